@@ -1,0 +1,55 @@
+# Everything runs in a virtual environment per Python version, made on first use.
+
+# Prints the version of a Python that is new enough and can make environments.
+PROBE := import sys, venv, ensurepip; assert sys.version_info >= (3, 11); \
+	print("%d.%d" % sys.version_info[:2])
+
+# The first that runs: a name on PATH may be a shim of a version that is switched off.
+PYTHON ?= $(shell for python in python3.11 python3.12 python3.13 python3; do \
+	"$$python" -c '$(PROBE)' >/dev/null 2>&1 && { echo "$$python"; break; }; done)
+PYTHON := $(PYTHON)
+
+SCENARIO ?= seven_joint_wall
+VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
+VENV := .venv-$(VERSION)
+BIN := $(VENV)/bin
+
+.PHONY: help demo test benchmark clean
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+help:
+	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
+	@echo 'make test        lint, types and tests'
+	@echo 'make benchmark   speed, with ratios'
+	@echo 'make clean       remove environments, caches and packages; keeps runs/'
+	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
+
+demo: $(VENV)/installed
+	$(BIN)/drake-dae simulate $(SCENARIO) --out runs/$(SCENARIO)
+
+test: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+benchmark: $(VENV)/installed-dev
+	$(BIN)/python -m pytest tests/benchmarks -s
+
+clean:
+	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@test -n '$(VERSION)' || \
+		{ echo 'No usable Python >= 3.11: make ... PYTHON=/path/to/python' >&2; exit 1; }
+	"$(PYTHON)" -m venv --clear $(VENV)
+
+$(VENV)/installed: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/installed-dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $(VENV)/installed $@

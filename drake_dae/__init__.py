@@ -1,0 +1,107 @@
+"""Robots in contact as differential-algebraic systems in Drake.
+
+Constrained robots as LeafSystems with the constraint force on an output port, and controllers that
+track positions and contact forces at once, after Krishnan and McClamroch, "Tracking in nonlinear
+differential-algebraic control systems with applications to constrained robot systems". Equation
+numbers in the documentation are those of that paper.
+"""
+
+from importlib.metadata import version
+
+from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.system import DaeSystem, Parameter, Signal
+from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.diagrams.build import build
+from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation, make_closed_loop
+from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.errors import DrakeDaeError
+from drake_dae.robots.actuation import DcMotors, ElectrohydraulicServos, FlexibleJoints
+from drake_dae.robots.constraints import CoincidentPoints, PointOnSurface, WeldedFrames
+from drake_dae.robots.links import LinkExpressions
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.multibody import MultibodyExpressions
+from drake_dae.robots.outputs import (
+    AxisCoordinates,
+    ExpressionOutput,
+    JointPositions,
+    PointCoordinates,
+    SurfaceCoordinates,
+)
+from drake_dae.robots.surfaces import (
+    Cylinder,
+    Ellipsoid,
+    ImplicitSurface,
+    Plane,
+    Sphere,
+    Torus,
+)
+from drake_dae.simulation.meshcat import start_meshcat
+from drake_dae.simulation.record import Record
+from drake_dae.simulation.simulate import simulate
+from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.plant import DaePlant
+from drake_dae.systems.references import (
+    ExpressionSignal,
+    ReferenceGenerator,
+    TrajectorySignal,
+    constant,
+    point_to_point,
+    sinusoids,
+)
+from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.systems.sensors import ForceSensor
+
+__version__ = version("drake_dae")
+
+__all__ = [
+    "AxisCoordinates",
+    "ClosedLoop",
+    "CoincidentPoints",
+    "Cylinder",
+    "DaePlant",
+    "DaeSystem",
+    "DcMotors",
+    "DrakeDaeError",
+    "ElectrohydraulicServos",
+    "Ellipsoid",
+    "ExpressionOutput",
+    "ExpressionSignal",
+    "FeedbackGains",
+    "FlexibleJoints",
+    "ForceSensor",
+    "ImplicitSurface",
+    "JointPositions",
+    "LinkExpressions",
+    "MultibodyExpressions",
+    "Parameter",
+    "Plane",
+    "PointCoordinates",
+    "PointOnSurface",
+    "Record",
+    "ReferenceGenerator",
+    "RobotModel",
+    "RobotPlant",
+    "Signal",
+    "Sphere",
+    "Structure",
+    "SurfaceCoordinates",
+    "Torus",
+    "TrackingController",
+    "TrackingLaw",
+    "TrajectorySignal",
+    "WeldedFrames",
+    "build",
+    "coefficients",
+    "constant",
+    "find_structure",
+    "load_scenario",
+    "make_animation",
+    "make_closed_loop",
+    "matrices",
+    "point_to_point",
+    "poles",
+    "simulate",
+    "sinusoids",
+    "start_meshcat",
+]

@@ -1,0 +1,7 @@
+"""`python -m drake_dae`."""
+
+import sys
+
+from drake_dae.cli import main
+
+sys.exit(main())

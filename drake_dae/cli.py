@@ -1,0 +1,197 @@
+"""The command `drake-dae`."""
+
+import argparse
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from pydrake.systems.framework import Context
+
+import drake_dae
+from drake_dae.diagrams.build import build
+from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation
+from drake_dae.diagrams.scenario import (
+    DEFAULT_SCENARIO,
+    Scenario,
+    find_scenario,
+    load_scenario,
+    save_scenario,
+    shipped_scenarios,
+)
+from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.simulation.meshcat import start_meshcat
+from drake_dae.simulation.plots import PLOTS, save_plots
+from drake_dae.simulation.simulate import RunStatistics, simulate
+from drake_dae.simulation.summary import Limits, summary
+from drake_dae.systems.robot_plant import RobotPlant
+
+FILES = ("scenario.yaml", "summary.txt", "record.npz", *PLOTS, "animation.html")
+"""What a run leaves in its folder."""
+
+_MARK = "# Scenario as run by drake-dae"
+"""Begins the scenario in a run's folder: only such a folder is written to again."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code: 0, 1 for an error, 130 after Ctrl-C."""
+    parser = argparse.ArgumentParser(
+        prog="drake-dae",
+        description="Robots in contact: position and force tracking on Drake's systems framework.",
+    )
+    parser.add_argument("--version", action="version", version=drake_dae.__version__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="show the shipped scenarios")
+    run = commands.add_parser("simulate", help="run a scenario")
+    run.add_argument(
+        "scenario",
+        nargs="?",
+        default=DEFAULT_SCENARIO,
+        help=f"a shipped scenario or a YAML file (default: {DEFAULT_SCENARIO})",
+    )
+    run.add_argument(
+        "--out", type=Path, help="folder for the results (default: runs/<scenario>-<time>)"
+    )
+    run.add_argument(
+        "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
+    )
+    run.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help='change the scenario, for example "integrator.accuracy=1e-8"; may be repeated',
+    )
+    options = parser.parse_args(arguments)
+    # Drake tells where each Meshcat listens, also the one that only records.
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    try:
+        if options.command == "list":
+            return _list()
+        return _simulate(options)
+    except DrakeDaeError as error:
+        # Texts of Drake and YAML may have several lines.
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        # The reader of our output, such as head, has enough; Python would complain on exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _list() -> int:
+    paths = shipped_scenarios()
+    width = max(map(len, paths), default=0)
+    for name, path in paths.items():
+        print(f"{name.ljust(width)}  {load_scenario(path).description}")
+    return 0
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    path = find_scenario(options.scenario)
+    scenario = load_scenario(path, options.settings)
+    if options.meshcat:
+        scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
+    meshcat = start_meshcat() if options.meshcat or scenario.write.animation else None
+    began = time.perf_counter()
+    loop, context = build(scenario, meshcat, live=options.meshcat)
+    print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
+    folder = _prepare(options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"))
+    save_scenario(scenario, folder / "scenario.yaml", f"{_MARK} {drake_dae.__version__}")
+    if options.meshcat and meshcat is not None:
+        print(f"watch at {meshcat.web_url()}", flush=True)
+    run, failure = None, ""
+    try:
+        run = simulate(loop.diagram, context, scenario.duration, scenario.integrator, progress=True)
+    except DrakeDaeError as error:
+        failure = str(error)
+        raise
+    except KeyboardInterrupt:
+        failure = "interrupted in the middle of a step"
+        raise
+    finally:
+        # Also when the run fails or is interrupted: what was recorded is kept.
+        _write(loop, context, scenario, folder, run, failure)
+    return 130 if run.interrupted else 0
+
+
+def _unused(name: str) -> Path:
+    """A folder below runs/ that is not there yet."""
+    folder, number = Path("runs") / name, 1
+    while folder.exists():
+        number += 1
+        folder = Path("runs") / f"{name}-{number}"
+    return folder
+
+
+def _prepare(folder: Path) -> Path:
+    """Makes the folder of a run; the files of an earlier one are removed, others never."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        present = [folder / name for name in FILES if (folder / name).exists()]
+        if present:
+            scenario = folder / FILES[0]
+            if not (scenario.exists() and scenario.read_text("utf-8").startswith(_MARK)):
+                raise ScenarioError(
+                    f"--out: '{folder}' holds {', '.join(file.name for file in present)}, not from "
+                    "an earlier run; choose another folder"
+                )
+        for file in present:
+            file.unlink()
+        # A folder that cannot be written to is found now, not at the end of the run.
+        (folder / FILES[0]).touch()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ScenarioError(f"--out: cannot write to '{folder}': {reason}") from None
+    return folder
+
+
+def _write(
+    loop: ClosedLoop,
+    context: Context,
+    scenario: Scenario,
+    folder: Path,
+    run: RunStatistics | None,
+    failure: str,
+) -> None:
+    record = loop.record(context)
+    if record.time.size == 0:
+        return
+    predicted = loop.predicted_error(record)
+    limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
+    text = summary(record, predicted, limits, run, failure)
+    with _stage(folder) as stage:
+        (stage / "summary.txt").write_text(text + "\n", encoding="utf-8")
+        if scenario.write.record:
+            record.save(stage / "record.npz")
+    if scenario.write.plots:
+        with _stage(folder) as stage:
+            save_plots(record, predicted, limits.control, stage)
+    if scenario.write.animation:
+        with _stage(folder) as stage:
+            page = make_animation(loop, record, context)
+            (stage / "animation.html").write_text(page, encoding="utf-8")
+    files = [name for name in FILES if (folder / name).exists()]
+    print(text)
+    print(f"written to {folder}/: {', '.join(files)}")
+
+
+@contextmanager
+def _stage(folder: Path) -> Iterator[Path]:
+    """A place to write files, which appear in the folder when they are complete."""
+    with TemporaryDirectory(prefix=".unfinished-", dir=folder) as stage:
+        yield Path(stage)
+        for file in Path(stage).iterdir():
+            file.replace(folder / file.name)

@@ -1,0 +1,44 @@
+"""Lie derivatives of expressions, exact and without Jacobians where a direction is enough."""
+
+import casadi as ca
+
+
+def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
+    """L_f k = (dk/dx) f, by one forward sweep.
+
+    Args:
+        expression: k, shape (a, 1).
+        field: f, shape (n, 1).
+        state: x, shape (n, 1).
+
+    Returns:
+        Shape (a, 1).
+    """
+    return ca.jtimes(expression, state, ca.densify(field))
+
+
+def lie_derivatives(expression: ca.SX, field: ca.SX, state: ca.SX, order: int) -> list[ca.SX]:
+    """[k, L_f k, ..., L_f^order k], with L_f^k k = L_f (L_f^(k-1) k)."""
+    result = [expression]
+    for _ in range(order):
+        result.append(lie_derivative(result[-1], field, state))
+    return result
+
+
+def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.SX:
+    """[L_g1 k, ..., L_gm k], structurally zero where it must be zero.
+
+    Args:
+        expression: k, shape (a, 1).
+        fields: g = [g_1, ..., g_m], shape (n, m).
+        state: x, shape (n, 1).
+
+    Returns:
+        Shape (a, m), sparse.
+    """
+    return ca.sparsify(ca.mtimes(ca.jacobian(expression, state), fields))
+
+
+def lie_bracket(first: ca.SX, second: ca.SX, state: ca.SX) -> ca.SX:
+    """[f, g] = (dg/dx) f - (df/dx) g, shape (n, 1)."""
+    return lie_derivative(second, first, state) - lie_derivative(first, second, state)

@@ -1,0 +1,329 @@
+"""Numbers at consistent states: what is zero there, what is dependent, what is singular."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.manifold import Manifold, are_dependent
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import AssumptionError, FloatArray, InconsistentStateError, ModelError
+
+ZERO = 1e-9
+"""A sum of products below this, relative to the sizes of its terms, is zero."""
+
+ROUND_OFF = 1e-12
+"""A factor below this, relative to the other factors in its row or column, is zero."""
+
+SINGULAR = 1e-6
+"""A matrix with a singular value below this, its rows and columns scaled, is singular."""
+
+Booleans = np.typing.NDArray[np.bool_]
+
+Sized = tuple[FloatArray, FloatArray]
+"""A matrix without its round-off, and how large its entries were before terms cancelled."""
+
+
+@dataclass(frozen=True)
+class Margin:
+    """How far a matrix is from losing its rank.
+
+    Attributes:
+        singular_value: The smallest singular value over all examined states.
+        relative: The same after rows and columns are scaled to about length one, by factors that
+            are common to all states, so that units do not matter.
+        state: Where `relative` is smallest, shape (n,).
+    """
+
+    singular_value: float
+    relative: float
+    state: FloatArray
+
+
+class Fields:
+    """f, g, h, l and m of (1)-(3) as numbers, with the default parameters.
+
+    Args:
+        system: (1)-(3).
+    """
+
+    def __init__(self, system: DaeSystem) -> None:
+        self.system = system
+        self._function = traced(system, f=system.f, g=system.g, h=system.h, l=system.l, m=system.m)
+
+    def __call__(self, state: FloatArray) -> dict[str, FloatArray]:
+        """The matrices at a state, by letter."""
+        values = self._function(state, self.system.parameter_values)
+        return dict(zip(self._function.output_names, map(_matrix, values), strict=True))
+
+
+class Samples:
+    """Consistent states near given ones, with the default parameters.
+
+    A state that does not get onto N*, or is outside the domain of (1)-(3), is left out.
+
+    Args:
+        manifold: N*, or what is known of it.
+        fields: Of the system.
+        guesses: The nominal state first, shape (count, n).
+
+    Attributes:
+        states: Shape (samples, n).
+        fields: The matrices g, h, m ... at each.
+        scale: How large each state is over all of them and the guesses, shape (n,).
+
+    Raises:
+        InconsistentStateError: No guess gets onto N*.
+        ModelError: A function is not finite at the nominal state.
+    """
+
+    def __init__(self, manifold: Manifold, fields: Fields, guesses: FloatArray) -> None:
+        self.manifold = manifold
+        self.system = manifold.system
+        self.fields: list[dict[str, FloatArray]] = []
+        states: list[FloatArray] = []
+        failure = None
+        for number, guess in enumerate(guesses):
+            try:
+                state = manifold.project(guess)
+            except InconsistentStateError as error:
+                failure = failure or error
+                continue
+            values = fields(state)
+            bad = [key for key, value in values.items() if not np.all(np.isfinite(value))]
+            if not bad:
+                states.append(state)
+                self.fields.append(values)
+            elif number == 0:
+                raise ModelError(
+                    f"{self.system.name}: {', '.join(bad)} of (1)-(3) is not finite at the "
+                    f"consistent state x = {show(state)}; give a nominal_state inside the domain"
+                )
+        if failure and not states:
+            raise failure
+        self.states = np.array(states)
+        self.scale = _positive(np.abs(np.vstack([guesses, self.states])).max(axis=0))
+
+    def values(self, **expressions: ca.SX) -> list[tuple[FloatArray, ...]]:
+        """Expressions of the state, as matrices, at each state.
+
+        Raises:
+            ModelError: One is not finite.
+        """
+        function = traced(self.system, **expressions)
+        result = []
+        for state in self.states:
+            values = function(state, self.system.parameter_values)
+            if not function.is_finite:
+                raise ModelError(
+                    f"{self.system.name}: {', '.join(expressions)} is not finite at the consistent "
+                    f"state x = {show(state)}; give a nominal_state inside the domain of the "
+                    "functions and of their derivatives"
+                )
+            result.append(tuple(_matrix(value) for value in values))
+        return result
+
+    def field(self, key: str) -> list[Sized]:
+        """g or h at each state."""
+        return [(values[key], np.abs(values[key])) for values in self.fields]
+
+    def eliminated(
+        self, constraint_gradient: ca.SX, constraint_matrix: ca.SX
+    ) -> tuple[list[Sized], list[Sized], list[Sized]]:
+        """beta (14), h* (10) and n* (12) at each state, from their factors.
+
+        Where they are zero but for round-off, they are zero here.
+
+        Args:
+            constraint_gradient: Of the last derivatives of the constraints, shape (m, n).
+            constraint_matrix: A(x), shape (m, m).
+        """
+        beta, h_star, n_star = [], [], []
+        values = self.values(gradient=constraint_gradient, matrix=constraint_matrix)
+        for fields, (gradient, matrix) in zip(self.fields, values, strict=True):
+            h, size = fields["h"], np.abs(fields["h"])
+            by_control = multiply(gradient, (h, size), self.scale)
+            # Units of the constraints' derivatives, and of the constraint inputs.
+            rows, columns = _equilibration(np.abs(matrix))
+            inverse = np.linalg.inv(matrix / rows[:, None] / columns)
+            small = np.abs(inverse) <= ROUND_OFF * np.max(np.abs(inverse), initial=0.0)
+            inverse = np.where(small, 0.0, inverse) / columns[:, None] / rows
+            beta.append(multiply(-inverse, by_control, rows))
+            added, added_size = multiply(fields["g"], beta[-1], 1.0 / columns)
+            h_star.append(_without_round_off(h + added, size + added_size))
+            n_star.append(multiply(fields["m"], beta[-1], 1.0 / columns))
+        return beta, h_star, n_star
+
+    def acts(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> Booleans:
+        """Whether the derivatives of functions along fields are not zero.
+
+        Args:
+            rows: The derivatives, shape (a, k), whose structure may decide.
+            functions: Shape (a, 1).
+            field: Shape (n, k), at each state.
+
+        Returns:
+            Shape (a, samples).
+        """
+        if not rows.nnz():
+            return np.zeros((rows.shape[0], len(self.states)), dtype=bool)
+        gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
+        return np.array(
+            [
+                multiply(gradient, value, self.scale)[0].any(axis=1)
+                for (gradient,), value in zip(gradients, field, strict=True)
+            ]
+        ).T
+
+    def dependent(self, functions: ca.SX) -> bool:
+        """Whether the differentials of functions are linearly dependent at every state."""
+        gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
+        return all(are_dependent(gradient) for (gradient,) in gradients)
+
+    def margin(
+        self,
+        matrix: ca.SX,
+        rows: Sequence[str],
+        assumptions: tuple[int, int],
+        message: str,
+    ) -> Margin:
+        """The smallest singular values of a square matrix at the states and what lies between.
+
+        A determinant that changes its sign on the way from the first state is zero there, unless
+        N* has no way, or the determinant is infinite on it.
+
+        Args:
+            matrix: Shape (k, k).
+            rows: What the rows belong to, for the message.
+            assumptions: The number that is violated if a whole row vanishes, and if not.
+            message: Of the second.
+
+        Raises:
+            AssumptionError: The matrix is singular somewhere.
+        """
+        function = traced(self.system, matrix=matrix)
+        matrices = [value for (value,) in self.values(matrix=matrix)]
+        row_scale, column_scale = _equilibration(np.mean(np.abs(matrices), axis=0))
+
+        def scaled(state: FloatArray) -> FloatArray:
+            value = _matrix(function(state, self.system.parameter_values)[0])
+            return value / row_scale[:, None] / column_scale
+
+        def distance(state: FloatArray) -> float:
+            return smallest_singular_value(scaled(state))
+
+        crossings = (self._crossing(scaled, there) for there in self.states[1:])
+        candidates = [*self.states, *(state for state in crossings if state is not None)]
+        state = min(candidates, key=distance)
+        if distance(state) >= SINGULAR:
+            value = min(smallest_singular_value(value) for value in matrices)
+            return Margin(value, distance(state), state)
+        length = np.linalg.norm(scaled(state), axis=1)
+        if length.min() < SINGULAR:
+            raise AssumptionError(
+                f"the relative degree of {rows[int(np.argmin(length))]} is not defined at x = "
+                f"{show(state)}: the inputs act on that derivative around this state, but not "
+                "there. Keep away from this state, or choose another function",
+                assumptions[0],
+                state,
+            )
+        raise AssumptionError(
+            f"{message}. Smallest singular value {distance(state):.1e} (rows and columns scaled) "
+            f"at x = {show(state)}",
+            assumptions[1],
+            state,
+        )
+
+    def _crossing(
+        self, matrix: Callable[[FloatArray], FloatArray], there: FloatArray
+    ) -> FloatArray | None:
+        """Where the determinant changes its sign on the way from the first state, if it does."""
+        here = self.states[0]
+
+        def sign(state: FloatArray) -> float:
+            return float(np.linalg.slogdet(matrix(state))[0])
+
+        start, end = sign(here), sign(there)
+        if start == end:
+            return None
+        for _ in range(60):
+            try:
+                middle = self.manifold.project((here + there) / 2.0)
+            except InconsistentStateError:
+                return None
+            if not np.all(np.isfinite(matrix(middle))):
+                return None
+            if sign(middle) == start:
+                here = middle
+            else:
+                there = middle
+        # Two branches of N* stay apart.
+        near = float(np.linalg.norm(there - here)) <= SINGULAR * max(
+            1.0, float(np.linalg.norm(here))
+        )
+        return here if near else None
+
+
+def traced(system: DaeSystem, **expressions: ca.SX) -> TracedFunction:
+    """A function of the state and of all parameters."""
+    inputs = {"x": system.state, "p": system.parameter_symbol}
+    return TracedFunction(system.name, inputs, expressions, often=False)
+
+
+def largest(matrix: FloatArray) -> FloatArray:
+    """The largest size in each row; 0 without columns."""
+    return np.max(np.abs(matrix), axis=1, initial=0.0)
+
+
+def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:
+    """A product in which entries that are nothing but round-off are zero.
+
+    Args:
+        left: Shape (a, k).
+        right: Shape (k, b).
+        scale: Units in which the columns of `left` and the rows of `right` compare, shape (k,).
+    """
+    value, size = right
+    row, column = np.abs(left) * scale, size / scale[:, None]
+    row_noise = ROUND_OFF * np.max(row, axis=1, keepdims=True, initial=0.0)
+    column_noise = ROUND_OFF * np.max(column, axis=0, keepdims=True, initial=0.0)
+    left = np.where(row > row_noise, left, 0.0)
+    kept = np.abs(value) / scale[:, None] > column_noise
+    value, size = np.where(kept, value, 0.0), np.where(column > column_noise, size, 0.0)
+    return _without_round_off(left @ value, np.abs(left) @ size)
+
+
+def _without_round_off(value: FloatArray, size: FloatArray) -> Sized:
+    return np.where(np.abs(value) > ZERO * size, value, 0.0), size
+
+
+def _positive(sizes: FloatArray) -> FloatArray:
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def smallest_singular_value(matrix: FloatArray) -> float:
+    """Of a square matrix."""
+    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
+
+
+def show(state: FloatArray) -> str:
+    """A state in a message."""
+    return np.array2string(state, precision=4, separator=", ", max_line_width=10**6)
+
+
+def _matrix(value: FloatArray) -> FloatArray:
+    """Columns come back as vectors."""
+    return value[:, None].copy() if value.ndim == 1 else value
+
+
+def _equilibration(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Divisors of the rows and of the columns that bring all to about length one (Ruiz)."""
+    rows, columns = np.ones(matrix.shape[0]), np.ones(matrix.shape[1])
+    for _ in range(10):
+        scaled = matrix / rows[:, None] / columns
+        for divisor, axis in ((rows, 1), (columns, 0)):
+            length = np.linalg.norm(scaled, axis=axis)
+            divisor *= np.sqrt(np.where(length > 0.0, length, 1.0))
+    return rows, columns

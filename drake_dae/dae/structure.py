@@ -1,0 +1,313 @@
+"""What kind of system it is: relative degrees, index, Assumptions (1)-(5) with their margins."""
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.elimination import Elimination, affine, eliminate
+from drake_dae.dae.lie import lie_derivative, lie_derivative_along
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.motion import Motion
+from drake_dae.dae.samples import Fields, Margin, Samples, show
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import AssumptionError, FloatArray, ModelError
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The structure that the paper assumes, found for one system.
+
+    Attributes:
+        system: The system.
+        constraint_degrees: r_1, ..., r_m.
+        output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
+            enters the output at once (the paper's outputs s + 1, ..., p).
+        output_order: The outputs in the paper's order (15): those with mu_i >= 1 first.
+        manifold: N* (4).
+        motion: Time derivatives along the motion on N*.
+        elimination: (9)-(14).
+        output_chains: Per output l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i.
+        drift: a_1(x), a_2(x) of (28): L_f*^mu_i l*_i, shape (p, 1).
+        control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p).
+        states: The consistent states at which numbers were decided, shape (samples, n).
+        constraint_margin: Margin of A(x), Assumption (2); None without constraints.
+        control_margin: Margin of B(x), Assumption (5).
+    """
+
+    system: DaeSystem
+    constraint_degrees: tuple[int, ...]
+    output_degrees: tuple[int, ...]
+    output_order: tuple[int, ...]
+    manifold: Manifold
+    motion: Motion
+    elimination: Elimination
+    output_chains: tuple[tuple[ca.SX, ...], ...]
+    drift: ca.SX
+    control_matrix: ca.SX
+    states: FloatArray
+    constraint_margin: Margin | None
+    control_margin: Margin
+
+    @property
+    def index(self) -> int:
+        """max r_i + 1, the index of the DAE; 0 without constraints."""
+        return max(self.constraint_degrees) + 1 if self.constraint_degrees else 0
+
+    @property
+    def num_dynamic_outputs(self) -> int:
+        """s of (15)."""
+        return sum(degree > 0 for degree in self.output_degrees)
+
+    @property
+    def zero_dynamics_dimension(self) -> int:
+        """dim xi of (22): n - sum r_i - sum mu_i."""
+        return self.manifold.dimension - sum(self.output_degrees)
+
+
+def find_structure(
+    system: DaeSystem, *, spread: ArrayLike = 0.1, count: int = 12, seed: int = 0
+) -> Structure:
+    """Finds relative degrees, A(x), B(x) and checks Assumptions (1)-(5).
+
+    Whether an expression is zero is decided by its structure first, then by its numbers at
+    consistent states drawn around `system.nominal_state`, with the default parameters.
+
+    Args:
+        system: (1)-(3).
+        spread: Standard deviation of the drawn states around the nominal one, a number for all
+            or shape (n,).
+        count: How many states are drawn.
+        seed: Of the random numbers.
+
+    Raises:
+        AssumptionError: An assumption that is violated, with the state where.
+        InconsistentStateError: No consistent state near the nominal one.
+        ModelError: No control input, a function that is not finite at the nominal state, or a mass
+            matrix that is not symmetric and positive definite there.
+    """
+    if system.num_controls == 0:
+        raise ModelError(f"{system.name}: no control inputs, so there is nothing to steer")
+    if system.num_constraints > system.num_states:
+        raise AssumptionError(
+            f"m = {system.num_constraints} constraints on n = {system.num_states} states depend "
+            "on each other; remove the redundant ones",
+            2,
+        )
+    _check_mass_matrix(system)
+    random = np.random.default_rng(seed)
+    guesses = system.nominal_state + np.asarray(spread, dtype=float) * np.vstack(
+        [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
+    )
+    fields = Fields(system.explicit)
+    chains = _constraint_chains(system.explicit, fields, guesses)
+    manifold = Manifold(system, chains)
+    samples = Samples(manifold, fields, guesses)
+    motion = Motion(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
+    elimination = eliminate(motion)
+    constraint_margin = None
+    if system.num_constraints:
+        constraint_margin = samples.margin(
+            elimination.constraint_matrix,
+            [f"constraint '{s.name}'" for s in system.constraint_output_signals],
+            (1, 2),
+            "A(x) of (2) loses rank: the constraints are redundant or their forces cannot act "
+            "independently. Remove a redundant constraint, or keep away from this state",
+        )
+    output_chains, drift, control_matrix = _output_chains(motion, elimination, samples)
+    degrees = tuple(len(chain) for chain in output_chains)
+    control_margin = samples.margin(
+        control_matrix,
+        [f"output '{s.name}'" for s in system.output_signals],
+        (4, 5),
+        "B(x) of (16) is singular: the controlled outputs "
+        f"{', '.join(s.name for s in system.output_signals)} cannot be steered independently. An "
+        "output may repeat a constraint or another output; choose other outputs, or keep away "
+        "from this state",
+    )
+    # Rows of n* that are zero but for round-off are no feedthrough.
+    n_star = [
+        ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
+        for i, degree in enumerate(degrees)
+    ]
+    samples.values(drift=drift)  # It can leave its domain where nothing before it did.
+    return Structure(
+        system=system,
+        constraint_degrees=tuple(len(chain) for chain in chains),
+        output_degrees=degrees,
+        output_order=tuple(sorted(range(len(degrees)), key=lambda i: degrees[i] == 0)),
+        manifold=manifold,
+        motion=motion,
+        elimination=replace(elimination, n_star=ca.vertcat(*n_star)),
+        output_chains=output_chains,
+        drift=drift,
+        control_matrix=control_matrix,
+        states=samples.states,
+        constraint_margin=constraint_margin,
+        control_margin=control_margin,
+    )
+
+
+def _check_mass_matrix(system: DaeSystem) -> None:
+    """Its factorization LDL^T reads one triangle, and would not notice."""
+    symbols = [system.state, system.parameter_symbol]
+    function = ca.Function("mass", symbols, [ca.densify(system.mass_matrix)])
+    mass = function(system.nominal_state, system.parameter_values).full()
+    length = np.sqrt(np.abs(np.diag(mass)))
+    if np.all(np.isfinite(mass)) and np.all(length > 0.0):
+        mass = mass / length / length[:, None]
+        if np.allclose(mass, mass.T, rtol=0.0, atol=1e-9) and np.linalg.eigvalsh(mass)[0] > 1e-12:
+            return
+    raise ModelError(
+        f"{system.name}: mass_matrix is not symmetric and positive definite at the nominal state "
+        f"x = {show(system.nominal_state)}"
+    )
+
+
+def _constraint_chains(system: DaeSystem, fields: Fields, guesses: FloatArray) -> list[list[ca.SX]]:
+    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i by Assumptions (1) and (3)."""
+    x = system.state
+    chains = [[system.k[i]] for i in range(system.num_constraints)]
+    undecided = list(range(system.num_constraints))
+    while undecided:
+        last = ca.vertcat(*[chains[i][-1] for i in undecided])
+        by_force = lie_derivative_along(last, system.g, x)
+        by_control = lie_derivative_along(last, system.h, x)
+        samples = Samples(Manifold(system, chains), fields, guesses)
+        force_acts = samples.acts(by_force, last, samples.field("g"))
+        control_acts = samples.acts(by_control, last, samples.field("h"))
+        still, stuck = [], []
+        for row, i in enumerate(undecided):
+            name, order = system.constraint_output_signals[i].name, len(chains[i])
+            if force_acts[row].all():
+                continue
+            if force_acts[row].any():
+                state = samples.states[int(np.argmin(force_acts[row]))]
+                raise AssumptionError(
+                    f"the relative degree of constraint '{name}' is not defined at x = "
+                    f"{show(state)}: the constraint inputs act on its derivative {order} in the "
+                    "neighbourhood, but not there. Keep away from this state, or write the "
+                    "constraint so that its gradient does not vanish",
+                    1,
+                    state,
+                )
+            if control_acts[row].any():
+                state = samples.states[int(np.argmax(control_acts[row]))]
+                raise AssumptionError(
+                    f"the control acts on derivative {order} of constraint '{name}', before any "
+                    f"constraint input does, at x = {show(state)}: the constraint then binds the "
+                    "control instead of the state. Take that control out, or add an actuator "
+                    "state in front of it",
+                    3,
+                    state,
+                )
+            still.append(i)
+            if not _reaches(system.g, system.f, last[row], x) or (
+                by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
+            ):
+                stuck.append(i)
+        if still and sum(len(chain) for chain in chains) >= system.num_states:
+            stuck = still
+        if stuck:
+            names = ", ".join(f"'{system.constraint_output_signals[i].name}'" for i in stuck)
+            raise AssumptionError(
+                f"no constraint input ever acts on constraint {names}: no force reaches it, or "
+                f"its derivatives repeat each other or fill the state (n = {system.num_states}). "
+                "It is redundant, or no force keeps it",
+                2,
+            )
+        for i in still:
+            chains[i].append(lie_derivative(chains[i][-1], system.f, x))
+        undecided = still
+    return chains
+
+
+def _output_chains(
+    motion: Motion, elimination: Elimination, samples: Samples
+) -> tuple[tuple[tuple[ca.SX, ...], ...], ca.SX, ca.SX]:
+    """l*_i, ..., L_f*^(mu_i - 1) l*_i by Assumption (4), a(x) of (28) and B(x) of (16)."""
+    system = motion.system
+    x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
+    count = system.num_controls
+    moving = system.l + ca.mtimes(system.m, motion.constraint_input)
+    _, h_star_values, n_star_values = samples.eliminated(
+        elimination.constraint_gradient, elimination.constraint_matrix
+    )
+    drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
+    chains: list[list[ca.SX]] = [[] for _ in range(count)]
+    acts = np.array([value.any(axis=1) for value, _ in n_star_values]).T
+    following = elimination.l_star
+    rows = elimination.n_star
+    undecided = list(range(count))
+    while undecided:
+        still = []
+        for row, i in enumerate(undecided):
+            if acts[row].all():
+                drift[i], control_matrix[i, :] = following[row], rows[row, :]
+            elif acts[row].any():
+                state = samples.states[int(np.argmin(acts[row]))]
+                raise AssumptionError(
+                    f"the relative degree of output '{system.output_signals[i].name}' is not "
+                    f"defined at x = {show(state)}: the control acts on its derivative "
+                    f"{len(chains[i])} in the neighbourhood, but not there. Choose another "
+                    "output, or keep away from this state",
+                    4,
+                    state,
+                )
+            else:
+                still.append(i)
+                chains[i].append(following[row])
+        if not still:
+            break
+        last = ca.vertcat(*[chains[i][-1] for i in still])
+        # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
+        moving = motion.derivative(moving[[undecided.index(i) for i in still]])
+        following, rows = affine(motion.expand(moving), motion.control)
+        acts = samples.acts(rows, last, h_star_values)
+        stuck = []
+        for row, i in enumerate(still):
+            if acts[row].any():
+                continue
+            # By Theorem 2.1 these differentials are independent if the output has a degree; worth
+            # a look where nothing acts although the structure says that it could.
+            used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
+            if (
+                used.numel() >= system.num_states
+                or not _reaches(h_star, f_star, last[row], x)
+                or (rows[row, :].nnz() and samples.dependent(used))
+            ):
+                stuck.append(i)
+        if stuck:
+            names = ", ".join(f"'{system.output_signals[i].name}'" for i in stuck)
+            raise AssumptionError(
+                f"the control never acts on output {names}: its derivatives repeat those of the "
+                "constraints, or no control reaches it, so it has no relative degree and B(x) no "
+                "row for it. Choose another output",
+                5,
+            )
+        undecided = still
+    return tuple(tuple(chain) for chain in chains), drift, control_matrix
+
+
+def _reaches(fields: ca.SX, drift: ca.SX, expression: ca.SX, state: ca.SX) -> bool:
+    """Whether an input along the fields can influence an expression at all, by structure."""
+    influence = _pattern(drift, state)
+    needed = _pattern(expression, state)[0]
+    for _ in range(state.numel()):
+        needed = needed | influence[needed].any(axis=0)
+    moved = _nonzeros(fields).any(axis=1)
+    return bool((needed & moved).any())
+
+
+def _pattern(expression: ca.SX, state: ca.SX) -> np.typing.NDArray[np.bool_]:
+    """Which entries (rows) depend on which states (columns)."""
+    return _nonzeros(ca.SX(ca.jacobian_sparsity(expression, state), 1))
+
+
+def _nonzeros(matrix: ca.SX) -> np.typing.NDArray[np.bool_]:
+    """Which entries are structurally nonzero."""
+    result = np.zeros(matrix.shape, dtype=bool)
+    rows, columns = matrix.sparsity().get_triplet()
+    result[rows, columns] = True
+    return result

@@ -1,0 +1,402 @@
+"""The system class of the paper: x' = f + g v + h u, 0 = k(x), z = l + m v.      (1)-(3)"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.expressions import PositiveDefiniteFactorization
+from drake_dae.errors import FloatArray, ModelError
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A scalar of a vector signal.
+
+    Attributes:
+        name: Unique in its vector.
+        unit: SI unit as text, "" for a pure number.
+    """
+
+    name: str
+    unit: str = ""
+
+    def derivative(self, order: int) -> "Signal":
+        """Its time derivative: x -> x', x'', ..., with the unit to match."""
+        if order == 0:
+            return self
+        per_time = "/s" if order == 1 else f"/s^{order}"
+        return Signal(self.name + "'" * order, (self.unit or "1") + per_time)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A number, or a vector of numbers, that a study changes without tracing again.
+
+    Attributes:
+        name: Unique in its system, for example "link1.mass".
+        value: The default, shape (k,); a float is taken as shape (1,).
+        unit: SI unit as text.
+        symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
+            not given.
+
+    Raises:
+        ModelError: A value that is not finite, or a symbol that does not fit it.
+    """
+
+    name: str
+    value: FloatArray
+    unit: str = ""
+    symbol: ca.SX = field(default=None)
+
+    def __post_init__(self) -> None:
+        value = np.atleast_1d(_numbers(f"parameter '{self.name}'", self.value))
+        if value.ndim != 1 or not np.all(np.isfinite(value)):
+            raise ModelError(
+                f"parameter '{self.name}' must be finite and one-dimensional, got {self.value!r}"
+            )
+        value.setflags(write=False)
+        object.__setattr__(self, "value", value)
+        if self.symbol is None:
+            object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
+        elif not _is_symbol(self.symbol) or self.symbol.shape != (value.size, 1):
+            raise ModelError(
+                f"the symbol of parameter '{self.name}' must be a CasADi SX column of "
+                f"{value.size} symbols, as its value has; got {self.symbol}"
+            )
+
+
+def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
+    """Signals that share a unit."""
+    return tuple(Signal(name, unit) for name in names)
+
+
+@dataclass(frozen=True, eq=False)
+class DaeSystem:
+    """A nonlinear differential-algebraic control system, equations (1)-(3):
+
+        x' = f(x) + g(x) v + h(x) u,    0 = k(x),    z = l(x) + m(x) v.
+
+    With a mass matrix E the first is E(x) x' = f + g v + h u, and what the paper calls f, g, h is
+    E^-1 f, E^-1 g, E^-1 h (see `explicit`). Giving E, as a robot has it in M(q), costs far fewer
+    operations than giving its inverse.
+
+    The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers
+    and NumPy arrays are taken as constants. The data checks itself when it is made.
+
+    Attributes:
+        state: The symbol x, shape (n, 1).
+        f: Drift, shape (n, 1).
+        g: How the constraint inputs v enter, shape (n, m).
+        h: How the control inputs u enter, shape (n, p).
+        k: Constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
+        l: Controlled outputs at v = 0, shape (p, 1).
+        m: How v enters the controlled outputs, shape (p, m).
+        parameters: Named numbers that the expressions depend on.
+        state_signals, constraint_input_signals, control_signals, constraint_output_signals,
+            output_signals: Names and units of x, v, u, y and z; a plain name is a Signal without
+            unit. Made up ("x0", "x1", ...) where not given.
+        nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
+        name: For messages.
+        mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
+        reaction: g(x) v as a function of the symbol v, shape (n, 1), for when it takes fewer
+            operations than the product: for a robot J^T lambda is the gradient of lambda^T phi.
+
+    Raises:
+        ModelError: A shape that does not fit, a symbol that is neither state nor parameter, or
+            names or symbols that are not unique.
+    """
+
+    state: ca.SX
+    f: ca.SX
+    g: ca.SX
+    h: ca.SX
+    k: ca.SX
+    l: ca.SX  # noqa: E741 - the paper's letter
+    m: ca.SX
+    parameters: tuple[Parameter, ...] = ()
+    state_signals: tuple[Signal, ...] = ()
+    constraint_input_signals: tuple[Signal, ...] = ()
+    constraint_output_signals: tuple[Signal, ...] = ()
+    control_signals: tuple[Signal, ...] = ()
+    output_signals: tuple[Signal, ...] = ()
+    nominal_state: FloatArray = field(default=None)  # type: ignore[arg-type]
+    name: str = "system"
+    mass_matrix: ca.SX = None
+    reaction: Callable[[ca.SX], ca.SX] | None = None
+
+    def __post_init__(self) -> None:
+        if not (_is_symbol(self.state) and self.state.numel()):
+            raise ModelError(
+                f"{self.name}: 'state' must be a CasADi SX column of symbols, "
+                f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
+            )
+
+        def put(key: str, value: object) -> None:
+            object.__setattr__(self, key, value)
+
+        put("state", ca.vec(self.state))
+        put("parameters", tuple(self.parameters))
+        n = self.state.numel()
+        k = _expression("k", self.k, self.name)
+        constraints = k.numel()
+        controls = _expression("h", self.h, self.name).shape[1]
+        shapes = {
+            "f": (n, 1),
+            "g": (n, constraints),
+            "h": (n, controls),
+            "k": (constraints, 1),
+            "l": (controls, 1),
+            "m": (controls, constraints),
+            "mass_matrix": (n, n),
+        }
+        if self.mass_matrix is None:
+            put("mass_matrix", ca.SX.eye(n))
+        _unique([p.name for p in self.parameters], "parameter", self.name)
+        known = ca.vertcat(self.state, self.parameter_symbol)
+        if len(ca.symvar(known)) != known.numel():
+            raise ModelError(f"{self.name}: a symbol stands twice among the states and parameters")
+        for key, shape in shapes.items():
+            value = _expression(key, getattr(self, key), self.name)
+            if value.numel() == 0 and 0 in shape:
+                value = ca.SX(*shape)
+            if value.shape != shape and value.shape == shape[::-1] and 1 in shape:
+                value = value.T
+            if value.shape != shape:
+                hint = (
+                    " (as many controlled outputs as controls: the law (28) inverts B(x), "
+                    "which is p x p)"
+                    if key in "lm"
+                    else ""
+                )
+                raise ModelError(
+                    f"{self.name}: {key} has shape {value.shape}, expected {shape} for "
+                    f"n = {n} states, m = {constraints} constraints, p = {controls} controls{hint}"
+                )
+            unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(known, s)]
+            if unknown:
+                raise ModelError(
+                    f"{self.name}: {key} depends on {', '.join(unknown)}, which is neither a "
+                    "state nor a parameter; pass it in 'parameters' or put its number in"
+                )
+            put(key, value)
+        sizes = (
+            ("state_signals", n, "x"),
+            ("constraint_input_signals", constraints, "v"),
+            ("constraint_output_signals", constraints, "y"),
+            ("control_signals", controls, "u"),
+            ("output_signals", controls, "z"),
+        )
+        for key, count, letter in sizes:
+            given = tuple(
+                Signal(signal) if isinstance(signal, str) else signal
+                for signal in getattr(self, key) or [f"{letter}{i}" for i in range(count)]
+            )
+            if len(given) != count:
+                raise ModelError(f"{self.name}: {key} has {len(given)} entries, expected {count}")
+            _unique([s.name for s in given], key, self.name)
+            put(key, given)
+        nominal = np.zeros(n)
+        if self.nominal_state is not None:
+            nominal = _numbers(f"{self.name}: nominal_state", self.nominal_state)
+        if nominal.shape != (n,) or not np.all(np.isfinite(nominal)):
+            raise ModelError(
+                f"{self.name}: nominal_state must be finite with shape ({n},), "
+                f"got {self.nominal_state!r}"
+            )
+        nominal.setflags(write=False)
+        put("nominal_state", nominal)
+
+    @classmethod
+    def from_functions(
+        cls,
+        state: Sequence[Signal | str] | int,
+        *,
+        f: Callable[..., Any],
+        h: Callable[..., Any],
+        l: Callable[..., Any],  # noqa: E741
+        g: Callable[..., Any] | None = None,
+        k: Callable[..., Any] | None = None,
+        m: Callable[..., Any] | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        **labels: Any,
+    ) -> Self:
+        """Builds a system from Python functions of the state.
+
+        Each function is called once with a CasADi column x, and, if there are `parameters`, with
+        a namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns
+        an expression, or a list (of lists for a matrix, row by row).
+
+        Args:
+            state: Names (or Signals) of the states, or their number n.
+            f, g, h, k, l, m: As in the class. Without constraints leave out g, k and m.
+            parameters: Name -> default; a name must be a Python identifier.
+            labels: The remaining fields of the class.
+
+        Raises:
+            ModelError: As the class, or a function that fails.
+        """
+        bad = [name for name in parameters or {} if not name.isidentifier()]
+        if bad:
+            raise ModelError(
+                f"parameter names must be Python identifiers, to be read as p.name: {bad}"
+            )
+        if isinstance(state, int):
+            state = [f"x{i}" for i in range(state)]
+        named = tuple(s if isinstance(s, Signal) else Signal(s) for s in state)
+        x = ca.vertcat(ca.SX(0, 1), *[ca.SX.sym(s.name) for s in named])
+        defined = tuple(
+            Parameter(name, _numbers(f"parameter '{name}'", value))
+            for name, value in (parameters or {}).items()
+        )
+        arguments = [x]
+        if defined:
+            arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
+
+        def call(letter: str, function: Callable[..., Any] | None) -> ca.SX:
+            if function is None:
+                return ca.SX(0, 0)
+            try:
+                value = function(*arguments)
+            except Exception as error:
+                raise ModelError(
+                    f"function {letter} failed on a CasADi column of {x.numel()} states: {error}. "
+                    "Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"
+                ) from error
+            if value is None:
+                raise ModelError(f"function {letter} returned nothing")
+            return _expression(letter, value, labels.get("name", "system"))
+
+        drift, control = call("f", f), call("h", h)
+        if control.shape[0] == 1 and x.numel() != 1:
+            control = control.T
+        return cls(
+            state=x,
+            f=drift,
+            g=call("g", g),
+            h=control,
+            k=call("k", k),
+            l=call("l", l),
+            m=call("m", m),
+            parameters=defined,
+            state_signals=named,
+            **labels,
+        )
+
+    def reaction_to(self, constraint_input: ca.SX) -> ca.SX:
+        """g(x) v, shape (n, 1), by `reaction` where there is one.
+
+        Raises:
+            ModelError: `reaction` is not g v at the nominal state.
+        """
+        product = ca.mtimes(self.g, constraint_input)
+        if self.reaction is None:
+            return product
+        value = ca.SX(self.reaction(constraint_input))
+        symbols = [self.state, constraint_input, self.parameter_symbol]
+        both = ca.Function("reactions", symbols, [ca.horzcat(product, value)])
+        inputs = np.arange(1.0, self.num_constraints + 1.0)
+        found = both(self.nominal_state, inputs, self.parameter_values).full()
+        if not np.allclose(found[:, 0], found[:, 1], rtol=1e-9, atol=1e-9 * np.abs(found).max()):
+            raise ModelError(f"{self.name}: 'reaction' is not g v at the nominal state")
+        return value
+
+    @cached_property
+    def explicit(self) -> "DaeSystem":
+        """The same system with E = 1: f, g and h are those of the paper."""
+        if ca.is_equal(self.mass_matrix, ca.SX.eye(self.num_states)):
+            return self
+        fields = ca.horzcat(self.f, self.g, self.h)
+        solved = PositiveDefiniteFactorization(self.mass_matrix).solve(fields)
+        m = self.num_constraints
+        return replace(
+            self,
+            f=solved[:, 0],
+            g=solved[:, 1 : 1 + m],
+            h=solved[:, 1 + m :],
+            mass_matrix=None,
+            reaction=None,
+        )
+
+    @property
+    def num_states(self) -> int:
+        """n."""
+        return int(self.state.numel())
+
+    @property
+    def num_constraints(self) -> int:
+        """m."""
+        return int(self.k.numel())
+
+    @property
+    def num_controls(self) -> int:
+        """p, which is also the number of controlled outputs."""
+        return int(self.h.shape[1])
+
+    @property
+    def parameter_symbol(self) -> ca.SX:
+        """All parameters below each other."""
+        return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters])
+
+    @property
+    def parameter_values(self) -> FloatArray:
+        """The defaults of all parameters, in the order of `parameter_symbol`."""
+        return np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
+
+    def parameter_slice(self, name: str) -> slice:
+        """Where a parameter stands in `parameter_values`.
+
+        Raises:
+            ModelError: No parameter has that name.
+        """
+        start = 0
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return slice(start, start + parameter.value.size)
+            start += parameter.value.size
+        names = ", ".join(p.name for p in self.parameters) or "none"
+        raise ModelError(f"{self.name} has no parameter '{name}'; it has {names}")
+
+
+def _expression(key: str, value: Any, owner: str) -> ca.SX:
+    """An SX matrix from an SX, a number, an array, or a (nested) list of these."""
+    if isinstance(value, ca.MX):
+        raise ModelError(f"{owner}: {key} is a CasADi MX; use SX symbols and expressions")
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
+    try:
+        if isinstance(value, (list, tuple)):
+            rows = [ca.horzcat(*row) if isinstance(row, (list, tuple)) else row for row in value]
+            value = ca.vertcat(*rows) if rows else ca.SX(0, 1)
+        result = ca.SX(np.asarray(value, dtype=float) if not isinstance(value, ca.SX) else value)
+    except Exception as error:
+        raise ModelError(
+            f"{owner}: {key} must be a CasADi SX expression, an array, or a list of these (of "
+            f"lists of one length for a matrix), got {type(value).__name__}"
+        ) from error
+    constant = [float(e) for e in result.nonzeros() if e.is_constant()]
+    if not np.all(np.isfinite(constant)):
+        raise ModelError(f"{owner}: {key} holds a constant that is not finite: {result}")
+    return result
+
+
+def _is_symbol(value: Any) -> bool:
+    return isinstance(value, ca.SX) and value.is_valid_input()
+
+
+def _numbers(what: str, value: Any) -> FloatArray:
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{what} must be numbers, got {value!r}") from error
+
+
+def _unique(names: Sequence[str], kind: str, owner: str) -> None:
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise ModelError(f"{owner}: {kind} names must be unique, twice: {', '.join(double)}")

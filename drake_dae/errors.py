@@ -1,0 +1,78 @@
+"""The exception family: every failure says what was wrong, which value, and what to do."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+FloatArray = np.typing.NDArray[np.float64]
+
+
+class DrakeDaeError(Exception):
+    """Base of every exception that drake_dae raises on purpose."""
+
+
+class ModelError(DrakeDaeError, ValueError):
+    """A system, robot, surface or signal that is not well formed."""
+
+
+class GainError(DrakeDaeError, ValueError):
+    """Gains of a wrong shape, or whose error dynamics (30) are not Hurwitz."""
+
+
+class ReferenceSignalError(DrakeDaeError, ValueError):
+    """A reference that is too short, too rough, or lacks derivatives that the law needs."""
+
+
+class ScenarioError(DrakeDaeError, ValueError):
+    """A scenario file that cannot be used; the message names the key."""
+
+
+class AssumptionError(DrakeDaeError):
+    """An assumption of the theory that the system violates.
+
+    Attributes:
+        assumption: Number of the assumption in the paper, (1) to (5).
+        state: A consistent state, shape (n,), where it fails, or None if it fails everywhere.
+    """
+
+    def __init__(self, message: str, assumption: int, state: ArrayLike | None = None) -> None:
+        super().__init__(f"Assumption ({assumption}): {message}")
+        self.assumption = assumption
+        self.state = None if state is None else np.array(state, dtype=float)
+
+
+class InconsistentStateError(DrakeDaeError):
+    """A state that is not on the manifold N* of (4).
+
+    Attributes:
+        residual: The constraint outputs and their derivatives, shape (sum r_i,).
+    """
+
+    def __init__(self, message: str, residual: ArrayLike) -> None:
+        super().__init__(message)
+        self.residual = np.array(residual, dtype=float)
+
+
+class WiringError(DrakeDaeError, ValueError):
+    """Blocks that must not be connected like this: an algebraic loop, or a loop that diverges."""
+
+
+class SimulationError(DrakeDaeError):
+    """A run that cannot go on.
+
+    Attributes:
+        time: When it failed, in s.
+        state: The state there, shape (n,).
+    """
+
+    def __init__(self, message: str, time: float, state: ArrayLike) -> None:
+        super().__init__(message)
+        self.time = time
+        self.state = np.array(state, dtype=float)
+
+
+class SingularityError(SimulationError):
+    """A(x) of (13) or B(x) of (16) lost its rank on the way."""
+
+
+class NonFiniteError(SimulationError):
+    """A derivative or an output that is NaN or infinite."""

@@ -1,0 +1,168 @@
+"""What the links of a robot provide: M(q), H(q, v) and where their frames are."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.system import Parameter, Signal, signals
+from drake_dae.errors import FloatArray, ModelError
+
+
+class Links(Protocol):
+    """Rigid links without constraint: M(q) v' + H(q, v) = B u, q' = N(q) v.
+
+    `MultibodyExpressions` takes them from a MultibodyPlant, `LinkExpressions` from equations.
+    Expressions depend on `q`, `v` and the symbols of `parameters`.
+    """
+
+    @property
+    def q(self) -> ca.SX: ...
+    @property
+    def v(self) -> ca.SX: ...
+    @property
+    def velocity_map(self) -> ca.SX: ...
+    @property
+    def mass_matrix(self) -> ca.SX: ...
+    @property
+    def bias(self) -> ca.SX: ...
+    @property
+    def actuation_matrix(self) -> FloatArray: ...
+    @property
+    def parameters(self) -> tuple[Parameter, ...]: ...
+    @property
+    def position_signals(self) -> tuple[Signal, ...]: ...
+    @property
+    def velocity_signals(self) -> tuple[Signal, ...]: ...
+    @property
+    def actuator_signals(self) -> tuple[Signal, ...]: ...
+    @property
+    def effort_limits(self) -> FloatArray: ...
+    @property
+    def reflected_inertia(self) -> FloatArray: ...
+    @property
+    def gear_ratios(self) -> FloatArray: ...
+    @property
+    def default_positions(self) -> FloatArray: ...
+
+    def rotation(self, frame: Any) -> ca.SX:
+        """R_WF(q), shape (3, 3)."""
+
+    def position(self, frame: Any, point: ArrayLike = (0.0, 0.0, 0.0)) -> ca.SX:
+        """Position in the world of a point that is fixed in a frame, m, shape (3, 1)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkExpressions:
+    """A robot given by its own M(q) and H(q, v), as in a textbook.
+
+    Attributes:
+        q: Generalized positions, SX symbols, shape (nq, 1).
+        v: Generalized velocities, SX symbols, shape (nv, 1).
+        mass_matrix: M(q), shape (nv, nv), symmetric positive definite.
+        bias: H(q, v): Coriolis, centripetal, gravity and friction forces, shape (nv, 1).
+        frames: Name -> position p_W(q) in m, shape (3, 1), or (rotation R_WF(q), position).
+        velocity_map: N(q) of q' = N(q) v, shape (nq, nv); the identity if None.
+        actuation_matrix: B of M v' + H = B u, shape (nv, nu); the identity if None.
+        parameters: Parameters of the expressions.
+        position_signals, velocity_signals, actuator_signals: Names and units; made up if empty.
+        effort_limits: Largest |u|, shape (nu,); infinite if None.
+        reflected_inertia: What of M(q) is rotors, kg m^2 (kg), shape (nu,); 0 if None.
+        gear_ratios: Motor turns per joint turn, shape (nu,); 1 if None.
+        default_positions: A usual configuration, shape (nq,); zero if None.
+
+    Raises:
+        ModelError: A shape that does not fit.
+    """
+
+    q: ca.SX
+    v: ca.SX
+    mass_matrix: ca.SX
+    bias: ca.SX
+    frames: Mapping[str, ca.SX | tuple[ca.SX, ca.SX]] = field(default_factory=dict)
+    velocity_map: ca.SX = None
+    actuation_matrix: FloatArray = field(default=None)  # type: ignore[arg-type]
+    parameters: tuple[Parameter, ...] = ()
+    position_signals: tuple[Signal, ...] = ()
+    velocity_signals: tuple[Signal, ...] = ()
+    actuator_signals: tuple[Signal, ...] = ()
+    effort_limits: FloatArray = field(default=None)  # type: ignore[arg-type]
+    reflected_inertia: FloatArray = field(default=None)  # type: ignore[arg-type]
+    gear_ratios: FloatArray = field(default=None)  # type: ignore[arg-type]
+    default_positions: FloatArray = field(default=None)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        nq, nv = self.q.numel(), self.v.numel()
+        actuation = np.eye(nv) if self.actuation_matrix is None else self.actuation_matrix
+        actuation = np.array(actuation, dtype=float)
+        if actuation.ndim != 2 or actuation.shape[0] != nv:
+            raise ModelError(f"actuation_matrix has shape {actuation.shape}, expected ({nv}, nu)")
+        nu = actuation.shape[1]
+        fill = {
+            "velocity_map": ca.SX.eye(nv) if self.velocity_map is None else self.velocity_map,
+            "actuation_matrix": actuation,
+            "position_signals": self.position_signals or signals([f"q{i}" for i in range(nq)]),
+            "velocity_signals": self.velocity_signals or signals([f"v{i}" for i in range(nv)]),
+            "actuator_signals": self.actuator_signals or signals([f"u{i}" for i in range(nu)]),
+            "effort_limits": _numbers(self.effort_limits, nu, np.inf),
+            "reflected_inertia": _numbers(self.reflected_inertia, nu, 0.0),
+            "gear_ratios": _numbers(self.gear_ratios, nu, 1.0),
+            "default_positions": _numbers(self.default_positions, nq, 0.0),
+        }
+        for key, value in fill.items():
+            object.__setattr__(self, key, value)
+        for key, shape in (
+            ("mass_matrix", (nv, nv)),
+            ("bias", (nv, 1)),
+            ("velocity_map", (nq, nv)),
+            ("effort_limits", (nu,)),
+            ("reflected_inertia", (nu,)),
+            ("gear_ratios", (nu,)),
+            ("default_positions", (nq,)),
+        ):
+            found = getattr(self, key).shape
+            if found != shape:
+                raise ModelError(f"{key} has shape {found}, expected {shape}")
+
+    def rotation(self, frame: str) -> ca.SX:
+        """R_WF(q), shape (3, 3).
+
+        Raises:
+            ModelError: An unknown frame, or one given without a rotation.
+        """
+        if frame == "world":
+            return ca.SX.eye(3)
+        pose = self._pose(frame)
+        if not isinstance(pose, tuple):
+            raise ModelError(f"frame '{frame}' was given as a position only; give (rotation, p)")
+        return pose[0]
+
+    def position(self, frame: str, point: ArrayLike = (0.0, 0.0, 0.0)) -> ca.SX:
+        """Position in the world of a point that is fixed in a frame, m, shape (3, 1).
+
+        Raises:
+            ModelError: An unknown frame, or a point off the origin of one without rotation.
+        """
+        offset = np.asarray(point, dtype=float)
+        if frame == "world":
+            return ca.SX(offset)
+        pose = self._pose(frame)
+        origin = pose[1] if isinstance(pose, tuple) else pose
+        return origin + ca.mtimes(self.rotation(frame), offset) if offset.any() else origin
+
+    def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
+        if frame not in self.frames:
+            near = get_close_matches(frame, self.frames, n=1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            raise ModelError(
+                f"no frame '{frame}'; {hint}frames: {', '.join(['world', *self.frames])}"
+            )
+        return self.frames[frame]
+
+
+def _numbers(given: ArrayLike | None, size: int, default: float) -> FloatArray:
+    return np.full(size, default) if given is None else np.array(given, dtype=float)

@@ -1,0 +1,315 @@
+"""A constrained robot as a DaeSystem.                        (37)-(45), (64)-(68), (74)-(78)"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
+from drake_dae.robots.actuation import ActuationChain, Stage, chain
+from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.links import Links
+from drake_dae.robots.multibody import MultibodyExpressions
+from drake_dae.robots.outputs import PositionOutput
+
+
+class RobotModel:
+    """A robot in contact, equations (37)-(40):
+
+        M(q) v' + H(q, v) = J(q)^T lambda + B tau,    q' = N(q) v,
+        0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
+
+    with J = (dphi/dq) N. With rigid joints tau = u; stages of actuation put their own dynamics
+    between u and tau: E s' = drift(q, v, s) + drive u, tau = tau(q, v, s), as in (64)-(65) and
+    (74)-(75). The state is x = (q, v, s), the constraint input is lambda, and the controlled
+    outputs are z = (z_1, z_2), so there are as many position outputs as there are actuators less
+    constraints.
+
+    Args:
+        links: M, H and kinematics.
+        constraints: phi, one below the other; none is a robot that moves freely.
+        positions: h_1, one below the other.
+        nominal_positions: A configuration of the robot at work, shape (nq,), near which the
+            structure is examined; `links.default_positions` if None.
+        name: For messages.
+        actuation: Stages from the joints toward the motor; none is rigid joints.
+
+    Attributes:
+        dae: The `DaeSystem` (43)-(45).
+        links, constraints, positions: As given.
+        stages: The attached stages.
+        joint_force: tau as an expression of `dae.state`; None with rigid joints.
+
+    Raises:
+        ModelError: Too many or too few outputs, an M that is not positive definite, or stages
+            that do not fit.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        constraints: Sequence[Constraint],
+        positions: Sequence[PositionOutput],
+        nominal_positions: ArrayLike | None = None,
+        name: str = "robot",
+        actuation: Sequence[Stage] = (),
+    ) -> None:
+        self.links = links
+        self.constraints = tuple(constraints)
+        self.positions = tuple(positions)
+        self.name = name
+        q, v = links.q, links.v
+        nq, nv = q.numel(), v.numel()
+        phi = ca.vertcat(ca.SX(0, 1), *[c.residual(links) for c in self.constraints])
+        h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
+        forces = tuple(s for c in self.constraints for s in c.force_signals)
+        position_outputs = tuple(s for p in self.positions for s in p.signals(links))
+        m, nu = phi.numel(), links.actuation_matrix.shape[1]
+        if h_1.numel() + m != nu:
+            raise ModelError(
+                f"{name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces are "
+                f"outputs already, so {nu - m} position outputs are needed; given are "
+                f"{h_1.numel()} ({', '.join(s.name for s in position_outputs) or 'none'})"
+            )
+        nominal = np.asarray(
+            links.default_positions if nominal_positions is None else nominal_positions, float
+        )
+        if nominal.shape != (nq,):
+            raise ModelError(f"{name}: nominal_positions has shape {nominal.shape}, not ({nq},)")
+
+        # The links, then the stages: E x' = f + g lambda + h u.
+        actuation_matrix = ca.SX(ca.DM(links.actuation_matrix))
+        mass, bias = links.mass_matrix, links.bias
+        stages = self._attach(actuation)
+        self.stages = stages.stages if stages else ()
+        self.joint_force = stages.joint_force if stages else None
+        if stages and stages.stages[0].carries_rotors:
+            rotors = links.actuation_matrix * links.reflected_inertia @ links.actuation_matrix.T
+            mass = mass - ca.SX(ca.sparsify(ca.DM(rotors)))
+        self._check_mass_matrix(mass, nominal)
+        jacobian = ca.mtimes(ca.jacobian(phi, q), links.velocity_map)
+        inertia = ca.diagcat(ca.SX.eye(nq), mass)
+        f = ca.vertcat(ca.mtimes(links.velocity_map, v), -bias)
+        h = ca.vertcat(ca.SX(nq, nu), actuation_matrix)
+        state, parameters = ca.vertcat(q, v), list(links.parameters)
+        state_signals = (*links.position_signals, *links.velocity_signals)
+        control_signals = tuple(links.actuator_signals)
+        if stages:
+            inertia = ca.diagcat(inertia, stages.mass)
+            f = ca.vertcat(f + ca.mtimes(h, stages.joint_force), stages.drift)
+            h = ca.vertcat(ca.SX(nq + nv, nu), stages.drive)
+            state = ca.vertcat(state, stages.state)
+            control_signals = stages.control_signals
+            for stage in stages.stages:
+                state_signals += stage.state_signals
+                parameters += stage.parameters
+        for constraint in self.constraints:
+            parameters += constraint.parameters
+        #: Largest |u| per actuator, infinite where there is none or where u is no joint force.
+        self.control_limits = (
+            links.effort_limits
+            if control_signals == tuple(links.actuator_signals)
+            else np.full(nu, np.inf)
+        )
+        self.dae = DaeSystem(
+            state=state,
+            mass_matrix=inertia,
+            f=f,
+            g=ca.vertcat(ca.SX(nq, m), jacobian.T, ca.SX(state.numel() - nq - nv, m)),
+            h=h,
+            k=phi,
+            l=ca.vertcat(h_1, ca.SX(m, 1)),
+            m=ca.vertcat(ca.SX(nu - m, m), ca.SX.eye(m)),
+            parameters=tuple(parameters),
+            state_signals=state_signals,
+            constraint_input_signals=forces,
+            constraint_output_signals=tuple(
+                s for c in self.constraints for s in c.residual_signals
+            ),
+            control_signals=control_signals,
+            output_signals=position_outputs + forces,
+            nominal_state=np.concatenate([nominal, np.zeros(state.numel() - nq)]),
+            name=name,
+            reaction=lambda multiplier: ca.vertcat(
+                ca.SX(nq, 1),
+                ca.mtimes(links.velocity_map.T, ca.jtimes(phi, q, multiplier, True)),
+                ca.SX(state.numel() - nq - nv, 1),
+            ),
+        )
+        self._configuration = TracedFunction(
+            f"{name} configuration",
+            {"q": q, "parameters": self.dae.parameter_symbol},
+            {"phi": phi, "h_1": h_1, "jacobian": ca.jacobian(ca.vertcat(phi, h_1), q)},
+        )
+        self._trace_equilibrium()
+        if stages:
+            rest = self._rest(nominal, np.zeros(m), self.dae.parameter_values)[0]
+            self.dae = replace(self.dae, nominal_state=rest)
+
+    @classmethod
+    def from_multibody(
+        cls,
+        plant: MultibodyPlant,
+        constraints: Sequence[Constraint],
+        positions: Sequence[PositionOutput],
+        nominal_positions: ArrayLike | None = None,
+        name: str = "robot",
+        actuation: Sequence[Stage] = (),
+    ) -> Self:
+        """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
+
+        Raises:
+            ModelError: What the plant has and cannot be represented, by name.
+        """
+        links = MultibodyExpressions(plant)
+        return cls(links, constraints, positions, nominal_positions, name, actuation)
+
+    @property
+    def position_signals(self) -> tuple[Signal, ...]:
+        """Names and units of z_1."""
+        return self.dae.output_signals[: self.dae.num_controls - self.dae.num_constraints]
+
+    def configuration(
+        self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """q = psi(z_1) of (58): the consistent configuration with given position outputs.
+
+        Args:
+            outputs: z_1, shape (nu - m,).
+            guess: Where Newton's method starts, shape (nq,).
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            Shape (nq,); where the outputs leave freedom, the one next to the guess.
+
+        Raises:
+            InconsistentStateError: No such configuration near the guess.
+        """
+        q = np.array(guess, dtype=float)
+        wanted = np.asarray(outputs, dtype=float)
+        values = self.dae.parameter_values if parameters is None else parameters
+        length, best = 1.0, np.inf
+        step = np.zeros(q.size)
+        for _ in range(100):
+            phi, h_1, jacobian = self._configuration(q + length * step, values)
+            residual = np.concatenate([phi, h_1 - wanted])
+            size = float(np.max(np.abs(residual), initial=0.0))
+            if size < best:
+                q, best = q + length * step, size
+                step = -np.linalg.lstsq(jacobian.reshape(residual.size, -1), residual)[0]
+                length = 1.0
+            elif best < 1e-10:
+                return q
+            else:
+                length /= 2.0
+        raise InconsistentStateError(
+            f"{self.name}: no configuration near the guess satisfies the constraints with "
+            f"outputs {np.array2string(wanted, precision=4)}; {best:.2g} is left. They may be out "
+            "of reach",
+            residual,
+        )
+
+    def rest_state(
+        self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """The state at rest in a configuration with given constraint forces.
+
+        What the stages need to hold the robot there (shaft positions, currents, actuator forces)
+        is solved for: v = 0, v' = 0, s' = 0.
+
+        Args:
+            positions: q, shape (nq,), on the constraints.
+            forces: lambda, shape (m,).
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            x = (q, 0, s), shape (n,). With rigid joints the forces do not enter it.
+
+        Raises:
+            ModelError: No drive holds the robot there.
+        """
+        values = self.dae.parameter_values if parameters is None else np.asarray(parameters)
+        q, load = np.asarray(positions, dtype=float), np.asarray(forces, dtype=float)
+        state, left = self._rest(q, load, values)
+        if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
+            raise ModelError(
+                f"{self.name}: no drive holds the robot at rest at q = "
+                f"{np.array2string(q, precision=4)} with forces {load}; {left:.2g} N m is left. It "
+                "has fewer actuators than joints"
+            )
+        return state
+
+    def _attach(self, actuation: Sequence[Stage]) -> ActuationChain | None:
+        if not actuation:
+            return None
+        select = self.links.actuation_matrix
+        if not np.allclose(select.T @ select, np.eye(select.shape[1])):
+            raise ModelError(
+                f"{self.name}: actuation stages need one actuator per actuated joint, so "
+                "orthonormal columns of the actuation matrix"
+            )
+        transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
+        position = ca.mtimes(transposed, self.links.q)
+        return chain(actuation, self.links, position, ca.mtimes(transposed, self.links.v))
+
+    def _trace_equilibrium(self) -> None:
+        """Balance of forces and of the stages at v = 0, linear in (s, u)."""
+        dae, links = self.dae, self.links
+        first = links.q.numel() + links.v.numel()
+        control = ca.SX.sym("u", dae.num_controls)
+        force = ca.SX.sym("lambda", dae.num_constraints)
+        balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
+        balance = balance[links.q.numel() :]
+        balance = ca.substitute(balance, links.v, ca.SX.zeros(links.v.numel()))
+        unknown = ca.vertcat(dae.state[first:], control)
+        gradient = ca.jacobian(balance, unknown)
+        offset = ca.substitute(balance, unknown, ca.SX.zeros(unknown.numel()))
+        self._equilibrium = TracedFunction(
+            f"{self.name} equilibrium",
+            {"q": links.q, "lambda": force, "parameters": dae.parameter_symbol},
+            {
+                "offset": offset,
+                "gradient": ca.substitute(gradient, unknown, ca.SX.zeros(unknown.numel())),
+            },
+        )
+
+    def _rest(
+        self, q: FloatArray, forces: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """The state at rest and what is left of the balance of forces."""
+        offset, gradient = self._equilibrium(q, forces, parameters)
+        gradient = gradient.reshape(offset.size, -1)
+        # Currents and forces differ by orders of magnitude.
+        scale = np.linalg.norm(gradient, axis=0)
+        solution = np.linalg.lstsq(gradient / scale, -offset)[0] / scale
+        left = float(np.max(np.abs(gradient @ solution + offset), initial=0.0))
+        stages = self.dae.num_states - q.size - self.links.v.numel()
+        return np.concatenate([q, np.zeros(self.links.v.numel()), solution[:stages]]), left
+
+    def _check_mass_matrix(self, mass_matrix: ca.SX, nominal: FloatArray) -> None:
+        parameters = self.links.parameters
+        mass = TracedFunction(
+            "mass matrix",
+            {
+                "q": self.links.q,
+                "p": ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters]),
+            },
+            {"mass_matrix": mass_matrix},
+        )(nominal, np.concatenate([np.zeros(0), *[p.value for p in parameters]]))[0]
+        mass = np.atleast_2d(mass)
+        asymmetry = np.abs(mass - mass.T).max()
+        if asymmetry > 1e-9 * np.abs(mass).max():
+            raise ModelError(f"{self.name}: M(q) is not symmetric, by {asymmetry:.2g}")
+        smallest = float(np.linalg.eigvalsh(mass)[0])
+        if smallest <= 0.0:
+            raise ModelError(
+                f"{self.name}: M(q) is not positive definite at the nominal configuration: "
+                f"smallest eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a "
+                "force; give it mass, or weld it"
+            )

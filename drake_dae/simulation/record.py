@@ -1,0 +1,108 @@
+"""What a run leaves: every signal over time, with names and units."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+from zipfile import BadZipFile
+
+import numpy as np
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import VectorLogSink
+
+from drake_dae.dae.system import Signal
+from drake_dae.errors import FloatArray, ModelError
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A vector signal over time.
+
+    Attributes:
+        values: shape (k, size).
+        signals: Name and unit of each column.
+    """
+
+    values: FloatArray
+    signals: tuple[Signal, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """All signals of a run at the ends of the integrator's steps.
+
+    On disk it is one `record.npz` that NumPy alone reads: `numpy.load("record.npz")` has "time"
+    in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
+
+    Attributes:
+        time: s, shape (k,), strictly increasing.
+        signals: Name -> values.
+    """
+
+    time: FloatArray
+    signals: Mapping[str, Recorded]
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Values of a signal, shape (k, size).
+
+        Raises:
+            ModelError: No such signal.
+        """
+        if name not in self.signals:
+            raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
+        return self.signals[name].values
+
+    @classmethod
+    def from_logs(
+        cls, loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]], context: Context
+    ) -> Self:
+        """Collects per-step logs, whatever they hold up to now.
+
+        Args:
+            loggers: Name -> (sink, names and units of its input).
+            context: Of the diagram.
+        """
+        logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
+        times = [log.sample_times() for log in logs.values()]
+        # A run that failed in the middle of a step may have logged some of the signals only.
+        count = min((len(t) for t in times), default=0)
+        time = times[0][:count] if times else np.zeros(0)
+        # The last sample of a moment is the one after the projection.
+        last = np.append(np.diff(time) > 0.0, True)[:count]
+        return cls(
+            time[last].copy(),
+            {
+                name: Recorded(log.data()[:, :count].T[last].copy(), tuple(loggers[name][1]))
+                for name, log in logs.items()
+            },
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Writes `record.npz`."""
+        arrays: dict[str, np.ndarray] = {"time": self.time}
+        for name, recorded in self.signals.items():
+            arrays[name] = recorded.values
+            arrays[f"{name}.names"] = np.array([s.name for s in recorded.signals], dtype=str)
+            arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
+        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads what `save` wrote.
+
+        Raises:
+            ModelError: The file holds something else.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                names = [key for key in file.files if f"{key}.names" in file.files]
+                signals = {name: _read(file, name) for name in names}
+                return cls(file["time"], signals)
+        except (AttributeError, KeyError, TypeError, ValueError, BadZipFile) as error:
+            raise ModelError(f"{path} is not a record of a run: {error}") from None
+
+
+def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:
+    labels = zip(file[f"{name}.names"], file[f"{name}.units"], strict=True)
+    signals = tuple(Signal(str(label), str(unit)) for label, unit in labels)
+    return Recorded(file[name], signals)

@@ -1,0 +1,240 @@
+"""Running a diagram: progress, clean interruption, and what it took."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from math import isfinite
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from pydrake.systems.analysis import (
+    ApplySimulatorConfig,
+    GetIntegrationSchemes,
+    Simulator,
+    SimulatorConfig,
+)
+from pydrake.systems.framework import Context, Diagram, EventStatus
+from pydrake.systems.primitives import Integrator
+from tqdm import tqdm
+
+from drake_dae.errors import ModelError, SimulationError
+
+BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
+"""Between two updates of the progress bar, or two lines where there is no terminal for it, in s."""
+
+
+@dataclass(frozen=True)
+class RunStatistics:
+    """What a run took.
+
+    Attributes:
+        simulated_time: How far it came, s.
+        wall_time: s.
+        steps: Of the integrator.
+        interrupted: Whether Ctrl-C ended it early.
+    """
+
+    simulated_time: float
+    wall_time: float
+    steps: int
+    interrupted: bool
+
+    @property
+    def times_real_time(self) -> float:
+        """Simulated seconds per second."""
+        return self.simulated_time / max(self.wall_time, 1e-9)
+
+
+def simulate(
+    diagram: Diagram,
+    context: Context,
+    duration: float,
+    config: SimulatorConfig,
+    progress: bool = False,
+) -> RunStatistics:
+    """Runs a diagram from a context; the context is the end state afterwards, on the manifold.
+
+    Ctrl-C ends the run after the current step; logs keep what they have, as they do when the run
+    fails with an exception.
+
+    Args:
+        diagram: The system.
+        context: Its context with the start state; changed in place.
+        duration: How long, s.
+        config: Drake's integrator settings. The run begins at its start_time.
+        progress: Shows simulated time and speed on stderr.
+
+    Raises:
+        ModelError: A duration or settings that make no sense.
+        SimulationError: The run cannot go on.
+    """
+    check_duration(duration)
+    check_config(config)
+    simulator = Simulator(diagram, context)
+    ApplySimulatorConfig(config, simulator)
+    # Under error control, witness functions take their accuracy from the context.
+    context.SetAccuracy(config.accuracy)
+    start = context.get_time()
+    with _interrupt_flag() as interrupted, _Progress(duration, progress) as shown:
+
+        def monitor(current: Context) -> EventStatus:
+            shown.update(current.get_time() - start)
+            if interrupted.is_set():
+                return EventStatus.ReachedTermination(diagram, "interrupted")
+            return EventStatus.DidNothing()
+
+        try:
+            simulator.Initialize()
+            simulator.set_monitor(monitor)
+            began = time.perf_counter()
+            simulator.AdvanceTo(start + duration)
+            elapsed = time.perf_counter() - began
+            steps = simulator.get_num_steps_taken()
+            simulator.AdvancePendingEvents()
+        except RuntimeError as error:
+            state = context.get_continuous_state_vector().CopyToVector()
+            raise SimulationError(
+                f"the simulation cannot go on at t = {context.get_time():.6g} s, state "
+                f"{np.array2string(state, precision=4, separator=', ')}: {error} Where the state "
+                "grows without bound or a reference leaves what the robot can reach, change these; "
+                "otherwise choose other integrator settings",
+                context.get_time(),
+                state,
+            ) from error
+        shown.finish(context.get_time() - start)
+        return RunStatistics(context.get_time() - start, elapsed, steps, interrupted.is_set())
+
+
+def check_duration(duration: float) -> None:
+    """Refuses a duration that is not positive.
+
+    Raises:
+        ModelError: It is not.
+    """
+    if not (isfinite(duration) and duration > 0.0):
+        raise ModelError(f"a duration must be positive, got {duration} s")
+
+
+def check_config(config: SimulatorConfig) -> None:
+    """Refuses settings that Drake takes and that then hang, fail late, or are ignored.
+
+    Raises:
+        ModelError: The setting, and what would fit.
+    """
+    scheme = config.integration_scheme
+    # CENIC simulates a MultibodyPlant, and a constrained robot is none.
+    schemes = [name for name in GetIntegrationSchemes() if name != "cenic"]
+    if scheme not in schemes:
+        near = get_close_matches(scheme, schemes, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ModelError(
+            f"integration_scheme: no scheme '{scheme}' for these systems; {hint}there are "
+            f"{', '.join(schemes)}"
+        )
+    for name in ("accuracy", "max_step_size"):
+        value = getattr(config, name)
+        if not (isfinite(value) and value > 0.0):
+            raise ModelError(f"{name} must be positive, got {value}")
+    if not config.target_realtime_rate >= 0.0:
+        raise ModelError(
+            f"target_realtime_rate must not be negative, got {config.target_realtime_rate}; 0 is "
+            "as fast as possible"
+        )
+    if config.use_error_control:
+        trial = Simulator(Integrator(1))
+        ApplySimulatorConfig(config, trial)
+        if trial.get_integrator().get_fixed_step_mode():
+            raise ModelError(
+                f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
+                "step, or choose runge_kutta5"
+            )
+
+
+class _Progress:
+    """Simulated time and speed on stderr: a bar on a terminal, elsewhere a line now and then."""
+
+    def __init__(self, duration: float, enabled: bool) -> None:
+        self._duration = duration
+        self._enabled = enabled
+        self._terminal = sys.stderr.isatty()
+        self._period = BAR_PERIOD if self._terminal else LINE_PERIOD
+        self._bar = tqdm(
+            total=duration,
+            disable=not (enabled and self._terminal),
+            file=sys.stderr,
+            **_default_size(),
+            bar_format="{desc}{percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s{postfix}",
+        )
+        self._began = self._shown = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.close()
+
+    def update(self, simulated: float) -> None:
+        """Shows the simulated time in s, if it is time to."""
+        if self._enabled and time.perf_counter() - self._shown >= self._period:
+            self._show(simulated)
+
+    def finish(self, simulated: float) -> None:
+        """Shows where the run ended; lines are for runs that last."""
+        if self._terminal or self._shown > self._began:
+            self._show(simulated)
+
+    def _show(self, simulated: float) -> None:
+        self._shown = time.perf_counter()
+        speed = f"{simulated / (self._shown - self._began):.1f} x real time"
+        if self._terminal:
+            self._bar.set_postfix_str(speed, refresh=False)
+            self._bar.n = min(simulated, self._duration)
+            self._bar.refresh()
+        elif self._enabled:
+            text = f"{simulated:.2f}/{self._duration:.2f} s, {speed}"
+            print(text, file=sys.stderr, flush=True)
+
+
+def _default_size() -> dict[str, int]:
+    """For tqdm, where the terminal says that it has no columns, as in some containers."""
+    try:
+        known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
+    except OSError:
+        known = False
+    return {} if known else {"ncols": 79, "nrows": 24}
+
+
+@contextmanager
+def _interrupt_flag() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets, instead of an exception in the middle of a step.
+
+    A second Ctrl-C raises KeyboardInterrupt as usual.
+    """
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+
+    def handle(number: int, frame: object) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    previous = signal.signal(signal.SIGINT, handle)
+    try:
+        yield event
+    finally:
+        # None: the handler before was not Python's.
+        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)

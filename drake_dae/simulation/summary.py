@@ -1,0 +1,156 @@
+"""The figures of a run as a table."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from drake_dae.errors import FloatArray
+from drake_dae.robots.model import RobotModel
+from drake_dae.simulation.record import Record
+from drake_dae.simulation.simulate import RunStatistics
+
+_SLACK = 1e-9
+"""Of joint limits, in their unit: a start on the limit is not beyond it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What a robot can take; None where it has no limits.
+
+    Attributes:
+        control: Largest |u|, shape (p,).
+        state: Lowest and highest (q, v), shape (nq + nv,) each.
+    """
+
+    control: FloatArray | None = None
+    state: tuple[FloatArray, FloatArray] | None = None
+
+    @classmethod
+    def of(cls, model: RobotModel) -> Self:
+        """Those of a robot: of what drives it, and of its joints."""
+        links, state = model.links, None
+        if hasattr(links, "position_limits") and hasattr(links, "velocity_limits"):
+            pairs = zip(links.position_limits, links.velocity_limits, strict=True)
+            lower, upper = (np.concatenate(pair) for pair in pairs)
+            state = (lower, upper)
+        return cls(model.control_limits, state)
+
+
+def summary(
+    record: Record,
+    predicted: FloatArray,
+    limits: Limits | None = None,
+    run: RunStatistics | None = None,
+    failure: str = "",
+) -> str:
+    """What a run did, in plain text.
+
+    Args:
+        record: With state, tracking_error, constraint_residual, constraint_force and control.
+        predicted: Tracking error by theory, shape (k, p).
+        limits: Of the robot.
+        run: What it took; None for a run that failed.
+        failure: Why it failed.
+    """
+    limits = limits or Limits()
+    sections = [_errors(record, predicted), _forces(record), _controls(record, limits)]
+    residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
+    notes = [f"constraint residual  {residual:.2g} at most, before each step's projection"]
+    notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
+    if run is not None:
+        notes.append(
+            f"simulated            {run.simulated_time:g} s in {run.steps} steps, "
+            f"{run.wall_time:.2f} s, {run.times_real_time:.1f} times real time"
+        )
+        if run.interrupted:
+            notes.append("interrupted          the record ends there")
+    if failure:
+        notes.append(f"failed               the record ends at {record.time[-1]:.6g} s: {failure}")
+    return "\n\n".join("\n".join(lines) for lines in [*sections, notes] if lines)
+
+
+def _errors(record: Record, predicted: FloatArray) -> list[str]:
+    signals = record.signals["tracking_error"].signals
+    return _table(
+        ["tracking error", "unit", "start", "largest", "final", "off prediction by"],
+        [
+            [
+                signal.name,
+                signal.unit or "1",
+                f"{error[0]:.3g}",
+                f"{np.max(np.abs(error)):.3g}",
+                f"{error[-1]:.3g}",
+                f"{np.max(np.abs(error - theory)):.2g}",
+            ]
+            for signal, error, theory in zip(
+                signals, record["tracking_error"].T, predicted.T, strict=True
+            )
+        ],
+    )
+
+
+def _forces(record: Record) -> list[str]:
+    forces = record.signals["constraint_force"]
+    if not forces.signals:
+        return []
+    return _table(
+        ["constraint force", "unit", "least", "largest", ""],
+        [
+            [
+                signal.name,
+                signal.unit or "1",
+                f"{np.min(values):.4g}",
+                f"{np.max(values):.4g}",
+                "pulls: a real contact would open" if np.min(values) < 0 else "",
+            ]
+            for signal, values in zip(forces.signals, forces.values.T, strict=True)
+        ],
+    )
+
+
+def _controls(record: Record, limits: Limits) -> list[str]:
+    controls = record.signals["control"]
+    largest = np.full(len(controls.signals), np.inf) if limits.control is None else limits.control
+    return _table(
+        ["control", "unit", "least", "largest", "limit", ""],
+        [
+            [
+                signal.name,
+                signal.unit or "1",
+                f"{np.min(values):.4g}",
+                f"{np.max(values):.4g}",
+                f"{limit:.4g}" if np.isfinite(limit) else "none",
+                "over its limit" if np.max(np.abs(values)) > limit else "",
+            ]
+            for signal, values, limit in zip(
+                controls.signals, controls.values.T, largest, strict=True
+            )
+        ],
+    )
+
+
+def _beyond(record: Record, limits: Limits) -> list[str]:
+    """Positions and velocities that leave their limits."""
+    if limits.state is None:
+        return []
+    states = record.signals["state"]
+    rows = zip(states.signals, states.values.T, *limits.state, strict=False)
+    return [
+        f"{signal.name} goes from {np.min(values):.4g} to {np.max(values):.4g} {signal.unit}, "
+        f"its limits are {lower:.4g} and {upper:.4g}"
+        for signal, values, lower, upper in rows
+        if np.min(values) < lower - _SLACK or np.max(values) > upper + _SLACK
+    ]
+
+
+def _table(head: list[str], rows: list[list[str]]) -> list[str]:
+    """Columns as wide as they must be: names and notes to the left, numbers to the right."""
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    return [
+        "  ".join(
+            text.ljust(width) if i < 2 or not head[i] else text.rjust(width)
+            for i, (text, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in [head, *rows]
+    ]

@@ -1,0 +1,220 @@
+"""Any DaeSystem as a LeafSystem."""
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    ContinuousState,
+    EventStatus,
+    State,
+)
+
+from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.manifold import CONSISTENT
+from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import (
+    FloatArray,
+    InconsistentStateError,
+    NonFiniteError,
+    SingularityError,
+)
+from drake_dae.systems.parameters import ParameterizedSystem
+
+SINGULAR = 1e-12
+"""Below this sine between columns a matrix counts as singular; see `expressions.Factorization`."""
+
+
+class DaePlant(ParameterizedSystem):
+    """The solution of a differential-algebraic system (1)-(3) on its manifold N*:
+
+        x' = f(x) + g(x) v + h(x) u,    v = alpha(x) + beta(x) u,    z = l(x) + m(x) v.
+
+    The state stays on N*: after each step it is projected to round-off. Drake does that at the
+    start of the next step, so a log or a monitor sees it before its projection;
+    `Simulator.AdvancePendingEvents()` projects the last state of a run.
+
+    Input port:
+        control: u, shape (p,).
+
+    Output ports:
+        state: x, shape (n,).
+        constraint_force: v, shape (m,); direct feedthrough from `control` where beta is not zero.
+        constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, constraint-major, shape
+            (sum r_i,); zero on N*.
+        controlled_output: z, shape (p,); direct feedthrough where n* = m beta is not zero.
+
+    The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
+    The default state is the consistent one next to `system.nominal_state`.
+
+    Args:
+        system: The system, or its structure if that is known already.
+        project: False leaves the drift off N* uncorrected, to study it.
+
+    Raises:
+        AssumptionError: The system violates an assumption of the theory.
+        InconsistentStateError: At the start of a simulation, for a start state that is off N*.
+        SingularityError, NonFiniteError: During a simulation, with time and state.
+    """
+
+    def __init__(self, system: DaeSystem | Structure, project: bool = True) -> None:
+        structure = system if isinstance(system, Structure) else find_structure(system)
+        super().__init__(structure.system, structure.system.parameter_values)
+        self.structure = structure
+        self.set_name(self.dae.name)
+        dae, elimination, motion = self.dae, structure.elimination, structure.motion
+        control = motion.control
+        force = motion.expand(motion.constraint_input)
+        x, p = dae.state, dae.parameter_symbol
+        inputs = {"state": x, "control": control, "parameters": p}
+        self.dynamics = TracedFunction(
+            f"{dae.name} dynamics",
+            inputs,
+            {
+                "derivative": motion.expand(motion.rate),
+                "pivot": elimination.pivot,
+            },
+        )
+        self._force = TracedFunction(
+            f"{dae.name} constraint force", inputs, {"force": force, "pivot": elimination.pivot}
+        )
+        self._output = TracedFunction(
+            f"{dae.name} controlled output",
+            inputs,
+            {"output": dae.l + ca.mtimes(dae.m, force), "pivot": elimination.pivot},
+        )
+        self._no_control = np.zeros(dae.num_controls)
+
+        state_index = self.DeclareContinuousState(
+            BasicVector(structure.manifold.project(dae.nominal_state))
+        )
+        self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
+        by_state = {self.xc_ticket(), self.all_parameters_ticket()}
+        by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
+        self._force_needs_control = elimination.beta.nnz() > 0
+        self._output_needs_control = elimination.n_star.nnz() > 0
+        self.DeclareStateOutputPort("state", state_index)
+        self.DeclareVectorOutputPort(
+            "constraint_force",
+            dae.num_constraints,
+            self._calc_force,
+            by_control if self._force_needs_control else by_state,
+        )
+        self.DeclareVectorOutputPort(
+            "constraint_residual",
+            len(structure.manifold.residual_signals),
+            self._calc_residual,
+            by_state,
+        )
+        self.DeclareVectorOutputPort(
+            "controlled_output",
+            dae.num_controls,
+            self._calc_output,
+            by_control if self._output_needs_control else by_state,
+        )
+        self.DeclareInitializationPublishEvent(self._check_start)
+        if project and dae.num_constraints:
+            self.DeclarePerStepUnrestrictedUpdateEvent(self._project)
+
+    def state(self, context: Context) -> FloatArray:
+        """x, shape (n,)."""
+        return context.get_continuous_state_vector().CopyToVector()
+
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Sets x as given, shape (n,); a run from there is refused if it is off N*."""
+        context.SetContinuousState(np.asarray(state, dtype=float))
+
+    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
+        """Sets the state on N* next to a guess, shape (n,), and returns it.
+
+        Raises:
+            InconsistentStateError: None found near the guess.
+        """
+        state = self.structure.manifold.project(guess, self.parameters(context))
+        self.set_state(context, state)
+        return state
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        value = self._evaluate(self.dynamics, context, self._control_port.Eval(context))
+        derivatives.get_mutable_vector().SetFromVector(value)
+
+    def _evaluate(
+        self, function: TracedFunction, context: Context, control: FloatArray
+    ) -> FloatArray:
+        x = context.get_continuous_state_vector().CopyToVector()
+        p = context.get_numeric_parameter(0).value()
+        value, pivot = function.evaluate(x, control, p)
+        if not function.is_finite:
+            raise _failure(function, context, x, control, self.dae)
+        if pivot[0] < SINGULAR:
+            raise SingularityError(
+                f"{self.dae.name}: A(x) of Assumption (2) is singular at t = "
+                f"{context.get_time():.6g} s, so the constraint forces are not determined: the "
+                "constraints depend on each other there. State: "
+                f"{np.array2string(x, precision=4, separator=', ')}",
+                context.get_time(),
+                x,
+            )
+        return value
+
+    def _control(self, context: Context, needed: bool) -> FloatArray:
+        return self._control_port.Eval(context) if needed else self._no_control
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        control = self._control(context, self._force_needs_control)
+        output.SetFromVector(self._evaluate(self._force, context, control))
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        control = self._control(context, self._output_needs_control)
+        output.SetFromVector(self._evaluate(self._output, context, control))
+
+    def _calc_residual(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(
+            self.structure.manifold.residual(self.state(context), self.parameters(context))
+        )
+
+    def _check_start(self, context: Context) -> EventStatus:
+        manifold = self.structure.manifold
+        residual = manifold.residual(self.state(context), self.parameters(context))
+        if np.max(np.abs(residual), initial=0.0) <= CONSISTENT:
+            return EventStatus.DidNothing()
+        table = ", ".join(
+            f"{signal.name} = {value:.3g} {signal.unit}"
+            for signal, value in zip(manifold.residual_signals, residual, strict=True)
+            if not abs(value) <= CONSISTENT
+        )
+        raise InconsistentStateError(
+            f"{self.dae.name}: the start state is not on the constraint: {table}. Call "
+            "set_consistent_state(context, guess) to start from the nearest consistent state",
+            residual,
+        )
+
+    def _project(self, context: Context, state: State) -> EventStatus:
+        x = self.structure.manifold.project(self.state(context), self.parameters(context))
+        state.get_mutable_continuous_state().SetFromVector(x)
+        return EventStatus.Succeeded()
+
+
+def _failure(
+    function: TracedFunction,
+    context: Context,
+    state: FloatArray,
+    control: FloatArray,
+    dae: DaeSystem,
+) -> NonFiniteError:
+    """Names the input that was not finite, or else the function."""
+    bad = [s.name for s, v in zip(dae.control_signals, control, strict=True) if not np.isfinite(v)]
+    bad += [s.name for s, v in zip(dae.state_signals, state, strict=True) if not np.isfinite(v)]
+    reason = (
+        f"its input {', '.join(bad)} is not finite"
+        if bad
+        else "a singular A(x), or a function left its domain"
+    )
+    return NonFiniteError(
+        f"{function.name} is not finite at t = {context.get_time():.6g} s: {reason}. State: "
+        f"{np.array2string(state, precision=4, separator=', ')}",
+        context.get_time(),
+        state,
+    )

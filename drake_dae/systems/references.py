@@ -1,0 +1,313 @@
+"""References with all the derivatives that a tracking law asks for."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from math import factorial
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
+
+from drake_dae.dae.expressions import TracedFunction
+from drake_dae.errors import FloatArray, NonFiniteError, ReferenceSignalError
+
+
+class ReferenceSignal(Protocol):
+    """Desired values of one or several outputs over time.
+
+    Attributes:
+        size: How many outputs it covers.
+    """
+
+    @property
+    def size(self) -> int: ...
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        """Prepares r_1, r_1', ..., r_1^(mu_1), r_2, ... as a function of the time in s.
+
+        Args:
+            degrees: mu of each covered output.
+
+        Raises:
+            ReferenceSignalError: The signal is not smooth enough for these degrees.
+        """
+
+
+class ExpressionSignal:
+    """A reference r(t) that is a CasADi expression of time; differentiated exactly.
+
+    Args:
+        function: Of a CasADi scalar t in s; returns an expression, or a list of these.
+    """
+
+    def __init__(self, function: Callable[[ca.SX], Any]) -> None:
+        self._time = ca.SX.sym("t")
+        value = function(self._time)
+        items = value if isinstance(value, (list, tuple)) else [value]
+        self.expression = ca.vertcat(*items)
+        if not isinstance(self.expression, ca.SX):
+            self.expression = ca.SX(self.expression)
+        unknown = [s.name() for s in ca.symvar(self.expression) if not ca.is_equal(s, self._time)]
+        if unknown or self.expression.shape[1] != 1:
+            raise ReferenceSignalError(
+                "a reference must be a column of expressions of the time alone, got shape "
+                f"{self.expression.shape} with {', '.join(unknown) or 'no'} other symbols"
+            )
+
+    @property
+    def size(self) -> int:
+        return int(self.expression.numel())
+
+    def derivative_expressions(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        """r_1, r_1', ..., r_1^(mu_1), r_2, ... at a symbolic time."""
+        rows = []
+        for i, degree in enumerate(degrees):
+            rows.append(self.expression[i])
+            for _ in range(degree):
+                rows.append(ca.jacobian(rows[-1], self._time))
+        return ca.substitute(ca.vertcat(*rows), self._time, time)
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        rows = self.derivative_expressions(degrees, self._time)
+        return _at_time(TracedFunction("reference", {"time": self._time}, {"R": rows}))
+
+
+def constant(values: ArrayLike) -> ExpressionSignal:
+    """Stays at given values, shape (k,)."""
+    numbers = np.atleast_1d(np.asarray(values, dtype=float))
+    return ExpressionSignal(lambda t: list(numbers))
+
+
+def sinusoids(
+    offset: float,
+    amplitudes: ArrayLike,
+    frequencies: ArrayLike,
+    phases: ArrayLike = 0.0,
+) -> ExpressionSignal:
+    """offset + sum_i amplitude_i sin(frequency_i t + phase_i).
+
+    Args:
+        offset: In the output's unit.
+        amplitudes: In the output's unit, shape (k,).
+        frequencies: rad/s, shape (k,).
+        phases: rad, shape (k,).
+
+    Raises:
+        ReferenceSignalError: Shapes that do not fit.
+    """
+    try:
+        rows = np.broadcast_arrays(*map(np.atleast_1d, (amplitudes, frequencies, phases)))
+    except ValueError:
+        raise ReferenceSignalError(
+            "sinusoids: amplitudes, frequencies and phases must have the same length"
+        ) from None
+    terms = np.array(rows, dtype=float).T
+    return ExpressionSignal(lambda t: offset + sum(a * ca.sin(w * t + p) for a, w, p in terms))
+
+
+class _Move(ExpressionSignal):
+    """A move from rest to rest that knows how smooth it is."""
+
+    def __init__(self, function: Callable[[ca.SX], Any], order: int) -> None:
+        super().__init__(function)
+        self._order = order
+
+    def derivative_expressions(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        if max(degrees) > self._order:
+            raise ReferenceSignalError(
+                f"point_to_point has {self._order} continuous derivatives, the law needs "
+                f"{max(degrees)}: pass order={max(degrees)} or more"
+            )
+        return super().derivative_expressions(degrees, time)
+
+
+def point_to_point(
+    start: ArrayLike, end: ArrayLike, start_time: float, end_time: float, order: int = 2
+) -> ExpressionSignal:
+    """A smooth move from rest at `start` to rest at `end`, held before and after.
+
+    The polynomial of degree 2 order + 1 whose derivatives 1, ..., order vanish at both ends:
+    order 2 is the quintic.
+
+    Args:
+        start: shape (k,).
+        end: shape (k,).
+        start_time: s.
+        end_time: s.
+        order: How many derivatives are continuous; at least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: Shapes or times that do not fit.
+    """
+    first, last = np.broadcast_arrays(np.atleast_1d(start), np.atleast_1d(end))
+    if not end_time > start_time:
+        raise ReferenceSignalError(f"end_time {end_time} must be after start_time {start_time}")
+    if order < 0:
+        raise ReferenceSignalError(f"order must not be negative, got {order}")
+
+    def function(t: ca.SX) -> list[ca.SX]:
+        s = (t - start_time) / (end_time - start_time)
+        # The integral of s^order (1 - s)^order, scaled to 1 at s = 1.
+        scale = factorial(2 * order + 1) / factorial(order) ** 2
+        fraction = scale * sum(
+            factorial(order)
+            / (factorial(k) * factorial(order - k))
+            * (-1.0) ** k
+            / (order + k + 1)
+            * s ** (order + k + 1)
+            for k in range(order + 1)
+        )
+        blend = ca.if_else(s <= 0, 0, ca.if_else(s >= 1, 1, fraction))
+        return [a + (b - a) * blend for a, b in zip(first, last, strict=True)]
+
+    return _Move(function, order)
+
+
+class TrajectorySignal:
+    """A Drake Trajectory, shape (k, 1), with the derivatives that it provides itself.
+
+    Args:
+        trajectory: Any column-valued Trajectory.
+
+    Raises:
+        ReferenceSignalError: At preparation: no derivatives, or, for a PiecewisePolynomial, a
+            derivative below the highest one that jumps at a break. During a simulation: a time
+            outside the trajectory, which Drake would silently clip.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        if trajectory.cols() != 1:
+            raise ReferenceSignalError(
+                f"a reference Trajectory must be a column, this one is {trajectory.rows()} x "
+                f"{trajectory.cols()}"
+            )
+        self.trajectory = trajectory
+
+    @property
+    def size(self) -> int:
+        return int(self.trajectory.rows())
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        highest = max(degrees)
+        path = self.trajectory
+        if highest and not path.has_derivative():
+            raise ReferenceSignalError(
+                f"{type(path).__name__} has no derivatives, the law needs {highest}"
+            )
+        if isinstance(path, PiecewisePolynomial):
+            self._check_breaks(path, degrees)
+        first, last = path.start_time(), path.end_time()
+        slack = 1e-9 * max(1.0, abs(last))
+
+        def evaluate(time: float) -> FloatArray:
+            if not first - slack <= time <= last + slack:
+                raise ReferenceSignalError(
+                    f"the reference Trajectory covers {first:g} to {last:g} s and was asked for "
+                    f"t = {time:g} s; extend it over the whole simulation"
+                )
+            table = [path.value(time)] + [
+                path.EvalDerivative(time, k) for k in range(1, highest + 1)
+            ]
+            return np.array(
+                [table[k][i, 0] for i, degree in enumerate(degrees) for k in range(degree + 1)]
+            )
+
+        return evaluate
+
+    @staticmethod
+    def _check_breaks(path: PiecewisePolynomial, degrees: Sequence[int]) -> None:
+        breaks = path.get_segment_times()[1:-1]
+        for order in range(max(degrees)):
+            derivative = path.derivative(order) if order else path
+            for index, time in enumerate(breaks):
+                left = derivative.getPolynomialMatrix(index)
+                right = derivative.getPolynomialMatrix(index + 1)
+                width = time - path.get_segment_times()[index]
+                for i, degree in enumerate(degrees):
+                    before, after = (
+                        left[i, 0].EvaluateUnivariate(width),
+                        right[i, 0].EvaluateUnivariate(0.0),
+                    )
+                    if order < degree and abs(before - after) > 1e-6 * (1.0 + abs(before)):
+                        raise ReferenceSignalError(
+                            f"derivative {order} of row {i} of the reference Trajectory jumps by "
+                            f"{after - before:.3g} at t = {time:g} s, but the law needs a "
+                            f"reference with {degree} derivatives; use a smoother trajectory"
+                        )
+
+
+class ReferenceGenerator(LeafSystem):
+    """References of all outputs, stacked, with their derivatives.
+
+    Output port:
+        reference: R(t) of (28): r_1, r_1', ..., r_1^(mu_1), r_2, ..., output-major, shape
+            (sum (mu_i + 1),).
+
+    Args:
+        signals: One below the other; together they cover all outputs.
+        degrees: mu_1, ..., mu_p, as `TrackingLaw.degrees`.
+
+    Raises:
+        ReferenceSignalError: Signals that cover too few or too many outputs, or that are not
+            smooth enough.
+        NonFiniteError: During a simulation.
+    """
+
+    def __init__(self, signals: Sequence[ReferenceSignal], degrees: Sequence[int]) -> None:
+        super().__init__()
+        self.set_name("reference")
+        covered = sum(signal.size for signal in signals)
+        if covered != len(degrees):
+            raise ReferenceSignalError(
+                f"the references cover {covered} outputs, the law has {len(degrees)}"
+            )
+        self._evaluate = _stack(signals, degrees)
+        self.DeclareVectorOutputPort(
+            "reference",
+            sum(degree + 1 for degree in degrees),
+            self._calc_reference,
+            {self.time_ticket()},
+        )
+
+    def reference(self, time: float) -> FloatArray:
+        """R(t) at a time in s, shape (sum (mu_i + 1),)."""
+        return self._evaluate(time).copy()
+
+    def _calc_reference(self, context: Context, output: BasicVector) -> None:
+        value = self._evaluate(context.get_time())
+        if not np.isfinite(value).all():
+            time = context.get_time()
+            raise NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)
+        output.SetFromVector(value)
+
+
+def _stack(
+    signals: Sequence[ReferenceSignal], degrees: Sequence[int]
+) -> Callable[[float], FloatArray]:
+    """All signals as one function; expressions are traced together."""
+    ends = np.cumsum([0, *[signal.size for signal in signals]])
+    parts = [list(degrees[a:b]) for a, b in pairwise(ends)]
+    if all(isinstance(signal, ExpressionSignal) for signal in signals):
+        time = ca.SX.sym("t")
+        rows = [
+            signal.derivative_expressions(part, time)
+            for signal, part in zip(signals, parts, strict=True)
+            if isinstance(signal, ExpressionSignal)
+        ]
+        return _at_time(TracedFunction("reference", {"time": time}, {"R": ca.vertcat(*rows)}))
+    functions = [s.derivatives(part) for s, part in zip(signals, parts, strict=True)]
+    return lambda now: np.concatenate([function(now) for function in functions])
+
+
+def _at_time(function: TracedFunction) -> Callable[[float], FloatArray]:
+    """A traced function of the time alone, called with a float."""
+    moment = np.zeros(1)
+
+    def evaluate(time: float) -> FloatArray:
+        moment[0] = time
+        return function.evaluate(moment)[0]
+
+    return evaluate

@@ -1,0 +1,68 @@
+"""A RobotModel as a LeafSystem."""
+
+from functools import partial
+
+from pydrake.systems.framework import BasicVector, Context
+
+from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.structure import Structure
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plant import DaePlant
+
+
+class RobotPlant(DaePlant):
+    """A constrained robot (37)-(40) with the ports of `DaePlant` and:
+
+    Output ports:
+        link_state: (q, v) of the links, shape (nq + nv,), as Drake's MultibodyPlant orders it.
+        motor_state: (q_2, q_2') of the shafts, on the joints' side; with `FlexibleJoints`.
+        motor_current: I_a in A, shape (nu,); with `DcMotors`.
+        actuator_force: f_a in N, shape (nu,); with `ElectrohydraulicServos`.
+        joint_torque: What the stages deliver to the joints, N m (N), shape (nu,); with any stage.
+
+    `constraint_force` is lambda of (37), in N for contacts. With rigid joints it feeds through from
+    `control`; with any stage it is a function of the state alone.
+
+    Args:
+        model: The robot.
+        structure: Of `model.dae`, if it is known already.
+        project: False leaves the drift off N* uncorrected, to study it.
+    """
+
+    def __init__(
+        self, model: RobotModel, structure: Structure | None = None, project: bool = True
+    ) -> None:
+        super().__init__(structure or model.dae, project)
+        self.model = model
+        size = model.links.q.numel() + model.links.v.numel()
+        parts = {"link_state": slice(0, size)}
+        start = size
+        for stage in model.stages:
+            for name, part in stage.ports.items():
+                parts[name] = slice(start + part.start, start + part.stop)
+            start += stage.state.numel()
+        for name, part in parts.items():
+            self.DeclareVectorOutputPort(
+                name,
+                part.stop - part.start,
+                partial(self._calc_part, part),
+                {self.xc_ticket()},
+            )
+        if model.joint_force is not None:
+            self._joint_force = TracedFunction(
+                "joint torque",
+                {"state": model.dae.state, "parameters": model.dae.parameter_symbol},
+                {"joint_torque": model.joint_force},
+            )
+            self.DeclareVectorOutputPort(
+                "joint_torque",
+                model.joint_force.numel(),
+                self._calc_joint_torque,
+                {self.xc_ticket(), self.all_parameters_ticket()},
+            )
+
+    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self.state(context)[part])
+
+    def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._joint_force(self.state(context), self.parameters(context))[0])

@@ -1,0 +1,125 @@
+"""Measured contact forces."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, ContinuousState, LeafSystem
+
+from drake_dae.errors import FloatArray, ModelError
+
+
+class ForceSensor(LeafSystem):
+    """A force sensor with state, so that it can stand in a loop with a rigid robot:
+
+        time_constant * y' = force - y,    measured_force = y + bias + noise_deviation * noise,
+
+    and, if it samples, measured_force is held between samples. With rigid joints the constraint
+    force depends on the control in the same instant; a controller that read it directly would close
+    an algebraic loop.
+
+    Input ports:
+        force: Shape (m,), N (N m).
+        noise: Shape (m,), of deviation 1, for example from Drake's RandomSource; only with a
+            noise_deviation.
+
+    Output port:
+        measured_force: Shape (m,); no direct feedthrough from `force`.
+
+    Args:
+        size: m.
+        time_constant: Of the lag in s; 0 for none, then it must sample.
+        sample_period: s; 0 for none, then it must lag.
+        bias: Constant error in N, a number or shape (m,).
+        noise_deviation: Standard deviation in N, a number or shape (m,).
+
+    Raises:
+        ModelError: Negative numbers, or neither lag nor sampling.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        time_constant: float = 0.0,
+        sample_period: float = 0.0,
+        bias: ArrayLike = 0.0,
+        noise_deviation: ArrayLike = 0.0,
+    ) -> None:
+        super().__init__()
+        self.set_name("force_sensor")
+        self.time_constant = float(time_constant)
+        self.sample_period = float(sample_period)
+        try:
+            self._bias = np.broadcast_to(np.asarray(bias, dtype=float), (size,))
+            self._deviation = np.broadcast_to(np.asarray(noise_deviation, dtype=float), (size,))
+        except ValueError:
+            raise ModelError(
+                f"a ForceSensor's bias and noise_deviation are numbers or shape ({size},), got "
+                f"{bias!r} and {noise_deviation!r}"
+            ) from None
+        if self.time_constant < 0 or self.sample_period < 0 or (self._deviation < 0).any():
+            raise ModelError(
+                "a ForceSensor's time_constant, sample_period and noise_deviation must not be "
+                f"negative, got {time_constant}, {sample_period}, {noise_deviation!r}"
+            )
+        if not (self.time_constant or self.sample_period):
+            raise ModelError(
+                "a ForceSensor needs a time_constant or a sample_period: without state it would "
+                "close an algebraic loop"
+            )
+        self._force_port = self.DeclareVectorInputPort("force", size)
+        self._noise_port = None
+        if self._deviation.any():
+            self._noise_port = self.DeclareVectorInputPort("noise", size)
+        if self.time_constant:
+            self.DeclareContinuousState(size)
+        if self.sample_period:
+            self._held = self.DeclareDiscreteState(size)
+            self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, self._sample)
+            sources = {self.xd_ticket()}
+        else:
+            sources = {self.xc_ticket()}
+            if self._noise_port is not None:
+                sources.add(self.input_port_ticket(self._noise_port.get_index()))
+        self.DeclareVectorOutputPort("measured_force", size, self._calc_measured, sources)
+
+    def set_force(self, context: Context, force: ArrayLike) -> None:
+        """Starts the sensor as if it had felt a constant force, shape (m,), without noise."""
+        value = np.asarray(force, dtype=float)
+        if self.time_constant:
+            context.SetContinuousState(value)
+        if self.sample_period:
+            context.SetDiscreteState(self._held, value + self._bias)
+
+    def largest_stable_gain(self) -> float:
+        """Largest gain Gbar of (59) for which a rigid robot's force error decays.
+
+        With the lag alone it is infinite: the error decays at (1 + G) / time_constant. A sampled
+        sensor multiplies the error by a - (1 - a) G a step, a = exp(-period / time_constant).
+        """
+        if not self.sample_period:
+            return np.inf
+        a = np.exp(-self.sample_period / self.time_constant) if self.time_constant else 0.0
+        return float((1.0 + a) / (1.0 - a))
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        if self.time_constant:
+            felt = context.get_continuous_state_vector().CopyToVector()
+            rate = (self._force_port.Eval(context) - felt) / self.time_constant
+            derivatives.get_mutable_vector().SetFromVector(rate)
+
+    def _felt(self, context: Context) -> FloatArray:
+        if self.time_constant:
+            value = context.get_continuous_state_vector().CopyToVector()
+        else:
+            value = self._force_port.Eval(context)
+        if self._noise_port is not None:
+            value = value + self._deviation * self._noise_port.Eval(context)
+        return value + self._bias
+
+    def _sample(self, context: Context, state: object) -> None:
+        state.set_value(self._held, self._felt(context))  # type: ignore[attr-defined]
+
+    def _calc_measured(self, context: Context, output: BasicVector) -> None:
+        if self.sample_period:
+            output.SetFromVector(context.get_discrete_state(self._held).value())
+        else:
+            output.SetFromVector(self._felt(context))

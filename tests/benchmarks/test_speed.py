@@ -1,0 +1,102 @@
+"""Speed, reported and never judged: `make benchmark`. Ratios are of one run."""
+
+import time
+import timeit
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_dae import build, load_scenario, simulate
+from drake_dae.diagrams.scenario import find_scenario
+
+SCENARIOS = ["two_link_wall", "seven_joint_wall"]
+TARGETS = {"two_link_wall": 20.0, "seven_joint_wall": 60.0}
+
+
+class _EmptyPlant(LeafSystem):
+    def __init__(self, states, controls):
+        super().__init__()
+        index = self.DeclareContinuousState(states)
+        self.control = self.DeclareVectorInputPort("control", controls)
+        self.DeclareStateOutputPort("state", index)
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        self.control.Eval(context)
+        derivatives.get_mutable_vector().SetFromVector(
+            context.get_continuous_state_vector().CopyToVector()
+        )
+
+
+class _EmptyController(LeafSystem):
+    def __init__(self, states, references, controls):
+        super().__init__()
+        self.state = self.DeclareVectorInputPort("estimated_state", states)
+        self.reference = self.DeclareVectorInputPort("reference", references)
+        self.value = np.zeros(controls)
+        self.DeclareVectorOutputPort("control", controls, self.calc)
+
+    def calc(self, context, output):
+        self.state.Eval(context)
+        self.reference.Eval(context)
+        output.SetFromVector(self.value)
+
+
+def microseconds(diagram, context, repeat=5, number=4000):
+    """Least time of one derivative evaluation at a new state, over repeats."""
+    state = context.get_continuous_state_vector().CopyToVector()
+    derivatives = diagram.AllocateTimeDerivatives()
+
+    def touch():
+        context.SetTime(0.5)
+        context.SetContinuousState(state)
+
+    def evaluate():
+        touch()
+        diagram.CalcTimeDerivatives(context, derivatives)
+
+    whole, part = (
+        min(timeit.repeat(f, number=number, repeat=repeat)) / number for f in (evaluate, touch)
+    )
+    return 1e6 * (whole - part)
+
+
+def empty_loop(states, references, controls):
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(_EmptyPlant(states, controls))
+    controller = builder.AddSystem(_EmptyController(states, references, controls))
+    source = builder.AddSystem(ConstantVectorSource(np.zeros(references)))
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    builder.Connect(source.get_output_port(), controller.GetInputPort("reference"))
+    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    return diagram, diagram.CreateDefaultContext()
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_derivative_evaluation(name, report):
+    loop, context = build(load_scenario(find_scenario(name)))
+    law = loop.controller.law
+    empty = empty_loop(law.system.num_states, len(law.reference_signals), law.system.num_controls)
+    ours, drake = microseconds(loop.diagram, context), microseconds(*empty)
+    report(
+        f"{name}: {ours:.1f} us for a closed-loop derivative (wanted at most "
+        f"{TARGETS[name]:.0f}), {ours / drake:.1f} times the {drake:.1f} us of an empty Python "
+        f"plant and controller; operations: plant {loop.plant.dynamics.num_operations}, law "
+        f"{law.function.num_operations}"
+    )
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_building_and_running(name, report):
+    began = time.perf_counter()
+    scenario = load_scenario(find_scenario(name), ["integrator.accuracy=1e-6"])
+    loop, context = build(scenario)
+    built = time.perf_counter() - began
+    run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+    report(
+        f"{name}: {built:.2f} s to parse, trace and build (wanted below 2), then "
+        f"{run.times_real_time:.0f} times real time at accuracy 1e-6 (wanted at least 20), "
+        f"{run.steps} steps"
+    )

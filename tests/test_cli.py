@@ -1,0 +1,340 @@
+"""The command: what it prints, what it leaves, and how it ends."""
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from recordings import animation
+
+import drake_dae
+from drake_dae import Record, cli, load_scenario
+from drake_dae.cli import FILES, main
+from drake_dae.diagrams.scenario import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
+from drake_dae.simulation.plots import PLOTS
+
+QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
+BARE = [*QUICK, "--set", "write.record=false"]
+SHORT = ["--set", "duration=0.2"]
+
+
+def command(*arguments, **options):
+    return subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", "drake_dae", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+def error_line(capsys):
+    """The one line on stderr."""
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    return line
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """The default scenario, as `make demo` runs it but for its length."""
+    folder = tmp_path_factory.mktemp("demo") / "run"
+    process = command("simulate", "--out", folder, "--set", "duration=2")
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    return folder, out, err
+
+
+# What it leaves.
+
+
+def test_the_run_folder_is_complete(demo):
+    folder, _, _ = demo
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    for name in PLOTS:
+        data = (folder / name).read_bytes()
+        assert data.startswith(b"\x89PNG")
+        assert data.endswith(b"IEND\xaeB`\x82")
+
+
+def test_it_prints_the_summary(demo):
+    folder, out, err = demo
+    text = (folder / "summary.txt").read_text()
+    assert text in out
+    assert out.splitlines()[0].startswith(f"{DEFAULT_SCENARIO}: built in ")
+    assert out.splitlines()[-1] == f"written to {folder}/: {', '.join(FILES)}"
+    assert re.search(r"simulated +2 s in \d+ steps, [\d.]+ s, [\d.]+ times real time", text)
+    for name in ("tool.y", "tool.z", "joint7", "wall.force", "joint1_motor"):
+        assert name in text
+    # Lines of progress are for runs that last.
+    assert err == ""
+
+
+def test_the_record_is_that_of_the_scenario(demo):
+    folder, _, _ = demo
+    record = Record.load(folder / "record.npz")
+    assert (record.time[0], record.time[-1]) == (0.0, 2.0)
+    np.testing.assert_allclose(
+        record["constraint_force"][:, 0], 20.0 + 5.0 * np.sin(2.0 * record.time), atol=1e-9
+    )
+
+
+def test_the_page_holds_the_animation(demo):
+    folder, _, _ = demo
+    tracks = animation((folder / "animation.html").read_text())
+    links = {path.split("/")[-1] for path, name in tracks if path.startswith("/drake/visualizer/")}
+    assert {f"link{i}" for i in range(1, 8)} <= links
+    assert ("/contact/wall/force", "position") in tracks
+    for track in tracks.values():
+        assert len(track.times) == 65  # 2 s at 32 frames a second.
+    hand = tracks["/drake/visualizer/seven_joint_arm/link7", "position"].values
+    assert np.ptp(hand[:, 1]) > 0.1
+
+
+def test_the_scenario_as_run_gives_the_same_record(demo, tmp_path):
+    folder, _, _ = demo
+    path = folder / "scenario.yaml"
+    assert path.read_text().splitlines()[0] == (
+        f"# Scenario as run by drake-dae {drake_dae.__version__}"
+    )
+    assert load_scenario(path) == load_scenario(find_scenario(DEFAULT_SCENARIO), ["duration=2"])
+    assert main(["simulate", str(path), "--out", str(tmp_path), *QUICK]) == 0
+    first, second = (Record.load(p / "record.npz") for p in (folder, tmp_path))
+    np.testing.assert_array_equal(first.time, second.time)
+    for name in first.signals:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("settings", "left"),
+    [
+        (BARE, ["scenario.yaml", "summary.txt"]),
+        (QUICK, ["record.npz", "scenario.yaml", "summary.txt"]),
+    ],
+)
+def test_it_writes_what_is_asked_for(settings, left, tmp_path, capsys):
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, *settings]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    capsys.readouterr()
+
+
+def test_without_out_each_run_gets_a_new_folder_below_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(3):
+        assert main(["simulate", "two_link_wall", *SHORT, *BARE]) == 0
+    folders = [path.name for path in (tmp_path / "runs").iterdir()]
+    assert len(folders) == 3
+    assert all(re.fullmatch(r"two_link_wall-\d{8}-\d{6}(-\d)?", name) for name in folders)
+    capsys.readouterr()
+
+
+# Folders that are there already.
+
+
+def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path, capsys):
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, *QUICK]) == 0
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main([*arguments, *BARE]) == 0
+    # Nothing of the first run stands beside the summary of the second.
+    left = ["notes.txt", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    assert "notes.txt" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["scenario.yaml", "controls.png"])
+def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *BARE]) == 1
+    assert re.search(rf"error: --out: .*{name}, not from an earlier run", error_line(capsys))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_a_scenario_is_not_overwritten_by_its_own_run(tmp_path, capsys):
+    path = tmp_path / "scenario.yaml"
+    path.write_text(find_scenario("two_link_wall").read_text() + "# A comment of mine.\n")
+    assert main(["simulate", str(path), "--out", str(tmp_path), *SHORT, *BARE]) == 1
+    assert "--out: " in error_line(capsys)
+    assert path.read_text().endswith("# A comment of mine.\n")
+
+
+def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert main(["simulate", "two_link_wall", "--out", str(folder), *SHORT, *BARE]) == 1
+        assert f"error: --out: cannot write to '{folder}': " in error_line(capsys)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_folder(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *BARE]) == 1
+    assert "Permission denied" in error_line(capsys)
+
+
+# Mistakes.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["two_link_wal"], "error: no scenario file 'two_link_wal'; did you mean 'two_link_wall'?"),
+        (["two_link_wall", "--set", "duration=-1"], "error: duration: .* positive, got -1"),
+        (["two_link_wall", "--set", "duration"], "error: --set duration: expected key=value"),
+        (
+            ["two_link_wall", "--set", "outputs.0.frame=tol"],
+            "error: outputs.0: .*did you mean tool",
+        ),
+        (["two_link_wall", "--set", "robot.file=x.urdf"], "error: robot.file: no file '.*x.urdf'"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(arguments, line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", *arguments]) == 1
+    assert re.match(line, error_line(capsys))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, capsys):
+    """The arm is stretched out at z = 1.6 m, which the reference passes after 0.13 s."""
+    move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
+    assert main([*arguments, "--set", move, "--set", "write.plots=false"]) == 1
+    assert re.match(r"error: .* at t = 0\.1\d+ s, state \[", error_line(capsys))
+    record = Record.load(tmp_path / "record.npz")
+    assert 0.1 < record.time[-1] < 0.2
+    assert 1.0 < record["controlled_output"][-1, 0] < 1.6
+    text = (tmp_path / "summary.txt").read_text()
+    assert re.search(r"failed +the record ends at 0\.1\d+ s: ", text)
+    assert "simulated" not in text
+    assert animation((tmp_path / "animation.html").read_text())
+
+
+def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
+    def fill(self, path):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Record, "save", fill)
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *QUICK]) == 1
+    assert re.match(r"error: .*record\.npz: No space left on device$", error_line(capsys))
+    # Nothing unfinished stays.
+    assert [path.name for path in tmp_path.iterdir()] == ["scenario.yaml"]
+
+
+# Ctrl-C.
+
+
+def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
+    """The run would last a minute; it is interrupted after about half a second."""
+    process = command(
+        *("simulate", "two_link_wall", "--out", tmp_path / "run"),
+        *("--set", "duration=60", "--set", "integrator.target_realtime_rate=1"),
+    )
+    assert process.stdout.readline().startswith("two_link_wall: built")
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130, err
+    assert err == ""
+    assert "interrupted          the record ends there" in out
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == sorted(FILES)
+    record = Record.load(tmp_path / "run" / "record.npz")
+    assert 0.1 < record.time[-1] < 10.0
+    tracks = animation((tmp_path / "run" / "animation.html").read_text())
+    end = tracks["/contact/wall/force", "position"].times[-1]
+    assert record.time[-1] <= end <= record.time[-1] + 1 / 32
+    for name in PLOTS:
+        assert (tmp_path / "run" / name).read_bytes().endswith(b"IEND\xaeB`\x82")
+
+
+def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, capsys):
+    """As a second Ctrl-C does, or one while the files are written."""
+
+    def stop(diagram, context, *_arguments, **_options):
+        drake_dae.simulate(diagram, context, 0.1, load_scenario(scenario).integrator)
+        raise KeyboardInterrupt
+
+    scenario = find_scenario("two_link_wall")
+    monkeypatch.setattr(cli, "simulate", stop)
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *QUICK]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert Record.load(tmp_path / "record.npz").time[-1] == 0.1
+    assert "interrupted in the middle of a step" in (tmp_path / "summary.txt").read_text()
+
+
+# The rest of the command line.
+
+
+def test_list(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(shipped_scenarios())
+    assert {"seven_joint_wall", "seven_joint_dome", "two_link_wall"} <= set(shipped_scenarios())
+    starts = {len(line) - len(line.split(maxsplit=1)[1]) for line in lines}
+    assert len(starts) == 1
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["--version"])
+    assert caught.value.code == 0
+    assert capsys.readouterr().out == f"{drake_dae.__version__}\n"
+
+
+@pytest.mark.parametrize("arguments", [[], ["simulat"], ["simulate", "a", "b"]])
+def test_a_wrong_command_line(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage: drake-dae" in capsys.readouterr().err
+
+
+def test_a_reader_that_has_enough():
+    """`drake-dae list | head -1`"""
+    with command("list") as process:
+        process.stdout.close()
+        assert process.wait(timeout=30) == 1
+        assert process.stderr.read() == ""
+
+
+def test_meshcat_tells_where_and_runs_in_real_time(tmp_path, capsys):
+    arguments = ["simulate", "two_link_wall", "--meshcat", "--out", str(tmp_path), *QUICK]
+    began = time.perf_counter()
+    assert main([*arguments, "--set", "duration=0.5"]) == 0
+    assert time.perf_counter() - began > 0.5
+    captured = capsys.readouterr()
+    assert re.search(r"^watch at http://localhost:\d+$", captured.out, re.MULTILINE)
+    assert captured.err == ""
+    assert load_scenario(tmp_path / "scenario.yaml").integrator.target_realtime_rate == 1.0
+
+
+def test_a_bar_on_a_terminal(tmp_path):
+    """One that does not know its width, as in some containers."""
+    ours, theirs = pty.openpty()
+    settings = ["--set", "duration=0.5", "--set", "integrator.target_realtime_rate=1"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "drake_dae", "simulate", "two_link_wall", *BARE, *settings],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        env=os.environ | {"PYTHONUTF8": "1"},
+    )
+    os.close(theirs)
+    shown = b""
+    try:
+        while part := os.read(ours, 4096):
+            shown += part
+    except OSError:
+        pass  # Linux says so when the other end is closed.
+    os.close(ours)
+    assert process.wait(timeout=30) == 0
+    steps = shown.decode().rstrip().split("\r")
+    assert len(steps) > 3
+    assert re.search(r"100%\|.*\| 0\.50/0\.50 s, \d+\.\d x real time", steps[-1])

@@ -1,0 +1,72 @@
+"""TrackingController as a Drake system."""
+
+import numpy as np
+import pytest
+from arms import arm, consistent_states, law
+
+from drake_dae import TrackingController
+from drake_dae.errors import NonFiniteError, SingularityError
+
+
+def controller(name="two_link"):
+    system = TrackingController(law(name))
+    return system, system.CreateDefaultContext()
+
+
+def test_ports_and_feedthrough():
+    system, _ = controller("seven_joint")
+    assert system.GetInputPort("estimated_state").size() == 14
+    assert system.GetInputPort("reference").size() == 6 * 3 + 1
+    assert system.GetOutputPort("control").size() == 7
+    assert system.GetOutputPort("tracking_error").size() == 7
+    for i in range(2):
+        for j in range(2):
+            assert system.HasDirectFeedthrough(i, j)
+
+
+def test_outputs_are_those_of_the_law():
+    system, context = controller()
+    state = consistent_states("two_link", 1)[0]
+    reference = np.array([0.2, 0.1, -0.3, 17.0])
+    system.GetInputPort("estimated_state").FixValue(context, state)
+    system.GetInputPort("reference").FixValue(context, reference)
+    np.testing.assert_array_equal(
+        system.GetOutputPort("control").Eval(context), law("two_link").control(state, reference)
+    )
+    tip = np.sin(state[0]) + np.sin(state[0] + state[1])
+    # The force is met at once, so by the model its error is zero.
+    np.testing.assert_allclose(
+        system.GetOutputPort("tracking_error").Eval(context), [tip - 0.2, 0.0], atol=1e-13
+    )
+
+
+def test_parameters_of_the_context_reach_the_law():
+    system, context = controller()
+    system.GetInputPort("estimated_state").FixValue(context, consistent_states("two_link", 1)[0])
+    system.GetInputPort("reference").FixValue(context, [0.2, 0.1, -0.3, 17.0])
+    first = system.GetOutputPort("control").Eval(context).copy()
+    dae = arm("two_link").model.dae
+    parameters = context.get_mutable_numeric_parameter(0)
+    values = parameters.CopyToVector()
+    values[dae.parameter_slice("link2.mass")] = 9.0
+    parameters.SetFromVector(values)
+    assert np.max(np.abs(system.GetOutputPort("control").Eval(context) - first)) > 1.0
+
+
+def test_a_stretched_arm_is_named_singular():
+    """Straight and horizontal onto the wall: no torque moves the tip along the normal."""
+    system, context = controller()
+    context.SetTime(1.5)
+    system.GetInputPort("estimated_state").FixValue(context, [0.0, 0.0, 0.0, 0.0])
+    system.GetInputPort("reference").FixValue(context, np.zeros(4))
+    with pytest.raises(SingularityError, match=r"singular at t = 1.5 s.*wall.force") as info:
+        system.GetOutputPort("control").Eval(context)
+    assert info.value.time == 1.5
+
+
+def test_an_input_that_is_not_finite_is_named():
+    system, context = controller()
+    system.GetInputPort("estimated_state").FixValue(context, [1.2, -1.6, np.nan, 0.0])
+    system.GetInputPort("reference").FixValue(context, np.zeros(4))
+    with pytest.raises(NonFiniteError, match="input estimated_state is not finite at t = 0 s"):
+        system.GetOutputPort("control").Eval(context)

@@ -1,0 +1,151 @@
+"""References: values and derivatives by other routes, smoothness, and refusals."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from pydrake.math import BsplineBasis
+from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
+
+from drake_dae import (
+    ExpressionSignal,
+    ReferenceGenerator,
+    TrajectorySignal,
+    constant,
+    point_to_point,
+    sinusoids,
+)
+from drake_dae.errors import NonFiniteError, ReferenceSignalError
+
+
+def table(signal, degree, time):
+    """(outputs, derivatives) of one signal at a time."""
+    generator = ReferenceGenerator([signal], [degree] * signal.size)
+    return generator.reference(time).reshape(signal.size, degree + 1)
+
+
+def test_layout_is_output_major():
+    generator = ReferenceGenerator([sinusoids(1.0, 2.0, 3.0), constant([7.0, 8.0])], [2, 1, 0])
+    expected = [1.0, 6.0, 0.0, 7.0, 0.0, 8.0]
+    np.testing.assert_allclose(generator.reference(0.0), expected, atol=1e-15)
+    context = generator.CreateDefaultContext()
+    context.SetTime(0.4)
+    port = generator.GetOutputPort("reference").Eval(context)
+    np.testing.assert_array_equal(port, generator.reference(0.4))
+
+
+def test_sums_of_sinusoids():
+    t, a, w, p = 0.7, np.array([0.5, -2.0]), np.array([3.0, 0.4]), np.array([0.1, 1.0])
+    found = table(sinusoids(4.0, a, w, p), 4, t)[0]
+    angle = w * t + p
+    expected = [
+        4.0 + np.sum(a * np.sin(angle)),
+        np.sum(a * w * np.cos(angle)),
+        -np.sum(a * w**2 * np.sin(angle)),
+        -np.sum(a * w**3 * np.cos(angle)),
+        np.sum(a * w**4 * np.sin(angle)),
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_quintic():
+    """Order 2 is 10 s^3 - 15 s^4 + 6 s^5."""
+    signal = point_to_point(1.0, 3.0, 2.0, 4.0)
+    for time in (2.3, 3.0, 3.9):
+        s = (time - 2.0) / 2.0
+        expected = [
+            1.0 + 2.0 * (10 * s**3 - 15 * s**4 + 6 * s**5),
+            30 * s**2 - 60 * s**3 + 30 * s**4,
+            (60 * s - 180 * s**2 + 120 * s**3) / 2.0,
+        ]
+        np.testing.assert_allclose(table(signal, 2, time)[0], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+def test_moves_are_smooth_at_both_ends_and_held_outside(order):
+    signal = point_to_point([0.0, 5.0], [1.0, 4.0], 1.0, 2.0, order)
+    for time, value in ((0.5, [0.0, 5.0]), (2.5, [1.0, 4.0])):
+        found = table(signal, order, time)
+        np.testing.assert_array_equal(found[:, 0], value)
+        assert not found[:, 1:].any()
+    # Derivatives up to `order` vanish at the ends; the next one, below 1e6, enters linearly.
+    for time in (1.0 + 1e-9, 2.0 - 1e-9):
+        assert np.max(np.abs(table(signal, order, time)[:, 1:])) < 1e-2
+    middle = table(signal, order, 1.5)
+    np.testing.assert_allclose(middle[:, 0], [0.5, 4.5], atol=1e-12)
+
+
+def test_expressions_of_time():
+    signal = ExpressionSignal(lambda t: [t**3, ca.exp(-t) * t])
+    np.testing.assert_allclose(
+        table(signal, 2, 2.0),
+        [[8.0, 12.0, 12.0], np.exp(-2.0) * np.array([2.0, -1.0, 0.0])],
+        atol=1e-14,
+    )
+
+
+def test_drake_trajectories():
+    spline = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
+        [0.0, 1.0, 2.0, 3.0],
+        np.array([[0.0, 1.0, 0.0, 2.0], [1.0, 1.0, 3.0, 0.0]]),
+        np.zeros((2, 1)),
+        np.zeros((2, 1)),
+    )
+    points = list(np.arange(9.0)[:, None, None])
+    for path in (spline, BsplineTrajectory(BsplineBasis(6, 9), points)):
+        signal, time = TrajectorySignal(path), path.start_time() + 0.37
+        found = table(signal, 2, time)
+        for order in range(3):
+            np.testing.assert_allclose(
+                found[:, order], path.EvalDerivative(time, order)[:, 0], rtol=1e-12
+            )
+
+
+def test_trajectories_and_expressions_stack():
+    path = PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]])
+    generator = ReferenceGenerator([constant(3.0), TrajectorySignal(path)], [1, 1])
+    np.testing.assert_allclose(generator.reference(0.5), [3.0, 0.0, 0.5, 1.5], atol=1e-15)
+
+
+def hold(values):
+    return PiecewisePolynomial.FirstOrderHold(np.arange(len(values)), [values])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: ReferenceGenerator([constant(1.0)], [2, 2]),
+            "cover 1 outputs, the law has 2",
+        ),
+        (
+            lambda: ReferenceGenerator([point_to_point(0, 1, 0, 1)], [4]),
+            "2 continuous derivatives, the law needs 4: pass order=4",
+        ),
+        (
+            lambda: ReferenceGenerator([TrajectorySignal(hold([0, 1, 0]))], [2]),
+            "derivative 1 of row 0 .* jumps by -2 at t = 1 s",
+        ),
+        (lambda: point_to_point(0, 1, 1, 1), "end_time 1 must be after"),
+        (lambda: sinusoids(0.0, [1, 2], [1, 2, 3]), "same length"),
+        (lambda: ExpressionSignal(lambda t: ca.SX.sym("a") * t), "with a other symbols"),
+        (
+            lambda: TrajectorySignal(PiecewisePolynomial(np.eye(2))),
+            "must be a column, this one is 2 x 2",
+        ),
+    ],
+)
+def test_refusals(make, message):
+    with pytest.raises(ReferenceSignalError, match=message):
+        make()
+
+
+def test_a_time_outside_a_trajectory_is_refused():
+    generator = ReferenceGenerator([TrajectorySignal(hold([0, 1]))], [1])
+    with pytest.raises(ReferenceSignalError, match=r"covers 0 to 1 s and was asked for t = 1.5 s"):
+        generator.reference(1.5)
+
+
+def test_a_reference_that_is_not_finite_raises():
+    generator = ReferenceGenerator([ExpressionSignal(lambda t: ca.log(t))], [1])
+    with pytest.raises(NonFiniteError, match="reference is not finite at t = 0 s"):
+        generator.GetOutputPort("reference").Eval(generator.CreateDefaultContext())

@@ -1,0 +1,243 @@
+"""Running a diagram: settings, statistics, progress, interruption, failure."""
+
+import io
+import os
+import signal
+import sys
+import threading
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import LogVectorOutput
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_dae.errors import ModelError, SimulationError
+from drake_dae.simulation import simulate as module
+from drake_dae.simulation.simulate import check_config, check_duration, simulate
+
+
+class Ramp(LeafSystem):
+    """x' = 1, and what is to happen once x passes a mark."""
+
+    def __init__(self, mark=np.inf, happening=None):
+        super().__init__()
+        self.mark, self.happening = mark, happening
+        self.DeclareStateOutputPort("x", self.DeclareContinuousState(1))
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        if context.get_continuous_state_vector()[0] > self.mark:
+            self.happening()
+        derivatives.get_mutable_vector().SetFromVector([1.0])
+
+
+def ramp(mark=np.inf, happening=None):
+    builder = DiagramBuilder()
+    system = builder.AddSystem(Ramp(mark, happening))
+    logger = LogVectorOutput(system.get_output_port(), builder)
+    diagram = builder.Build()
+    return diagram, diagram.CreateDefaultContext(), logger
+
+
+def fixed(step=0.125):
+    return SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=step, use_error_control=False
+    )
+
+
+def test_statistics_and_end_state():
+    diagram, context, logger = ramp()
+    run = simulate(diagram, context, 2.0, fixed())
+    assert (run.simulated_time, run.steps, run.interrupted) == (2.0, 16, False)
+    assert run.times_real_time == pytest.approx(2.0 / run.wall_time)
+    assert context.get_time() == 2.0
+    assert context.get_continuous_state_vector()[0] == pytest.approx(2.0, abs=1e-14)
+    # The last one is logged again after the pending events, such as a projection.
+    times = logger.FindLog(context).sample_times()
+    np.testing.assert_array_equal(times, [*np.arange(17) / 8, 2.0])
+
+
+def test_settings_reach_the_integrator():
+    diagram, context, _ = ramp()
+    config = SimulatorConfig(start_time=-3.0, accuracy=1e-5, max_step_size=0.5)
+    run = simulate(diagram, context, 1.0, config)
+    assert context.get_time() == -2.0
+    assert run.simulated_time == 1.0
+    assert context.get_accuracy() == 1e-5
+
+
+def test_a_second_run_goes_on_from_the_first():
+    diagram, context, _ = ramp()
+    simulate(diagram, context, 1.0, fixed())
+    config = fixed()
+    config.start_time = 1.0
+    simulate(diagram, context, 1.0, config)
+    assert context.get_continuous_state_vector()[0] == pytest.approx(2.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, np.nan, np.inf])
+def test_duration_is_checked(duration):
+    with pytest.raises(ModelError, match="duration must be positive"):
+        check_duration(duration)
+    diagram, context, _ = ramp()
+    with pytest.raises(ModelError, match="duration must be positive"):
+        simulate(diagram, context, duration, fixed())
+    assert context.get_time() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"integration_scheme": "rk45"}, r"no scheme 'rk45'.*there are .*runge_kutta5"),
+        ({"integration_scheme": "radau"}, r"did you mean 'radau\d'"),
+        ({"integration_scheme": "cenic"}, "no scheme 'cenic' for these systems"),
+        ({"accuracy": 0.0}, "accuracy must be positive, got 0.0"),
+        ({"accuracy": np.nan}, "accuracy must be positive, got nan"),
+        ({"max_step_size": 0.0}, "max_step_size must be positive, got 0.0"),
+        ({"max_step_size": np.inf}, "max_step_size must be positive, got inf"),
+        ({"target_realtime_rate": -1.0}, "target_realtime_rate must not be negative"),
+        ({"integration_scheme": "explicit_euler"}, "use_error_control: explicit_euler has none"),
+    ],
+)
+def test_settings_are_checked(settings, message):
+    """Drake takes each of these, and then hangs, ends in the middle, or ignores it."""
+    with pytest.raises(ModelError, match=message):
+        check_config(SimulatorConfig(use_error_control=True, **settings))
+    diagram, context, _ = ramp()
+    with pytest.raises(ModelError, match=message):
+        simulate(diagram, context, 1.0, SimulatorConfig(use_error_control=True, **settings))
+
+
+def test_every_other_scheme_passes():
+    for scheme in set(GetIntegrationSchemes()) - {"cenic"}:
+        check_config(SimulatorConfig(integration_scheme=scheme, use_error_control=False))
+
+
+# Interruption, by a real signal.
+
+
+def test_ctrl_c_ends_the_run_after_its_step():
+    before = signal.getsignal(signal.SIGINT)
+    sent = []
+
+    def press():
+        if not sent:
+            sent.append(True)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    diagram, context, logger = ramp(0.5, press)
+    run = simulate(diagram, context, 2.0, fixed())
+    assert sent
+    assert run.interrupted
+    # The signal comes in the step from 0.5 to 0.625, at one of its stages.
+    assert run.simulated_time == context.get_time() == 0.625
+    assert run.steps == 5
+    logged = logger.FindLog(context).data()[0]
+    np.testing.assert_allclose(logged, [*np.arange(6) / 8, 0.625], atol=1e-14)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_is_an_exception_and_the_log_is_kept():
+    before = signal.getsignal(signal.SIGINT)
+
+    def press_twice():
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+            # Python runs the handler between two of its instructions.
+            sum(range(1000))
+
+    diagram, context, logger = ramp(0.5, press_twice)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(diagram, context, 2.0, fixed())
+    assert logger.FindLog(context).sample_times()[-1] == 0.5
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_runs_outside_of_the_main_thread():
+    """Where Python allows no signal handler."""
+    result = []
+    thread = threading.Thread(target=lambda: result.append(simulate(*ramp()[:2], 1.0, fixed())))
+    thread.start()
+    thread.join()
+    assert result[0].simulated_time == 1.0
+
+
+# Failure.
+
+
+def test_an_exception_keeps_the_log():
+    def fail():
+        raise ZeroDivisionError("in the middle")
+
+    diagram, context, logger = ramp(0.5, fail)
+    with pytest.raises(ZeroDivisionError, match="in the middle"):
+        simulate(diagram, context, 2.0, fixed())
+    np.testing.assert_array_equal(logger.FindLog(context).sample_times(), np.arange(5) / 8)
+
+
+def test_what_drake_says_gets_time_and_state():
+    def fail():
+        PiecewisePolynomial().value(0.0)  # Drake refuses an empty one.
+
+    with pytest.raises(RuntimeError):
+        fail()
+    diagram, context, _ = ramp(0.5, fail)
+    with pytest.raises(SimulationError, match=r"cannot go on at t = 0\.5\d* s, state \[") as caught:
+        simulate(diagram, context, 2.0, fixed())
+    assert 0.5 <= caught.value.time <= 0.625
+    # The state is that of the stage at which it failed.
+    np.testing.assert_allclose(caught.value.state, caught.value.time, atol=0.1)
+    assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+# Progress.
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_bar_on_a_terminal(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    simulate(*ramp()[:2], 2.0, fixed(), progress=True)
+    last = terminal.getvalue().rstrip("\n").split("\r")[-1]
+    assert last.startswith("100%|")
+    assert "2.00/2.00 s" in last
+    assert last.endswith(" x real time")
+
+
+def test_the_bar_shows_where_a_run_failed(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(module, "BAR_PERIOD", 0.0)
+
+    def fail():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        simulate(*ramp(1.0, fail)[:2], 2.0, fixed(), progress=True)
+    assert "1.00/2.00 s" in terminal.getvalue().split("\r")[-1]
+    assert terminal.getvalue().endswith("\n")
+
+
+def test_no_bar_unless_asked_for(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    simulate(*ramp()[:2], 2.0, fixed())
+    assert terminal.getvalue() == ""
+
+
+def test_lines_where_there_is_no_terminal(monkeypatch, capsys):
+    simulate(*ramp()[:2], 2.0, fixed(), progress=True)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(module, "LINE_PERIOD", 0.0)
+    simulate(*ramp()[:2], 2.0, fixed(1.0), progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    assert list(dict.fromkeys(line.split(",")[0] for line in lines)) == [
+        "1.00/2.00 s",
+        "2.00/2.00 s",
+    ]
+    assert all(line.endswith(" x real time") and "\r" not in line for line in lines)

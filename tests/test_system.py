@@ -1,0 +1,279 @@
+from dataclasses import FrozenInstanceError
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import double_integrator
+
+from drake_dae.dae.system import DaeSystem, Parameter, Signal, signals
+from drake_dae.errors import ModelError
+
+
+def evaluated(system: DaeSystem, key: str, state: np.ndarray) -> np.ndarray:
+    function = ca.Function(
+        "value", [system.state, system.parameter_symbol], [ca.densify(getattr(system, key))]
+    )
+    return np.array(function(state, system.parameter_values))
+
+
+def constrained(**changes) -> DaeSystem:
+    """n = 4, m = 1, p = 2: a point on a line, with its force and its place along it."""
+    fields = {
+        "f": lambda x: [x[2], x[3], 0, 0],
+        "g": lambda x: [0, 0, 1, 0],
+        "h": lambda x: [[0, 0], [0, 0], [1, 0], [0, 1]],
+        "k": lambda x: x[0],
+        "l": lambda x: [0, x[1]],
+        "m": lambda x: [1, 0],
+    }
+    return DaeSystem.from_functions(4, **{**fields, **changes})
+
+
+def test_dimensions_and_made_up_names():
+    system = constrained()
+    assert (system.num_states, system.num_constraints, system.num_controls) == (4, 1, 2)
+    shapes = {key: getattr(system, key).shape for key in "fghklm"}
+    assert shapes == {"f": (4, 1), "g": (4, 1), "h": (4, 2), "k": (1, 1), "l": (2, 1), "m": (2, 1)}
+    assert [s.name for s in system.state_signals] == ["x0", "x1", "x2", "x3"]
+    assert [s.name for s in system.constraint_input_signals] == ["v0"]
+    assert [s.name for s in system.constraint_output_signals] == ["y0"]
+    assert [s.name for s in system.control_signals] == ["u0", "u1"]
+    assert [s.name for s in system.output_signals] == ["z0", "z1"]
+    np.testing.assert_array_equal(system.nominal_state, np.zeros(4))
+
+
+def test_without_constraints_g_k_and_m_are_empty():
+    system = double_integrator()
+    assert (system.g.shape, system.k.shape, system.m.shape) == ((2, 0), (0, 1), (1, 0))
+    assert system.constraint_input_signals == system.constraint_output_signals == ()
+
+
+@pytest.mark.parametrize(
+    "drift",
+    [
+        lambda x: ca.vertcat(x[1], -2 * x[0]),
+        lambda x: [x[1], -2 * x[0]],
+        lambda x: (x[1], -2 * x[0]),
+        lambda x: [[x[1]], [-2 * x[0]]],
+        lambda x: np.array([x[1], -2 * x[0]]),
+        lambda x: np.array([[x[1]], [-2 * x[0]]]),
+        lambda x: np.array([[0.0, 1.0], [-2.0, 0.0]]) @ x,
+        lambda x: ca.horzcat(x[1], -2 * x[0]),
+    ],
+)
+def test_an_expression_may_be_written_in_any_way(drift):
+    value = evaluated(double_integrator(f=drift), "f", np.array([3.0, 5.0]))
+    np.testing.assert_array_equal(value, [[5.0], [-6.0]])
+
+
+@pytest.mark.parametrize(
+    "control",
+    [[0, 1], [[0], [1]], [[0, 1]], np.array([0, 1]), np.array([[0.0], [1.0]]), ca.DM([0, 1])],
+)
+def test_constants_may_stand_for_expressions(control):
+    value = evaluated(double_integrator(h=lambda x: control), "h", np.zeros(2))
+    np.testing.assert_array_equal(value, [[0.0], [1.0]])
+
+
+def test_expressions_and_functions_make_the_same_system():
+    x, stiffness = ca.SX.sym("x", 2), Parameter("stiffness", 3.0, "N/m")
+    by_expressions = DaeSystem(
+        state=x,
+        f=ca.vertcat(x[1], -stiffness.symbol * x[0]),
+        g=[],
+        h=[0, 1],
+        k=[],
+        l=x[0],
+        m=[],
+        parameters=(stiffness,),
+    )
+    by_functions = double_integrator(
+        f=lambda x, p: [x[1], -p.stiffness * x[0]],
+        h=lambda x, p: [0, 1],
+        l=lambda x, p: x[0],
+        parameters={"stiffness": 3.0},
+    )
+    state = np.array([0.5, -2.0])
+    for key in "fghklm":
+        np.testing.assert_array_equal(
+            evaluated(by_expressions, key, state), evaluated(by_functions, key, state)
+        )
+
+
+def test_parameters_are_found_by_name():
+    system = double_integrator(
+        f=lambda x, p: [x[1], p.a + p.b[1]],
+        h=lambda x, p: [0, 1],
+        l=lambda x, p: x[0],
+        parameters={"a": 2.0, "b": [3.0, 4.0], "c": np.float32(5)},
+    )
+    np.testing.assert_array_equal(system.parameter_values, [2.0, 3.0, 4.0, 5.0])
+    assert [system.parameter_slice(name) for name in "abc"] == [
+        slice(0, 1),
+        slice(1, 3),
+        slice(3, 4),
+    ]
+    assert evaluated(system, "f", np.zeros(2))[1, 0] == 6.0
+    with pytest.raises(ModelError, match=r"no parameter 'mass'; it has a, b, c"):
+        system.parameter_slice("mass")
+    with pytest.raises(ModelError, match="it has none"):
+        double_integrator().parameter_slice("mass")
+
+
+def test_names_and_signals_label_the_vectors():
+    system = DaeSystem.from_functions(
+        [Signal("q", "rad"), "qd"],
+        f=lambda x: [x[1], 0],
+        h=lambda x: [0, 1],
+        l=lambda x: x[0],
+        output_signals=["angle"],
+        control_signals=[Signal("torque", "N m")],
+    )
+    assert system.state_signals == (Signal("q", "rad"), Signal("qd"))
+    assert system.output_signals == (Signal("angle"),)
+    assert system.control_signals == (Signal("torque", "N m"),)
+
+
+def test_derivatives_of_signals_carry_their_units():
+    angle = Signal("q", "rad")
+    assert angle.derivative(0) == angle
+    assert angle.derivative(1) == Signal("q'", "rad/s")
+    assert angle.derivative(3) == Signal("q'''", "rad/s^3")
+    assert Signal("gain").derivative(2).unit == "1/s^2"
+    assert signals(["a", "b"], "m") == (Signal("a", "m"), Signal("b", "m"))
+
+
+def test_a_system_cannot_be_changed():
+    nominal = np.array([1.0, 2.0])
+    system = double_integrator(nominal_state=nominal)
+    nominal[0] = 9.0
+    assert system.nominal_state[0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        system.nominal_state[0] = 3.0
+    with pytest.raises(FrozenInstanceError):
+        system.f = system.state
+    parameter = Parameter("mass", [1.0])
+    with pytest.raises(ValueError, match="read-only"):
+        parameter.value[0] = 2.0
+
+
+WRONG_SHAPES = {
+    "f": (lambda x: [x[1], 0, 0], r"f has shape \(3, 1\), expected \(2, 1\)"),
+    "g": (lambda x: [[1, 0], [0, 1]], r"g has shape \(2, 2\), expected \(2, 0\)"),
+    "h": (lambda x: [0, 1, 0], r"h has shape \(3, 1\), expected \(2, 1\)"),
+    "k": (lambda x: [[x[0], 1], [x[1], 1]], r"expected \(\d+, \d\)"),
+    "l": (lambda x: x, r"l has shape \(2, 1\), expected \(1, 1\).*as many controlled outputs"),
+    "m": (lambda x: [1, 2], r"m has shape \(2, 1\), expected \(1, 0\)"),
+}
+
+
+@pytest.mark.parametrize("key", WRONG_SHAPES)
+def test_wrong_shapes_are_refused_by_name(key):
+    function, message = WRONG_SHAPES[key]
+    with pytest.raises(ModelError, match=f"double integrator: .*{message}"):
+        double_integrator(**{key: function})
+
+
+def test_too_many_and_too_few_outputs_are_refused():
+    with pytest.raises(ModelError, match=r"l has shape \(2, 1\), expected \(1, 1\)"):
+        double_integrator(l=lambda x: [x[0], x[1]])
+    with pytest.raises(ModelError, match="as many controlled outputs as controls"):
+        constrained(l=lambda x: x[1], m=lambda x: 0)
+
+
+BAD_VALUES = {
+    "an MX": (lambda x: ca.MX.sym("a", 2), "casadi.* MX|CasADi MX"),
+    "a list of MX": (lambda x: [ca.MX.sym("a"), 0], "f must be a CasADi SX expression"),
+    "NaN": (lambda x: [x[1], np.nan], "f holds a constant that is not finite"),
+    "infinity": (lambda x: [x[1], ca.inf], "f holds a constant that is not finite"),
+    "text": (lambda x: "x1", "f must be a CasADi SX expression.* got str"),
+    "nothing": (lambda x: None, "function f returned nothing"),
+    "rows of two lengths": (lambda x: [[1, 2], [3]], "lists of one length"),
+    "an unknown symbol": (lambda x: [x[1], ca.SX.sym("mass")], "f depends on mass, which is nei"),
+    "a failing function": (lambda x: [x[1], x[7]], "function f failed on a CasADi column of 2"),
+    "a wrong signature": (lambda x, p: [x[1], 0], "function f failed"),
+}
+
+
+@pytest.mark.parametrize("what", BAD_VALUES)
+def test_bad_expressions_are_refused(what):
+    drift, message = BAD_VALUES[what]
+    with pytest.raises(ModelError, match=message):
+        double_integrator(f=drift)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "state_signals",
+        "constraint_input_signals",
+        "constraint_output_signals",
+        "control_signals",
+        "output_signals",
+    ],
+)
+def test_labels_must_fit_and_be_unique(key):
+    base = constrained()
+    fields = {name: getattr(base, name) for name in ("state", *"fghklm")}
+    count = len(getattr(base, key))
+    with pytest.raises(ModelError, match=f"{key} has {count + 1} entries, expected {count}"):
+        DaeSystem(**fields, **{key: signals([f"a{i}" for i in range(count + 1)])})
+    if count > 1:
+        with pytest.raises(ModelError, match=f"{key} names must be unique, twice: same"):
+            DaeSystem(**fields, **{key: signals(["same"] * count)})
+
+
+def test_states_must_be_a_column_of_different_symbols():
+    x = ca.SX.sym("x")
+    rest = {"g": [], "h": 1, "k": [], "l": x, "m": []}
+    for state in (x**2, ca.MX.sym("x"), np.zeros(1), ca.SX(0, 1)):
+        with pytest.raises(ModelError, match="'state' must be a CasADi SX column of symbols"):
+            DaeSystem(state=state, f=x, **rest)
+    with pytest.raises(ModelError, match="stands twice"):
+        DaeSystem(state=ca.vertcat(x, x), f=[x, x], **{**rest, "h": [0, 1]})
+    with pytest.raises(ModelError, match="stands twice"):
+        DaeSystem(state=x, f=x, parameters=(Parameter("x", 1.0, symbol=x),), **rest)
+    with pytest.raises(ModelError, match="'state' must be"):
+        DaeSystem.from_functions([], f=lambda x: [], h=lambda x: [], l=lambda x: [])
+    with pytest.raises(ModelError, match="state_signals names must be unique, twice: q"):
+        DaeSystem.from_functions(["q", "q"], f=lambda x: x, h=lambda x: x, l=lambda x: x[0])
+
+
+@pytest.mark.parametrize(
+    ("nominal", "message"),
+    [
+        ([1.0, 2.0, 3.0], r"finite with shape \(2,\)"),
+        ([[1.0, 2.0]], r"finite with shape \(2,\)"),
+        (0.0, r"finite with shape \(2,\)"),
+        ([1.0, np.nan], r"finite with shape \(2,\)"),
+        ("up", "nominal_state must be numbers, got 'up'"),
+    ],
+)
+def test_bad_nominal_states_are_refused(nominal, message):
+    with pytest.raises(ModelError, match=message):
+        double_integrator(nominal_state=nominal)
+
+
+def test_bad_parameters_are_refused():
+    for value in (np.nan, [1.0, np.inf], [[1.0]]):
+        with pytest.raises(ModelError, match="'mass' must be finite and one-dimensional"):
+            Parameter("mass", value)
+    with pytest.raises(ModelError, match="'mass' must be numbers"):
+        Parameter("mass", "heavy")
+    for symbol in (ca.SX.sym("m", 3), ca.SX.sym("m") ** 2, ca.MX.sym("m")):
+        with pytest.raises(ModelError, match="symbol of parameter 'mass' must be a CasADi SX colu"):
+            Parameter("mass", [1.0, 2.0], symbol=symbol)
+    with pytest.raises(ModelError, match=r"must be Python identifiers.*link1\.mass"):
+        double_integrator(parameters={"link1.mass": 1.0})
+    x = ca.SX.sym("x")
+    with pytest.raises(ModelError, match="parameter names must be unique, twice: a"):
+        DaeSystem(
+            state=x,
+            f=x,
+            g=[],
+            h=1,
+            k=[],
+            l=x,
+            m=[],
+            parameters=(Parameter("a", 1.0), Parameter("a", 2.0)),
+        )

@@ -1,0 +1,81 @@
+"""Two of the shipped seven-joint arms that hold one object: 14 actuators, a loop of 6 equations."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia
+
+from drake_dae import (
+    AxisCoordinates,
+    JointPositions,
+    PointCoordinates,
+    RobotModel,
+    WeldedFrames,
+)
+from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.robots.actuation import Stage
+
+APART = 1.8
+LENGTH = 0.2
+"""Of the bases, which face each other, and of the object, in m."""
+
+NOMINAL = np.tile([0.0, -0.7162933, 0.0, -1.7685105, 0.0, 0.9140075, 0.0], 2)
+"""Both elbows up, the object level, 0.4 m above the floor, midway between the bases."""
+
+GRASP = WeldedFrames(
+    "object",
+    "right::tool",
+    RigidTransform(RollPitchYaw(0.0, np.pi / 2, np.pi), [LENGTH / 2, 0.0, 0.0]),
+    name="grasp",
+)
+"""The right tool on the right end of the object; its fx presses the object together."""
+
+
+def two_arms_plant() -> MultibodyPlant:
+    """Arms "left" and "right", and the object of 4 kg, which is fixed to the left tool.
+
+    The object's x axis points from the left tool to the right one.
+    """
+    plant = MultibodyPlant(0.0)
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    places = {
+        "left": RigidTransform(),
+        "right": RigidTransform(RollPitchYaw(0.0, 0.0, np.pi), [APART, 0.0, 0.0]),
+    }
+    for name, place in places.items():
+        (instance,) = parser.AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
+        plant.RenameModelInstance(instance, name)
+        # The file welds the base to the origin.
+        plant.RemoveJoint(plant.GetJointByName("base_weld", instance))
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance), place)
+    left = plant.GetModelInstanceByName("left")
+    inertia = SpatialInertia.SolidBoxWithMass(4.0, LENGTH, 0.08, 0.08)
+    plant.AddRigidBody("object", left, inertia)
+    plant.WeldFrames(
+        plant.GetFrameByName("tool", left),
+        plant.GetFrameByName("object"),
+        RigidTransform(RollPitchYaw(0.0, -np.pi / 2, 0.0), [0.0, 0.0, LENGTH / 2]),
+    )
+    plant.Finalize()
+    return plant
+
+
+def two_arms(actuation: Sequence[Stage] = ()) -> RobotModel:
+    """z_1 is the object's position, its orientation, and one joint of each arm's redundancy."""
+    return RobotModel.from_multibody(
+        two_arms_plant(),
+        constraints=[GRASP],
+        positions=[
+            PointCoordinates("object", "xyz"),
+            AxisCoordinates("object", "x", "yz"),
+            AxisCoordinates("object", "y", "z"),
+            JointPositions(["left::joint3", "right::joint3"]),
+        ],
+        nominal_positions=NOMINAL,
+        name="two arms",
+        actuation=actuation,
+    )
