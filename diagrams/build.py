@@ -181,6 +181,9 @@ def _outputs(
 def _stage(form: typing.Any) -> actuation.Stage:
     """A stage of actuation; one number serves all actuators, none is the robot's own."""
     values = {item.name: getattr(form, item.name) for item in fields(form)}
+    for item in fields(form):
+        if item.metadata.get("required") and not values[item.name]:
+            raise ScenarioError(f"{item.name}: empty; give one number, or one per actuator")
     numbers = {
         name: value[0] if len(value) == 1 else value for name, value in values.items() if value
     }
@@ -188,6 +191,8 @@ def _stage(form: typing.Any) -> actuation.Stage:
 
 
 def _sensor(form: forms.MeasuredForce, size: int) -> ForceSensor:
+    if not 0 <= form.seed < 2**32:
+        raise ScenarioError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {form.seed}")
     bias, noise = (v[0] if len(v) == 1 else v for v in (form.bias, form.noise_deviation))
     return ForceSensor(size, form.time_constant, form.sample_period, bias, noise)
 

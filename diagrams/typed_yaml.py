@@ -212,7 +212,7 @@ def _unknown(key: str, data: typing.Any, schema: typing.Any) -> str:
     known = _keys(schema, data)
     near = get_close_matches(key, known, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
-    text = f"{_title(schema, data)}has no key '{key}'; {hint}keys: {', '.join(known)}"
+    text = f"{_title(schema, data)}has no key '{key}'; {hint}keys: {', '.join(known) or 'none'}"
     if _is_union(schema) and "_tag" not in data:
         forms = ", ".join(f"!{form.__name__}" for form in typing.get_args(schema))
         text += f". No tag is given; there are {forms}"

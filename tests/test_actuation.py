@@ -176,7 +176,7 @@ SHAFT = {"stiffness": 8e3, "inertia": 1.0}
         ([FlexibleJoints([1.0, 2.0, 3.0], 1.0)], r"stiffness must be .* shape \(2,\) or \(2, 2\)"),
         ([FlexibleJoints(np.nan, 1.0)], "stiffness must be a finite number"),
         ([FlexibleJoints(8e3, [1.0, 0.0])], "inertia must be positive definite; .* is 0"),
-        ([FlexibleJoints(8e3, 1.0, -1.0)], "damping must be positive semidefinite; .* is -1"),
+        ([FlexibleJoints(8e3, 1.0, -1.0)], "damping must be positive definite; .* is -1"),
         ([DcMotors(**MOTOR | {"torque_constant": [0.1, 0.0]})], "torque_constant must not be zero"),
         ([DcMotors(**MOTOR | {"gear_ratio": 0.0})], "gear_ratio must not be zero"),
         ([DcMotors(**MOTOR | {"inductance": 0.0})], "inductance must be positive"),
@@ -206,3 +206,22 @@ def test_damping_of_some_joints_is_refused():
     """The control would reach the outputs at different orders: B(x) is singular."""
     with pytest.raises((ModelError, AssumptionError)):
         find_structure(touching("two_link", [FlexibleJoints(**SHAFT, damping=[5.0, 0.0])]).dae)
+
+
+@pytest.mark.parametrize(
+    ("actuation", "message"),
+    [
+        (FlexibleJoints(**SHAFT), "is a list of stages"),
+        (["springs"], "is a list of stages"),
+        ([FlexibleJoints("stiff", inertia=1.0)], "must be numbers, got 'stiff'"),
+        ([FlexibleJoints(**SHAFT), FlexibleJoints(**SHAFT)], "come once in a chain"),
+        ([FlexibleJoints(**{**SHAFT, "damping": [5.0, 0.0]})], "Damp all flexible joints or none"),
+        (
+            [ElectrohydraulicServos(1e6, 1e-6, lambda q: [[q[0], 0], [0, q[1]]])],
+            "must return a CasADi matrix",
+        ),
+    ],
+)
+def test_more_refusals(actuation, message):
+    with pytest.raises(ModelError, match=message):
+        touching("two_link", actuation)

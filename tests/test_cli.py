@@ -159,10 +159,11 @@ def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
 
 def test_a_scenario_is_not_overwritten_by_its_own_run(tmp_path, capsys):
     path = tmp_path / "scenario.yaml"
-    path.write_text(find_scenario("two_link_wall").read_text() + "# A comment of mine.\n")
+    text = find_scenario("two_link_wall").read_text()
+    path.write_text(f"# My wall.\n{text}")
     assert main(["simulate", str(path), "--out", str(tmp_path), *SHORT, *BARE]) == 1
     assert "--out: " in error_line(capsys)
-    assert path.read_text().endswith("# A comment of mine.\n")
+    assert path.read_text() == f"# My wall.\n{text}"
 
 
 def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):

@@ -201,6 +201,26 @@ def test_a_parameter_moves_the_surface():
     np.testing.assert_allclose(arrow.values[:, 0], 1.1, atol=1e-3)
 
 
+def test_a_parameter_turns_the_arrow():
+    """Of the normal of a dome that stands elsewhere."""
+    scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])
+    loop, context = build(scenario, start_meshcat(), live=False)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    state = loop.plant.state(own)
+    center = np.array([0.45, 0.02, 0.2])
+    loop.plant.set_parameter(own, "dome.position", center)
+    loop.plant.set_consistent_state(own, state)
+    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+    page = make_animation(loop, loop.record(context), context)
+    np.testing.assert_allclose(transforms(page)["/contact/dome/surface"][:3, 3], center)
+    position, turn = (
+        animation(page)["/contact/dome/force", name].values[0]
+        for name in ("position", "quaternion")
+    )
+    # The page holds single precision.
+    np.testing.assert_allclose(rotation(turn)[:, 2], (position - center) / 0.25, atol=1e-5)
+
+
 def test_one_moment_is_an_animation_too():
     """What is left of a run that failed in its first step."""
     loop, record, _ = recorded("two_link_wall", "duration=0.1")

@@ -324,7 +324,8 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
 
 
 def test_a_start_is_at_rest():
-    loop, context = build(two_link())
+    loop, context = build(two_link("integrator.start_time=3"))
+    assert context.get_time() == 3.0
     state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
     np.testing.assert_array_equal(state[2:], 0.0)
 
@@ -538,6 +539,16 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         (f"{MOVE} {{start: [1, 2], end: [1], end_time: 1}}", ["start has 2, end has 1"]),
         (f"{MOVE} {{start: [1], end: [2], end_time: 0}}", ["references.0: end_time 0"]),
         (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["0: ", "order=2"]),
+        # Actuation and force.
+        ("actuation=[!FlexibleJoints {stiffness: []}]", ["actuation.0: stiffness: empty"]),
+        (
+            "actuation=[!FlexibleJoints {stiffness: [1, 2, 3], inertia: [1]}]",
+            ["actuation.0: ", "stiffness"],
+        ),
+        ("force=!ModelForce", ["force: ", "!ModelForce must be followed by keys, or by {}"]),
+        ("force={gain: 1}", ["force: !ModelForce has no key 'gain'; keys: none", "!MeasuredForce"]),
+        ("force=!MeasuredForce {time_constant: 1, seed: -1}", ["force: seed: ", "got -1"]),
+        ("plant_parameters={link9.mass: [1]}", ["plant_parameters: ", "link9.mass", "link2.mass"]),
         # The start.
         ("start.positions.joint9=1", ["start.positions: ", "'joint9'", "there are joint1, joint2"]),
         ("start.errors.tool.x=1", ["start.errors: ", "'tool.x'", "there are tool.z"]),

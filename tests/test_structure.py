@@ -12,6 +12,7 @@ from problems import (
     in_other_units,
 )
 
+from drake_dae.dae import structure
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem, Parameter
@@ -471,24 +472,74 @@ def test_5_an_output_that_repeats_a_curved_constraint():
     assert "B(x) of (16) is singular" in str(error)
 
 
-def test_5_an_output_that_no_control_reaches():
-    """A nonlinear oscillator beside the controlled part; the search must not expand it for long."""
-    n = 12
-    error = violation(
-        system_of(
-            n,
-            f=lambda x: [
-                x[1],
-                0,
-                *[ca.sin(x[2 + (i + 1) % (n - 2)]) * x[2 + i] ** 2 for i in range(n - 2)],
-            ],
-            h=lambda x: [0, 1, *[0] * (n - 2)],
-            l=lambda x: x[5],
-            nominal_state=[0.5] * n,
-        )
-    )
+@pytest.fixture
+def derivatives_taken(monkeypatch) -> list[int]:
+    """Counts the derivatives of outputs and of constraints, which grow without bound in size."""
+    taken = []
+
+    def counted(derivative: Callable) -> Callable:
+        def count(*arguments):
+            taken.append(1)
+            return derivative(*arguments)
+
+        return count
+
+    monkeypatch.setattr(structure.Motion, "derivative", counted(structure.Motion.derivative))
+    monkeypatch.setattr(structure, "lie_derivative", counted(structure.lie_derivative))
+    return taken
+
+
+def beside_an_integrator(n: int, **fields) -> DaeSystem:
+    """x0'' = u + v, and nonlinear states that nothing reaches; after ten derivatives of these
+    CasADi takes minutes."""
+    moving = [ca.sin, *[lambda x: x] * (n - 3)]
+    base = {
+        "f": lambda x: [
+            x[1],
+            0,
+            *[moving[i](x[2 + (i + 1) % (n - 2)]) * x[2 + i] ** 2 for i in range(n - 2)],
+        ],
+        "h": lambda x: [0, 1, *[0] * (n - 2)],
+        "nominal_state": [0.5] * n,
+    }
+    return system_of(n, **{**base, **fields})
+
+
+def test_5_an_output_that_no_control_reaches(derivatives_taken):
+    error = violation(beside_an_integrator(20, l=lambda x: x[5]))
     assert error.assumption == 5
     assert "no control reaches it" in str(error)
+    assert len(derivatives_taken) <= 1
+
+
+def test_2_a_constraint_that_no_force_reaches(derivatives_taken):
+    error = violation(
+        beside_an_integrator(
+            20,
+            g=lambda x: [0, 1, *[0] * 18],
+            k=lambda x: x[5] - 0.5,
+            l=lambda x: x[0],
+            m=lambda x: 0,
+        )
+    )
+    assert error.assumption == 2
+    assert "no force reaches it" in str(error)
+    assert len(derivatives_taken) == 0
+
+
+def test_5_an_output_that_repeats_the_constraint_is_found_at_once(derivatives_taken):
+    """By Theorem 2.1, before its derivatives fill the state."""
+    system = beside_an_integrator(
+        20,
+        g=lambda x: [0, 1, *[0] * 18],
+        k=lambda x: x[0] ** 2 - 0.25 + x[5] - 0.5,
+        l=lambda x: (x[0] ** 2 - 0.25 + x[5] - 0.5) * (1 + x[3]),
+        m=lambda x: 0,
+    )
+    error = violation(system)
+    assert error.assumption == 5
+    assert "its derivatives repeat those of the constraints" in str(error)
+    assert len(derivatives_taken) <= 4
 
 
 def test_5_a_b_that_is_singular_between_the_sampled_states():

@@ -259,11 +259,7 @@ class Samples:
                 here = middle
             else:
                 there = middle
-        # Two branches of N* stay apart.
-        near = float(np.linalg.norm(there - here)) <= SINGULAR * max(
-            1.0, float(np.linalg.norm(here))
-        )
-        return here if near else None
+        return here
 
 
 def traced(system: DaeSystem, **expressions: ca.SX) -> TracedFunction:

@@ -131,7 +131,6 @@ def find_structure(
         ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
         for i, degree in enumerate(degrees)
     ]
-    samples.values(drift=drift)  # It can leave its domain where nothing before it did.
     return Structure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),

@@ -68,12 +68,14 @@ class FlexibleJoints:
         M_2 q_2'' + K_2 (q_2 - q_1) + D (q_2' - q_1') = u.
 
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4
-    for positions and 2 for forces; 3 and 1 with damping of every joint.
+    for positions and 2 for forces; 3 and 1 with damping. Damping leaves p zero dynamics, which the
+    law does not move: K_2 d + D d' = tau for the deflections d, with the rates of D^-1 K_2. They
+    are stable, but bound the step of an explicit integrator.
 
     Attributes:
         stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite.
         inertia: M_2 in kg m^2 (kg), likewise; what the URDF declares if None.
-        damping: D in N m s/rad (N s/m), likewise, positive semidefinite; 0 for none.
+        damping: D in N m s/rad (N s/m), likewise, positive definite; 0 for none.
     """
 
     stiffness: ArrayLike
@@ -83,7 +85,7 @@ class FlexibleJoints:
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
         p = len(names)
-        if np.any(np.isinf(np.asarray(self.stiffness, dtype=float))):
+        if np.any(np.isinf(_numbers("flexible_joints.stiffness", self.stiffness))):
             raise ModelError(
                 "FlexibleJoints: a stiffness is infinite. Rigid joints beside flexible ones are "
                 "not supported: the control would reach the outputs at different orders, and B(x) "
@@ -98,21 +100,29 @@ class FlexibleJoints:
                     f"FlexibleJoints: no rotor inertia is declared for {', '.join(bare)}; give "
                     "'inertia', or drake:rotor_inertia and drake:gear_ratio in the URDF"
                 )
-        stiffness, k = _matrix("flexible_joints.stiffness", self.stiffness, p, definite=True)
-        rotors, m_2 = _matrix("flexible_joints.inertia", inertia, p, definite=True)
+        rotary = all(signal.unit == "N m" for signal in links.actuator_signals)
+        units = ("N m/rad", "kg m^2", "N m s/rad") if rotary else ("", "", "")
+        stiffness, k = _matrix("flexible_joints.stiffness", self.stiffness, p, units[0])
+        rotors, m_2 = _matrix("flexible_joints.inertia", inertia, p, units[1])
         parameters = [stiffness, rotors]
         d = ca.SX(p, p)
-        if np.any(np.asarray(self.damping)):
-            damping, d = _matrix("flexible_joints.damping", self.damping, p, semidefinite=True)
+        if np.any(_full("flexible_joints.damping", self.damping, p)):
+            try:
+                damping, d = _matrix("flexible_joints.damping", self.damping, p, units[2])
+            except ModelError as error:
+                raise ModelError(
+                    f"{error}. Damp all flexible joints or none: where only some are damped, the "
+                    "control reaches the outputs at different orders"
+                ) from None
             parameters.append(damping)
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
 
         def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
             return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)
 
-        units = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
-        positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, units, strict=True)]
-        rates = [Signal(f"{n}.velocity", f"{unit}/s") for n, unit in zip(names, units, strict=True)]
+        kinds = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
+        positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, kinds, strict=True)]
+        rates = [Signal(f"{n}.velocity", f"{unit}/s") for n, unit in zip(names, kinds, strict=True)]
         return AttachedStage(
             state=ca.vertcat(q_2, rate),
             state_signals=(*positions, *rates),
@@ -207,13 +217,19 @@ class ElectrohydraulicServos:
         fluid, k_h = _diagonal("hydraulics.stiffness", self.stiffness, p, "N/m")
         if (fluid.value <= 0).any():
             raise ModelError(f"{fluid.name} must be positive, got {fluid.value}")
-        leakage, g_p = _matrix("hydraulics.leakage", self.leakage, p, semidefinite=True)
+        leakage, g_p = _matrix("hydraulics.leakage", self.leakage, p, "m/(N s)", definite=False)
         pressing = ca.SX.sym("fa", p)
 
         def geometry(position: ca.SX) -> ca.SX:
             if not callable(self.geometry):
                 return ca.SX(_full("hydraulics.geometry", self.geometry, p))
-            value = ca.SX(self.geometry(position))
+            try:
+                value = ca.SX(self.geometry(position))
+            except (NotImplementedError, TypeError) as error:
+                raise ModelError(
+                    f"hydraulics.geometry must return a CasADi matrix, for example "
+                    f"casadi.diag(...): {error}"
+                ) from error
             if value.shape != (p, p):
                 raise ModelError(f"hydraulics.geometry has shape {value.shape}, expected {(p, p)}")
             return value
@@ -277,8 +293,10 @@ def chain(
         if before.shaft is None:
             raise ModelError(
                 f"{type(stage).__name__} cannot stand behind an electric or hydraulic stage, "
-                "which has no shaft to drive; put FlexibleJoints first"
+                "which has no shaft to drive; these come last"
             )
+        if isinstance(stage, FlexibleJoints):
+            raise ModelError("FlexibleJoints come once in a chain; put both springs into one")
         loads.append(before.shaft)
     delivered = [own.force(*load) for own, load in zip(attached, loads, strict=True)]
     drifts = [own.drift(*load) for own, load in zip(attached, loads, strict=True)]
@@ -296,9 +314,16 @@ def chain(
     )
 
 
+def _numbers(name: str, value: ArrayLike) -> FloatArray:
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(f"{name} must be numbers, got {value!r}") from None
+
+
 def _full(name: str, value: ArrayLike, size: int) -> FloatArray:
     """A number, a diagonal or a matrix as a matrix."""
-    array = np.asarray(value, dtype=float)
+    array = _numbers(name, value)
     if array.ndim == 0:
         array = np.full(size, float(array))
     if array.ndim == 1:
@@ -312,7 +337,7 @@ def _full(name: str, value: ArrayLike, size: int) -> FloatArray:
 
 def _diagonal(name: str, value: ArrayLike, size: int, unit: str) -> tuple[Parameter, ca.SX]:
     """A parameter of one number per actuator, and its symbol."""
-    array = np.asarray(value, dtype=float)
+    array = _numbers(name, value)
     if array.ndim == 0:
         array = np.full(size, float(array))
     if array.shape != (size,) or not np.all(np.isfinite(array)):
@@ -322,18 +347,21 @@ def _diagonal(name: str, value: ArrayLike, size: int, unit: str) -> tuple[Parame
 
 
 def _matrix(
-    name: str, value: ArrayLike, size: int, definite: bool = False, semidefinite: bool = False
+    name: str, value: ArrayLike, size: int, unit: str, definite: bool = True
 ) -> tuple[Parameter, ca.SX]:
-    """A parameter that is a diagonal, or column by column a matrix, and the matrix of symbols."""
+    """A parameter that is a diagonal, or column by column a matrix, and the matrix of symbols.
+
+    It is symmetric, and positive definite or at least semidefinite.
+    """
     array = _full(name, value, size)
-    smallest = float(np.linalg.eigvalsh((array + array.T) / 2)[0])
     if not np.allclose(array, array.T, rtol=1e-12, atol=0):
         raise ModelError(f"{name} must be symmetric")
-    if (definite and smallest <= 0) or (semidefinite and smallest < -1e-12 * abs(array).max()):
+    smallest = float(np.linalg.eigvalsh(array)[0])
+    if smallest <= 0 if definite else smallest < -1e-12 * np.abs(array).max():
         kind = "positive definite" if definite else "positive semidefinite"
         raise ModelError(f"{name} must be {kind}; its smallest eigenvalue is {smallest:.3g}")
     if np.ndim(value) < 2:
-        parameter = Parameter(name, np.diag(array))
+        parameter = Parameter(name, np.diag(array), unit)
         return parameter, ca.diag(parameter.symbol)
-    parameter = Parameter(name, array.reshape(-1, order="F"))
+    parameter = Parameter(name, array.reshape(-1, order="F"), unit)
     return parameter, ca.reshape(parameter.symbol, size, size)

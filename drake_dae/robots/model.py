@@ -60,6 +60,12 @@ class RobotModel:
         name: str = "robot",
         actuation: Sequence[Stage] = (),
     ) -> None:
+        for stage in actuation if isinstance(actuation, Sequence) else [None]:
+            if not hasattr(stage, "attach"):
+                raise ModelError(
+                    f"{name}: actuation is a list of stages such as [FlexibleJoints(8000.0)], got "
+                    f"{actuation!r}"
+                )
         self.links = links
         self.constraints = tuple(constraints)
         self.positions = tuple(positions)
@@ -106,9 +112,9 @@ class RobotModel:
             h = ca.vertcat(ca.SX(nq + nv, nu), stages.drive)
             state = ca.vertcat(state, stages.state)
             control_signals = stages.control_signals
-            for stage in stages.stages:
-                state_signals += stage.state_signals
-                parameters += stage.parameters
+            for attached in stages.stages:
+                state_signals += attached.state_signals
+                parameters += attached.parameters
         for constraint in self.constraints:
             parameters += constraint.parameters
         #: Largest |u| per actuator, infinite where there is none or where u is no joint force.
@@ -259,7 +265,7 @@ class RobotModel:
         return chain(actuation, self.links, position, ca.mtimes(transposed, self.links.v))
 
     def _trace_equilibrium(self) -> None:
-        """Balance of forces and of the stages at v = 0, linear in (s, u)."""
+        """Balance of forces and of the stages at v = 0, to be solved for (s, u)."""
         dae, links = self.dae, self.links
         first = links.q.numel() + links.v.numel()
         control = ca.SX.sym("u", dae.num_controls)
@@ -268,29 +274,31 @@ class RobotModel:
         balance = balance[links.q.numel() :]
         balance = ca.substitute(balance, links.v, ca.SX.zeros(links.v.numel()))
         unknown = ca.vertcat(dae.state[first:], control)
-        gradient = ca.jacobian(balance, unknown)
-        offset = ca.substitute(balance, unknown, ca.SX.zeros(unknown.numel()))
         self._equilibrium = TracedFunction(
             f"{self.name} equilibrium",
-            {"q": links.q, "lambda": force, "parameters": dae.parameter_symbol},
-            {
-                "offset": offset,
-                "gradient": ca.substitute(gradient, unknown, ca.SX.zeros(unknown.numel())),
-            },
+            {"q": links.q, "lambda": force, "s": unknown, "parameters": dae.parameter_symbol},
+            {"balance": balance, "gradient": ca.jacobian(balance, unknown)},
         )
 
     def _rest(
         self, q: FloatArray, forces: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, float]:
         """The state at rest and what is left of the balance of forces."""
-        offset, gradient = self._equilibrium(q, forces, parameters)
-        gradient = gradient.reshape(offset.size, -1)
-        # Currents and forces differ by orders of magnitude.
-        scale = np.linalg.norm(gradient, axis=0)
-        solution = np.linalg.lstsq(gradient / scale, -offset)[0] / scale
-        left = float(np.max(np.abs(gradient @ solution + offset), initial=0.0))
-        stages = self.dae.num_states - q.size - self.links.v.numel()
-        return np.concatenate([q, np.zeros(self.links.v.numel()), solution[:stages]]), left
+        nv = self.links.v.numel()
+        stages = self.dae.num_states - q.size - nv
+        trial, left = np.zeros(stages + self.dae.num_controls), np.inf
+        solution = trial
+        for _ in range(20):
+            balance, gradient = self._equilibrium(q, forces, trial, parameters)
+            size = float(np.max(np.abs(balance), initial=0.0))
+            if not size < left:
+                break
+            solution, left = trial, size
+            gradient = gradient.reshape(balance.size, -1)
+            # Currents and forces differ by orders of magnitude.
+            scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)
+            trial = solution - np.linalg.lstsq(gradient / scale, balance)[0] / scale
+        return np.concatenate([q, np.zeros(nv), solution[:stages]]), left
 
     def _check_mass_matrix(self, mass_matrix: ca.SX, nominal: FloatArray) -> None:
         parameters = self.links.parameters
