@@ -179,11 +179,11 @@ SHAFT = {"stiffness": 8e3, "inertia": 1.0}
         ([FlexibleJoints(8e3, 1.0, -1.0)], "damping must be positive definite; .* is -1"),
         ([DcMotors(**MOTOR | {"torque_constant": [0.1, 0.0]})], "torque_constant must not be zero"),
         ([DcMotors(**MOTOR | {"gear_ratio": 0.0})], "gear_ratio must not be zero"),
-        ([DcMotors(**MOTOR | {"inductance": 0.0})], "inductance must be positive"),
+        ([DcMotors(**MOTOR | {"inductance": 0.0})], "inductance' must be positive"),
         ([DcMotors(**MOTOR | {"inductance": np.inf})], "inductance must be a finite number"),
         ([DcMotors(**MOTOR | {"resistance": -1.0})], "resistance must not be negative"),
         ([DcMotors(**MOTOR | {"resistance": np.eye(2)})], r"resistance must .* or shape \(2,\)"),
-        ([ElectrohydraulicServos(**SERVO | {"stiffness": 0.0})], "stiffness must be positive"),
+        ([ElectrohydraulicServos(**SERVO | {"stiffness": 0.0})], "stiffness' must be positive"),
         ([ElectrohydraulicServos(**SERVO | {"leakage": -1e-6})], "leakage must be positive semid"),
         (
             [ElectrohydraulicServos(**SERVO | {"geometry": lambda q: q})],

@@ -43,6 +43,12 @@ def test_poles_per_output():
     np.testing.assert_allclose(gains.matrix, [[200, 30, 0], [0, 0, 0], [0, 0, 1]], rtol=1e-15)
 
 
+def test_a_star_stands_for_all_other_outputs():
+    gains = poles({"a": -1.0, "*": -2.0})(["a", "met", "b", "c"], [1, 0, 1, 2])
+    np.testing.assert_array_equal(np.diag(gains.matrix[[0, 2, 3]]), [1.0, 2.0, 4.0])
+    assert gains.matrix[3, 3] == 4.0
+
+
 def test_coefficients_stand_lowest_derivative_first():
     gains = coefficients([6.0, 5.0])(["a", "b"], [2, 2])
     np.testing.assert_array_equal(gains.matrix, [[6, 5, 0, 0], [0, 0, 6, 5]])
@@ -100,7 +106,7 @@ def test_1_by_1_matrices_may_be_numbers():
 
 
 @pytest.mark.parametrize("degree", [1, 2, 4, 6])
-@pytest.mark.parametrize("rate", [1.0, 100.0])
+@pytest.mark.parametrize("rate", [1e-3, 1.0, 100.0, 1e6])
 def test_response_of_repeated_poles_in_closed_form(degree, rate):
     """e = (w_0 + w_1 t + ... ) exp(-a t), where the w_j are the derivatives of e exp(a t) at 0."""
     random = np.random.default_rng(degree)
@@ -164,6 +170,17 @@ def test_response_starts_at_the_initial_error_and_takes_one_time():
     assert gains.error_response([], [3.0, 7.0, 5.0]).shape == (0, 3)
     nothing = poles(-1.0)(["met"], [0])
     np.testing.assert_array_equal(nothing.error_response([0.0, 1.0], []), [[0.0], [0.0]])
+
+
+def test_times_may_come_in_any_order_and_number():
+    """A log at 1 kHz, shuffled, with times before the start and repeated ones."""
+    gains = poles(-2.0)(["z"], [2])
+    times = np.concatenate([np.arange(10_001) * 1e-3, [-0.5, 0.3, 0.3, 1 / 3, np.pi]])
+    times = np.random.default_rng(0).permutation(times)
+    found = gains.error_response(times, [1.0, 0.0])[:, 0]
+    expected = (1 + 2 * times) * np.exp(-2 * times)
+    # Ten thousand products round at 1e-16 each.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
 def test_gains_cannot_be_changed():

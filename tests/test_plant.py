@@ -220,3 +220,12 @@ def test_system_without_constraints():
     simulator.AdvanceTo(0.1)
     # x'' = 1 - sin x from rest: 0.1^2 / 2 up to 0.1^5.
     assert plant.state(context)[0] == pytest.approx(0.005, abs=1e-5)
+
+
+def test_parameters_that_make_no_sense_are_refused():
+    plant = two_link()
+    context = plant.CreateDefaultContext()
+    for value, message in ((-5.0, "must be positive"), (np.nan, "finite"), ([1, 2], "1 entries")):
+        with pytest.raises(ModelError, match=message):
+            plant.set_parameter(context, "link2.mass", value)
+    assert plant.get_parameter(context, "link2.mass") == 6.0

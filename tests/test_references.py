@@ -149,3 +149,27 @@ def test_a_reference_that_is_not_finite_raises():
     generator = ReferenceGenerator([ExpressionSignal(lambda t: ca.log(t))], [1])
     with pytest.raises(NonFiniteError, match="reference is not finite at t = 0 s"):
         generator.GetOutputPort("reference").Eval(generator.CreateDefaultContext())
+
+
+@pytest.mark.parametrize("order", [8, 16, 30])
+def test_high_orders_do_not_cancel(order):
+    """The move stays between its ends and mirrors itself; all its terms are positive."""
+    signal = point_to_point(0.0, 1.0, 0.0, 1.0, order)
+    values = [table(signal, 0, t)[0, 0] for t in np.linspace(0.0, 1.0, 41)]
+    assert np.all(np.diff(values) >= -1e-13)
+    np.testing.assert_allclose(np.array(values) + values[::-1], 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: point_to_point([1, 2, 3], [1, 2], 0, 1), r"start \(3,\), end \(2,\)"),
+        (lambda: point_to_point([1], [1, 2], 0, 1), "same length"),
+        (lambda: sinusoids(0.0, [1], [1, 2]), "same length"),
+        (lambda: point_to_point(0, 1, 0, 1, order=600), "order must be from 0 to 30"),
+        (lambda: sinusoids(0.0, "a", 1.0), "must be numbers"),
+    ],
+)
+def test_more_refusals(make, message):
+    with pytest.raises(ReferenceSignalError, match=message):
+        make()

@@ -13,7 +13,9 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae import build, load_scenario
+from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation import simulate as module
 from drake_dae.simulation.simulate import check_config, check_duration, simulate
 
@@ -189,6 +191,33 @@ def test_what_drake_says_gets_time_and_state():
     # The state is that of the stage at which it failed.
     np.testing.assert_allclose(caught.value.state, caught.value.time, atol=0.1)
     assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+def two_link(*settings):
+    scenario = load_scenario(find_scenario("two_link_wall"), settings)
+    return *build(scenario), scenario
+
+
+def test_a_projection_that_fails_gets_time_and_state():
+    """Steps of 10 ms jump over the singularity at z = 1.6 m, and off the manifold."""
+    loop, context, scenario = two_link(
+        "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}",
+        "integrator.use_error_control=false",
+        "integrator.max_step_size=0.01",
+    )
+    with pytest.raises(SimulationError, match=r"t = 0\.1\d* s, state \[.*wall.distance") as caught:
+        simulate(loop.diagram, context, 0.5, scenario.integrator)
+    assert 0.1 < caught.value.time < 0.2
+    assert caught.value.state.shape == (4,)
+    assert loop.record(context).time[-1] == pytest.approx(caught.value.time)
+
+
+def test_a_start_off_the_manifold_keeps_its_own_message():
+    loop, context, scenario = two_link()
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_state(own, loop.plant.state(own) + 0.1)
+    with pytest.raises(InconsistentStateError, match="start state is not on the constraint"):
+        simulate(loop.diagram, context, 0.5, scenario.integrator)
 
 
 # Progress.

@@ -532,8 +532,8 @@ def test_5_an_output_that_repeats_the_constraint_is_found_at_once(derivatives_ta
     system = beside_an_integrator(
         20,
         g=lambda x: [0, 1, *[0] * 18],
-        k=lambda x: x[0] ** 2 - 0.25 + x[5] - 0.5,
-        l=lambda x: (x[0] ** 2 - 0.25 + x[5] - 0.5) * (1 + x[3]),
+        k=lambda x: x[0] + x[5] ** 2 - 0.75,
+        l=lambda x: (x[0] + x[5] ** 2 - 0.75) * (1 + x[3]),
         m=lambda x: 0,
     )
     error = violation(system)

@@ -75,6 +75,13 @@ def test_constants_may_stand_for_expressions(control):
     np.testing.assert_array_equal(value, [[0.0], [1.0]])
 
 
+def test_zeros_of_arrays_are_structural():
+    x = ca.SX.sym("x", 2)
+    system = DaeSystem(state=x, f=x, g=[], h=np.eye(2), k=[], l=[x[0], 0], m=[])
+    assert system.h.nnz() == 2
+    assert system.l.nnz() == 1
+
+
 def test_expressions_and_functions_make_the_same_system():
     x, stiffness = ca.SX.sym("x", 2), Parameter("stiffness", 3.0, "N/m")
     by_expressions = DaeSystem(

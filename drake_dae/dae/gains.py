@@ -101,9 +101,12 @@ class FeedbackGains:
                 f"the error has sum mu_i = {matrix.shape[0]} coordinates, got shape "
                 f"{coordinates.shape}"
             )
-        # From one time to the next: a log with fixed steps has few different lengths.
+        # From one time to the next: a log with fixed steps has few different lengths, once its
+        # times are rounded to a power of 2, of which floating-point numbers take differences
+        # exactly.
+        grid = np.exp2(np.floor(np.log2(np.max(np.abs(moments), initial=1e-300))) - 50.0)
         order = np.argsort(moments)
-        steps = np.round(np.diff(moments[order], prepend=0.0), 13)
+        steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
         lengths, which = np.unique(steps, return_inverse=True)
         result = np.zeros((moments.size, len(self.degrees)))
         orders = np.concatenate([np.arange(degree) for degree in self.degrees])

@@ -42,6 +42,7 @@ class Parameter:
         name: Unique in its system, for example "link1.mass".
         value: The default, shape (k,); a float is taken as shape (1,).
         unit: SI unit as text.
+        positive: Whether only positive numbers make sense, as for a mass.
         symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
             not given.
 
@@ -52,6 +53,7 @@ class Parameter:
     name: str
     value: FloatArray
     unit: str = ""
+    positive: bool = False
     symbol: ca.SX = field(default=None)
 
     def __post_init__(self) -> None:
@@ -62,6 +64,7 @@ class Parameter:
             )
         value.setflags(write=False)
         object.__setattr__(self, "value", value)
+        self.check(value)
         if self.symbol is None:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
         elif not _is_symbol(self.symbol) or self.symbol.shape != (value.size, 1):
@@ -69,6 +72,17 @@ class Parameter:
                 f"the symbol of parameter '{self.name}' must be a CasADi SX column of "
                 f"{value.size} symbols, as its value has; got {self.symbol}"
             )
+
+    def check(self, value: FloatArray) -> None:
+        """Refuses numbers that make no sense.
+
+        Raises:
+            ModelError: One is not finite, or not positive where it must be.
+        """
+        if not np.all(np.isfinite(value)):
+            raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
+        if self.positive and not np.all(value > 0.0):
+            raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
 
 
 def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
@@ -184,7 +198,7 @@ class DaeSystem:
                     f"{self.name}: {key} depends on {', '.join(unknown)}, which is neither a "
                     "state nor a parameter; pass it in 'parameters' or put its number in"
                 )
-            put(key, value)
+            put(key, ca.sparsify(value))  # Zeros of an array are structural, too.
         sizes = (
             ("state_signals", n, "x"),
             ("constraint_input_signals", constraints, "v"),

@@ -105,6 +105,11 @@ class TrackingLaw:
             for i, j in forces.items():
                 missing[j] = measurement[j] - nominal[i]
             for i, j in forces.items():
+                if degrees[i] and self.force_gain[j].any():
+                    raise GainError(
+                        f"force_gain is for outputs that the law meets at once; '{names[i]}' has "
+                        f"degree {degrees[i]} and takes the measured force itself. Leave it 0"
+                    )
                 if degrees[i]:
                     chains[i][0] = measurement[j]
                 else:

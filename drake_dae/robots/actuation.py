@@ -164,13 +164,12 @@ class DcMotors:
         p = len(names)
         ratio = links.gear_ratios if self.gear_ratio is None else self.gear_ratio
         constant, k_m = _diagonal("dc_motors.torque_constant", self.torque_constant, p, "N m/A")
-        inductance, l = _diagonal("dc_motors.inductance", self.inductance, p, "H")  # noqa: E741
+        inductance, l = _diagonal("dc_motors.inductance", self.inductance, p, "H", True)  # noqa: E741
         resistance, r = _diagonal("dc_motors.resistance", self.resistance, p, "ohm")
         gears, n = _diagonal("dc_motors.gear_ratio", ratio, p, "")
         for parameter, wrong, wanted in (
             (constant, constant.value == 0, "not be zero"),
             (gears, gears.value == 0, "not be zero"),
-            (inductance, inductance.value <= 0, "be positive"),
             (resistance, resistance.value < 0, "not be negative"),
         ):
             if wrong.any():
@@ -214,9 +213,7 @@ class ElectrohydraulicServos:
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
         p = len(names)
-        fluid, k_h = _diagonal("hydraulics.stiffness", self.stiffness, p, "N/m")
-        if (fluid.value <= 0).any():
-            raise ModelError(f"{fluid.name} must be positive, got {fluid.value}")
+        fluid, k_h = _diagonal("hydraulics.stiffness", self.stiffness, p, "N/m", True)
         leakage, g_p = _matrix("hydraulics.leakage", self.leakage, p, "m/(N s)", definite=False)
         pressing = ca.SX.sym("fa", p)
 
@@ -335,14 +332,16 @@ def _full(name: str, value: ArrayLike, size: int) -> FloatArray:
     return array
 
 
-def _diagonal(name: str, value: ArrayLike, size: int, unit: str) -> tuple[Parameter, ca.SX]:
+def _diagonal(
+    name: str, value: ArrayLike, size: int, unit: str, positive: bool = False
+) -> tuple[Parameter, ca.SX]:
     """A parameter of one number per actuator, and its symbol."""
     array = _numbers(name, value)
     if array.ndim == 0:
         array = np.full(size, float(array))
     if array.shape != (size,) or not np.all(np.isfinite(array)):
         raise ModelError(f"{name} must be a finite number or shape ({size},), got {value!r}")
-    parameter = Parameter(name, array, unit)
+    parameter = Parameter(name, array, unit, positive)
     return parameter, parameter.symbol
 
 
@@ -361,7 +360,7 @@ def _matrix(
         kind = "positive definite" if definite else "positive semidefinite"
         raise ModelError(f"{name} must be {kind}; its smallest eigenvalue is {smallest:.3g}")
     if np.ndim(value) < 2:
-        parameter = Parameter(name, np.diag(array), unit)
+        parameter = Parameter(name, np.diag(array), unit, positive=definite)
         return parameter, ca.diag(parameter.symbol)
     parameter = Parameter(name, array.reshape(-1, order="F"), unit)
     return parameter, ca.reshape(parameter.symbol, size, size)

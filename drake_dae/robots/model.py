@@ -77,6 +77,11 @@ class RobotModel:
         forces = tuple(s for c in self.constraints for s in c.force_signals)
         position_outputs = tuple(s for p in self.positions for s in p.signals(links))
         m, nu = phi.numel(), links.actuation_matrix.shape[1]
+        if m > nu:
+            raise ModelError(
+                f"{name}: {m} constraint forces are outputs, but {nu} actuators can steer {nu} "
+                "outputs; take constraints away, or add actuators"
+            )
         if h_1.numel() + m != nu:
             raise ModelError(
                 f"{name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces are "

@@ -233,7 +233,7 @@ class MultibodyExpressions:
         bodies = [body for body in every if body.default_mass() > 0.0]
         parameters = []
         for body, name in zip(bodies, self._names(bodies), strict=True):
-            parameter = Parameter(f"{name}.mass", body.default_mass(), "kg")
+            parameter = Parameter(f"{name}.mass", body.default_mass(), "kg", positive=True)
             parameters.append(parameter)
             index, X_LB = self._bodies[int(body.index())]
             rotation, offset = constant_pose(X_LB)
@@ -327,7 +327,8 @@ class MultibodyExpressions:
         if matches:
             scoped = ", ".join(self._scoped(frame) for frame in matches)
             raise ModelError(f"the plant has several frames '{name}'; say which: {scoped}")
-        names = self._names(frames)
+        # Drake's parser adds frames of its own at joints whose axis it has to turn.
+        names = [name for name in self._names(frames) if not name.endswith(("_parent_F", "_M"))]
         near = get_close_matches(name, names, n=3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise ModelError(f"the plant has no frame '{name}'; {hint}frames: {', '.join(names)}")
@@ -382,6 +383,11 @@ class MultibodyExpressions:
                 scale = max(np.abs(other).max(), 1.0 if name == "velocity map" else np.abs(M).max())
                 error = np.abs(own - other).max() / scale
                 # Round-off gives 1e-14; any modelling error shows far above 1e-10.
+                if not np.all(np.isfinite(other)):
+                    raise ModelError(
+                        f"the plant's own {name} is not finite at q = {q}: a joint moves no mass; "
+                        "give each moving link mass and inertia, or weld it"
+                    )
                 if not error <= 1e-10:
                     raise ModelError(
                         f"{name} differs from the plant's own by {error:.1e} (relative) at "

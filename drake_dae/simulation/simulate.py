@@ -24,7 +24,7 @@ from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import Integrator
 from tqdm import tqdm
 
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """Between two updates of the progress bar, or two lines where there is no terminal for it, in s."""
@@ -73,6 +73,7 @@ def simulate(
 
     Raises:
         ModelError: A duration or settings that make no sense.
+        InconsistentStateError: The start state is not on the manifold.
         SimulationError: The run cannot go on.
     """
     check_duration(duration)
@@ -90,6 +91,7 @@ def simulate(
                 return EventStatus.ReachedTermination(diagram, "interrupted")
             return EventStatus.DidNothing()
 
+        began = None
         try:
             simulator.Initialize()
             simulator.set_monitor(monitor)
@@ -98,13 +100,16 @@ def simulate(
             elapsed = time.perf_counter() - began
             steps = simulator.get_num_steps_taken()
             simulator.AdvancePendingEvents()
-        except RuntimeError as error:
+        except (InconsistentStateError, RuntimeError) as error:
+            if began is None and isinstance(error, InconsistentStateError):
+                raise  # The start state: its message says what to do.
             state = context.get_continuous_state_vector().CopyToVector()
             raise SimulationError(
                 f"the simulation cannot go on at t = {context.get_time():.6g} s, state "
-                f"{np.array2string(state, precision=4, separator=', ')}: {error} Where the state "
-                "grows without bound or a reference leaves what the robot can reach, change these; "
-                "otherwise choose other integrator settings",
+                f"{np.array2string(state, precision=4, separator=', ')}: "
+                f"{str(error).rstrip('.')}. Where the state grows without bound or a reference "
+                "leaves what the robot can reach, change these; otherwise choose other integrator "
+                "settings",
                 context.get_time(),
                 state,
             ) from error

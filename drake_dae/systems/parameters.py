@@ -55,4 +55,7 @@ class ParameterizedSystem(LeafSystem):
         except ValueError:
             size = place.stop - place.start
             raise ModelError(f"parameter '{name}' has {size} entries, got {value!r}") from None
+        for parameter in self.dae.parameters:
+            if parameter.name == name:
+                parameter.check(values[place])
         context.get_mutable_numeric_parameter(0).SetFromVector(values)

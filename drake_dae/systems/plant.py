@@ -19,6 +19,7 @@ from drake_dae.errors import (
     FloatArray,
     InconsistentStateError,
     NonFiniteError,
+    SimulationError,
     SingularityError,
 )
 from drake_dae.systems.parameters import ParameterizedSystem
@@ -192,7 +193,17 @@ class DaePlant(ParameterizedSystem):
         )
 
     def _project(self, context: Context, state: State) -> EventStatus:
-        x = self.structure.manifold.project(self.state(context), self.parameters(context))
+        try:
+            x = self.structure.manifold.project(self.state(context), self.parameters(context))
+        except InconsistentStateError as error:
+            time, x = context.get_time(), self.state(context)
+            raise SimulationError(
+                f"the state left the constraint too far at t = {time:.6g} s, state "
+                f"{np.array2string(x, precision=4, separator=', ')}: {error}. Take smaller steps or "
+                "a better accuracy",
+                time,
+                x,
+            ) from error
         state.get_mutable_continuous_state().SetFromVector(x)
         return EventStatus.Succeeded()
 

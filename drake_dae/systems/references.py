@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from math import factorial
+from math import comb
 from typing import Any, Protocol
 
 import casadi as ca
@@ -98,14 +98,25 @@ def sinusoids(
     Raises:
         ReferenceSignalError: Shapes that do not fit.
     """
-    try:
-        rows = np.broadcast_arrays(*map(np.atleast_1d, (amplitudes, frequencies, phases)))
-    except ValueError:
-        raise ReferenceSignalError(
-            "sinusoids: amplitudes, frequencies and phases must have the same length"
-        ) from None
-    terms = np.array(rows, dtype=float).T
+    rows = _together("sinusoids", amplitudes=amplitudes, frequencies=frequencies, phases=phases)
+    terms = np.array(rows).T
     return ExpressionSignal(lambda t: offset + sum(a * ca.sin(w * t + p) for a, w, p in terms))
+
+
+def _together(owner: str, **given: ArrayLike) -> list[FloatArray]:
+    """Numbers of the same length; a single number serves all."""
+    try:
+        arrays = {key: np.asarray(value, dtype=float) for key, value in given.items()}
+    except (TypeError, ValueError):
+        raise ReferenceSignalError(f"{owner}: {', '.join(given)} must be numbers") from None
+    lengths = {key: array.shape for key, array in arrays.items() if array.ndim}
+    if len(set(lengths.values())) > 1 or any(len(shape) > 1 for shape in lengths.values()):
+        found = ", ".join(f"{key} {shape}" for key, shape in lengths.items())
+        raise ReferenceSignalError(
+            f"{owner}: {', '.join(given)} must be numbers or have the same length, got {found}"
+        )
+    shape = next(iter(lengths.values()), (1,))
+    return [np.broadcast_to(array, shape) for array in arrays.values()]
 
 
 class _Move(ExpressionSignal):
@@ -142,23 +153,17 @@ def point_to_point(
     Raises:
         ReferenceSignalError: Shapes or times that do not fit.
     """
-    first, last = np.broadcast_arrays(np.atleast_1d(start), np.atleast_1d(end))
+    first, last = _together("point_to_point", start=start, end=end)
     if not end_time > start_time:
         raise ReferenceSignalError(f"end_time {end_time} must be after start_time {start_time}")
-    if order < 0:
-        raise ReferenceSignalError(f"order must not be negative, got {order}")
+    if not 0 <= order <= 30:
+        raise ReferenceSignalError(f"order must be from 0 to 30, got {order}")
 
     def function(t: ca.SX) -> list[ca.SX]:
         s = (t - start_time) / (end_time - start_time)
-        # The integral of s^order (1 - s)^order, scaled to 1 at s = 1.
-        scale = factorial(2 * order + 1) / factorial(order) ** 2
-        fraction = scale * sum(
-            factorial(order)
-            / (factorial(k) * factorial(order - k))
-            * (-1.0) ** k
-            / (order + k + 1)
-            * s ** (order + k + 1)
-            for k in range(order + 1)
+        # Positive terms alone, so that nothing cancels.
+        fraction = s ** (order + 1) * sum(
+            comb(order + k, k) * (1 - s) ** k for k in range(order + 1)
         )
         blend = ca.if_else(s <= 0, 0, ca.if_else(s >= 1, 1, fraction))
         return [a + (b - a) * blend for a, b in zip(first, last, strict=True)]
