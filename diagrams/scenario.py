@@ -100,6 +100,7 @@ class PointCoordinates:
     frame: str = field(default="", metadata=REQUIRED)
     axes: str = "xyz"
     point: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    name: str = ""
 
 
 @dataclass
@@ -127,7 +128,7 @@ class JointPositions:
 
 @dataclass
 class FlexibleJoints:
-    """`robots.actuation.FlexibleJoints`; one number serves all actuators.
+    """`robots.actuation.FlexibleJoints`; one number serves all, full matrices are for Python.
 
     An inertia that is left out is what the URDF declares.
     """
@@ -152,7 +153,7 @@ class DcMotors:
 
 @dataclass
 class ElectrohydraulicServos:
-    """`robots.actuation.ElectrohydraulicServos`; one number serves all actuators."""
+    """`robots.actuation.ElectrohydraulicServos`; one number serves all, G(q) is for Python."""
 
     stiffness: list[float] = field(default_factory=list, metadata=REQUIRED)
     leakage: list[float] = field(default_factory=list, metadata=REQUIRED)

@@ -225,3 +225,17 @@ def test_damping_of_some_joints_is_refused():
 def test_more_refusals(actuation, message):
     with pytest.raises(ModelError, match=message):
         touching("two_link", actuation)
+
+
+@pytest.mark.parametrize("kind", DEGREES)
+def test_the_default_state_is_at_rest(kind):
+    """Also where nominal_positions is off the wall: no spring is strained, no force acts."""
+    found = actuated("two_link", kind)
+    plant = RobotPlant(found.model, found.structure)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, np.zeros(2))
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    assert np.max(np.abs(force)) < 1e-6
+    rate = plant.EvalTimeDerivatives(context).CopyToVector()[:4]
+    # Condition numbers of about 1e3 on forces of about 1e2.
+    assert np.max(np.abs(rate)) < 1e-7

@@ -111,7 +111,7 @@ def test_response_of_repeated_poles_in_closed_form(degree, rate):
     """e = (w_0 + w_1 t + ... ) exp(-a t), where the w_j are the derivatives of e exp(a t) at 0."""
     random = np.random.default_rng(degree)
     initial = random.normal(size=degree) * rate ** np.arange(degree)
-    times = np.linspace(0.0, 20.0 / rate, 41)
+    times = 20.0 / rate * np.linspace(0.0, 1.0, 41) ** 1.5
     weights = [
         sum(comb(j, i) * rate ** (j - i) * initial[i] for i in range(j + 1)) for j in range(degree)
     ]
@@ -227,9 +227,10 @@ REFUSED = {
     "an odd number of complex poles": (poles([-1 + 1j, -1 - 1j, -1 + 1j]), [3], "conjugate"),
     "NaN": (poles(np.nan), [2], "finite"),
     "text for poles": (poles("fast"), [2], "poles of output 'a' must be numbers, got 'fast'"),
-    "text for coefficients": (coefficients("ab"), [2], "coefficients of output 'a' must be num"),
+    "text for coefficients": (coefficients("ab"), [2], "coefficients of output 'a' must be real"),
     "too few coefficients": (coefficients([1.0]), [2], r"takes 2 coefficients K_i1.*got 1"),
     "coefficients in a matrix": (coefficients([[1.0, 2.0]]), [2], "takes 2 coefficients"),
+    "complex coefficients": (coefficients(np.array([1.0, 2.0j])), [2], "must be real numbers"),
     "an infinite coefficient": (coefficients([1.0, np.inf]), [2], "finite"),
     "unknown outputs": (poles({"b": -1.0}), [2], "unknown outputs: b; no gains for: a. Needed: a"),
     "no outputs": (coefficients({}), [2], "no gains for: a"),
@@ -238,7 +239,7 @@ REFUSED = {
     "a group too few": (matrices(), [2], r"degrees \[2\], so 1 groups.* got 0"),
     "a matrix too few": (matrices([1.0]), [2], "degree 2 take 2 matrices, got 1"),
     "a wrong matrix": (matrices([np.eye(2), 1.0]), [2], r"shape \(2, 2\), but a need \(1, 1\)"),
-    "text for a matrix": (matrices(["a", "b"]), [2], "a gain matrix must be numbers"),
+    "text for a matrix": (matrices(["a", "b"]), [2], "a gain matrix must be real numbers"),
 }
 
 
@@ -256,7 +257,7 @@ def test_wrong_designs_are_refused_by_name(what):
         (["a"], [2], [1.0, 2.0], r"got \(2,\)"),
         (["a"], [2, 1], np.ones((2, 3)), "1 output names for 2 degrees"),
         (["a"], [1], [[np.nan]], "finite"),
-        (["a"], [1], "K", "gains must be numbers"),
+        (["a"], [1], "K", "gains must be real numbers"),
         (["a", "b"], [0, 1], [[1.0], [1.0]], "'a' has degree 0 and takes no gain"),
     ],
 )

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from problems import PROBLEMS, Problem, pendulum
 
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold import Manifold, are_dependent
 from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -183,3 +183,21 @@ def test_a_manifold_may_be_a_point():
     manifold = manifold_of(lambda x: [x[0] - 1, x[1] * x[0] - 2])
     assert manifold.dimension == 0
     assert manifold.project([0.7, 1.5]) == pytest.approx([1.0, 2.0], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("gradients", "expected"),
+    [
+        ([[1, 0, 0], [0, 1, 0]], False),
+        ([[1, 1, 0], [2, 2, 0]], True),
+        ([[1, 1, 0], [1, 1, 1e-11]], True),
+        ([[1, 1, 0], [1, 1, 1e-6]], False),
+        # Lengths are units.
+        ([[1e-9, 0, 0], [0, 1e9, 0]], False),
+        ([[1, 0, 0], [0, 0, 0]], True),
+        ([[1, 0], [0, 1], [1, -1]], True),
+        ([[1, np.inf, 0], [0, 1, 0]], True),
+    ],
+)
+def test_dependent_gradients(gradients, expected):
+    assert are_dependent(np.array(gradients, dtype=float)) is expected

@@ -203,3 +203,14 @@ def test_unknown_frame_of_a_plant_names_what_is_near():
             [PointOnSurface("tol", WALL.surface)],
             [PointCoordinates("tool", "z")],
         )
+
+
+def test_two_points_of_one_frame_need_names():
+    outputs = [PointCoordinates("tool", "y"), PointCoordinates("tool", "y", (0, 0, 0.1), "heel")]
+    signals = [s.name for output in outputs for s in output.signals(arm("two_link").model.links)]
+    assert signals == ["tool.y", "heel.y"]
+
+
+def test_shapes_of_a_configuration_are_checked():
+    with pytest.raises(ModelError, match=r"shapes \(2,\) and \(2,\), expected \(1,\)"):
+        textbook().configuration([0.1, 0.2], [1.2, -1.6])

@@ -106,6 +106,9 @@ def test_spread_and_count():
     # 200 normal numbers: their deviation is known to 5%.
     np.testing.assert_allclose(deviation, [0.0, 0.0, 10.0, 0.001], rtol=0.25)
     assert find_structure(system, count=0).states.shape == (1, 4)
+    for wrong in ([0.1, 0.2], [[0.1]], np.nan):
+        with pytest.raises(ModelError, match=r"spread must be a number or have shape \(4,\)"):
+            find_structure(system, spread=wrong)
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -190,7 +193,7 @@ def test_a_mass_matrix_changes_nothing(problem):
 
 def untidy_one(x: ca.SX) -> ca.SX:
     """1, but CasADi does not see it, and it is off by round-off."""
-    return ca.cos(x) ** 2 + ca.sin(x) ** 2
+    return ca.exp(x) * ca.exp(-x)
 
 
 def test_a_control_that_the_constraint_cancels_never_acts():
@@ -528,18 +531,55 @@ def test_2_a_constraint_that_no_force_reaches(derivatives_taken):
 
 
 def test_5_an_output_that_repeats_the_constraint_is_found_at_once(derivatives_taken):
-    """By Theorem 2.1, before its derivatives fill the state."""
+    """By Theorem 2.1, before its derivatives fill the state; h* is zero by cancellation alone."""
     system = beside_an_integrator(
         20,
-        g=lambda x: [0, 1, *[0] * 18],
-        k=lambda x: x[0] + x[5] ** 2 - 0.75,
-        l=lambda x: (x[0] + x[5] ** 2 - 0.75) * (1 + x[3]),
+        g=lambda x: [0, untidy_one(x[4]), *[0] * 18],
+        h=lambda x: [0, untidy_one(x[3]), *[0] * 18],
+        k=lambda x: x[0] * (2 + x[6]) + x[5] ** 2 - 0.75,
+        l=lambda x: (x[0] * (2 + x[6]) + x[5] ** 2 - 0.75) * (1 + x[3]),
         m=lambda x: 0,
     )
     error = violation(system)
     assert error.assumption == 5
     assert "its derivatives repeat those of the constraints" in str(error)
-    assert len(derivatives_taken) <= 4
+    # One of the constraint, two of the output.
+    assert len(derivatives_taken) <= 3
+
+
+def test_2_a_constraint_whose_derivatives_repeat_is_found_at_once(derivatives_taken):
+    """x2 oscillates by itself; x0 enters and cancels, so that the structure does not tell."""
+    n = 20
+    system = system_of(
+        n,
+        f=lambda x: [x[1], 0, x[3], -x[2], *[0] * (n - 4)],
+        g=lambda x: [0, 1, *[0] * (n - 2)],
+        h=lambda x: [0, 1, *[0] * (n - 2)],
+        k=lambda x: x[2] + x[0] ** 2 - x[0] ** 2 * untidy_one(x[4]),
+        l=lambda x: x[0],
+        m=lambda x: 0,
+    )
+    error = violation(system)
+    assert error.assumption == 2
+    assert "no constraint input ever acts on constraint 'y0'" in str(error)
+    assert len(derivatives_taken) <= 2
+
+
+def test_2_redundant_constraints_that_fill_the_state():
+    """Their four derivatives have no room in three states."""
+    error = violation(
+        system_of(
+            3,
+            f=lambda x: [x[1], 0, 0],
+            g=lambda x: [[0, 0], [1, 1], [0, 1]],
+            h=lambda x: [0, 0, 1],
+            k=lambda x: [x[0], x[0]],
+            l=lambda x: x[2],
+            m=lambda x: [[0, 0]],
+        )
+    )
+    assert error.assumption == 2
+    assert "repeat each other or fill the state (n = 3)" in str(error)
 
 
 def test_5_a_b_that_is_singular_between_the_sampled_states():

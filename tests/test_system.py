@@ -253,7 +253,8 @@ def test_states_must_be_a_column_of_different_symbols():
         ([[1.0, 2.0]], r"finite with shape \(2,\)"),
         (0.0, r"finite with shape \(2,\)"),
         ([1.0, np.nan], r"finite with shape \(2,\)"),
-        ("up", "nominal_state must be numbers, got 'up'"),
+        (np.array([1.0, 2.0j]), "nominal_state must be real numbers"),
+        ("up", "nominal_state must be real numbers, got 'up'"),
     ],
 )
 def test_bad_nominal_states_are_refused(nominal, message):
@@ -265,9 +266,14 @@ def test_bad_parameters_are_refused():
     for value in (np.nan, [1.0, np.inf], [[1.0]]):
         with pytest.raises(ModelError, match="'mass' must be finite and one-dimensional"):
             Parameter("mass", value)
-    with pytest.raises(ModelError, match="'mass' must be numbers"):
+    with pytest.raises(ModelError, match="'mass' must be real numbers"):
         Parameter("mass", "heavy")
-    for symbol in (ca.SX.sym("m", 3), ca.SX.sym("m") ** 2, ca.MX.sym("m")):
+    for symbol in (
+        ca.SX.sym("m", 3),
+        ca.SX.sym("m", 2).T,
+        ca.SX.sym("m", 2) ** 2,
+        ca.MX.sym("m", 2),
+    ):
         with pytest.raises(ModelError, match="symbol of parameter 'mass' must be a CasADi SX colu"):
             Parameter("mass", [1.0, 2.0], symbol=symbol)
     with pytest.raises(ModelError, match=r"must be Python identifiers.*link1\.mass"):

@@ -138,3 +138,30 @@ def test_scenarios_of_actuation_follow_their_prediction(name):
 def test_refusals_name_the_key(name, setting, message):
     with pytest.raises(ScenarioError, match=message):
         build(scenario(name, setting))
+
+
+@pytest.mark.parametrize(
+    ("setting", "start"),
+    [
+        # The wall stands 2 cm farther than the law believes, or the springs are half as stiff.
+        ("plant_parameters={wall.position: [1.22, 0, 0]}", [1.22, 0.32]),
+        ("plant_parameters={flexible_joints.stiffness: [4e3, 4e3]}", [1.2, 0.32]),
+    ],
+)
+def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
+    """The tip is on the plant's wall at the wanted height, at rest, with the wanted force."""
+    loop, context = build(scenario("two_link_flexible", setting))
+    own = loop.plant.GetMyContextFromRoot(context)
+    state = loop.plant.state(own)
+    q = state[:2]
+    tip = [np.cos(q[0]) + np.cos(q.sum()), np.sin(q[0]) + np.sin(q.sum())]
+    np.testing.assert_allclose(tip, start, atol=1e-9)
+    assert loop.plant.GetOutputPort("constraint_force").Eval(own)[0] == pytest.approx(
+        15.0, abs=1e-6
+    )
+    assert np.max(np.abs(loop.plant.GetOutputPort("constraint_residual").Eval(own))) < 1e-12
+
+
+def test_a_gain_without_effect_is_refused():
+    with pytest.raises(ScenarioError, match=r"force or gains: .*degree 2 and takes the measured"):
+        build(scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}"))

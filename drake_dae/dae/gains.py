@@ -241,9 +241,11 @@ def _per_output(
 
 def _numbers(what: str, value: ArrayLike) -> FloatArray:
     try:
+        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
+            raise TypeError
         return np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise GainError(f"{what} must be numbers, got {value!r}") from error
+        raise GainError(f"{what} must be real numbers, got {value!r}") from error
 
 
 def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:

@@ -147,9 +147,7 @@ class Samples:
             by_control = multiply(gradient, (h, size), self.scale)
             # Units of the constraints' derivatives, and of the constraint inputs.
             rows, columns = _equilibration(np.abs(matrix))
-            inverse = np.linalg.inv(matrix / rows[:, None] / columns)
-            small = np.abs(inverse) <= ROUND_OFF * np.max(np.abs(inverse), initial=0.0)
-            inverse = np.where(small, 0.0, inverse) / columns[:, None] / rows
+            inverse = np.linalg.inv(matrix / rows[:, None] / columns) / columns[:, None] / rows
             beta.append(multiply(-inverse, by_control, rows))
             added, added_size = multiply(fields["g"], beta[-1], 1.0 / columns)
             h_star.append(_without_round_off(h + added, size + added_size))

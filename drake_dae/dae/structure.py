@@ -96,8 +96,14 @@ def find_structure(
             2,
         )
     _check_mass_matrix(system)
+    deviation = np.asarray(spread, dtype=float)
+    if deviation.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviation)):
+        raise ModelError(
+            f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
+            f"{spread!r}"
+        )
     random = np.random.default_rng(seed)
-    guesses = system.nominal_state + np.asarray(spread, dtype=float) * np.vstack(
+    guesses = system.nominal_state + deviation * np.vstack(
         [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
     )
     fields = Fields(system.explicit)
@@ -206,7 +212,7 @@ def _constraint_chains(system: DaeSystem, fields: Fields, guesses: FloatArray) -
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
             ):
                 stuck.append(i)
-        if still and sum(len(chain) for chain in chains) >= system.num_states:
+        if sum(len(chain) for chain in chains) + len(still) > system.num_states:
             stuck = still
         if stuck:
             names = ", ".join(f"'{system.constraint_output_signals[i].name}'" for i in stuck)

@@ -405,9 +405,11 @@ def _is_symbol(value: Any) -> bool:
 
 def _numbers(what: str, value: Any) -> FloatArray:
     try:
+        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
+            raise TypeError
         return np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"{what} must be numbers, got {value!r}") from error
+        raise ModelError(f"{what} must be real numbers, got {value!r}") from error
 
 
 def _unique(names: Sequence[str], kind: str, owner: str) -> None:

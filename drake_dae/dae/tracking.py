@@ -207,7 +207,10 @@ class TrackingLaw:
 
 def _force_gain(value: ArrayLike, size: int) -> FloatArray:
     """Gbar as a matrix that is positive semidefinite."""
-    gain = np.array(value, dtype=float)
+    try:
+        gain = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise GainError(f"force_gain must be numbers, got {value!r}") from None
     if gain.ndim == 0:
         gain = gain * np.eye(size)
     if gain.shape != (size, size) or not np.all(np.isfinite(gain)):

@@ -70,7 +70,8 @@ class FlexibleJoints:
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4
     for positions and 2 for forces; 3 and 1 with damping. Damping leaves p zero dynamics, which the
     law does not move: K_2 d + D d' = tau for the deflections d, with the rates of D^-1 K_2. They
-    are stable, but bound the step of an explicit integrator.
+    are stable, but bound the step of an explicit integrator. The law needs positions and
+    velocities of links and shafts.
 
     Attributes:
         stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite.
@@ -145,7 +146,7 @@ class DcMotors:
         M(q) q'' + H = J^T lambda + N K_m I_a,    L I_a' + R I_a + K_m N q' = u.
 
     Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
-    positions and 1 for forces.
+    positions and 1 for forces. The law needs positions and velocities, and the currents.
 
     Attributes:
         torque_constant: K_m in N m/A, a number or shape (p,), not 0.
@@ -197,7 +198,7 @@ class ElectrohydraulicServos:
         M(q) q'' + H = J^T lambda + G(q) f_a,    K_h^-1 f_a' + G_p f_a + G(q)^T q' = u.
 
     Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
-    positions and 1 for forces.
+    positions and 1 for forces. The law needs positions and velocities, and the actuator forces.
 
     Attributes:
         stiffness: K_h of the fluid in N/m, a number or shape (p,), positive.

@@ -1,6 +1,7 @@
 """A constrained robot as a DaeSystem.                        (37)-(45), (64)-(68), (74)-(78)"""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Self
 
@@ -160,6 +161,9 @@ class RobotModel:
         )
         self._trace_equilibrium()
         if stages:
+            # On the constraints first: shafts that rest off them would strain the springs.
+            with suppress(InconsistentStateError):
+                nominal = self.configuration(None, nominal)
             rest = self._rest(nominal, np.zeros(m), self.dae.parameter_values)[0]
             self.dae = replace(self.dae, nominal_state=rest)
 
@@ -187,12 +191,12 @@ class RobotModel:
         return self.dae.output_signals[: self.dae.num_controls - self.dae.num_constraints]
 
     def configuration(
-        self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
+        self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
         """q = psi(z_1) of (58): the consistent configuration with given position outputs.
 
         Args:
-            outputs: z_1, shape (nu - m,).
+            outputs: z_1, shape (nu - m,); None leaves them free.
             guess: Where Newton's method starts, shape (nq,).
             parameters: Values of all parameters; the defaults if None.
 
@@ -201,19 +205,29 @@ class RobotModel:
 
         Raises:
             InconsistentStateError: No such configuration near the guess.
+            ModelError: A shape that does not fit.
         """
         q = np.array(guess, dtype=float)
-        wanted = np.asarray(outputs, dtype=float)
+        count = 0 if outputs is None else len(self.position_signals)
+        wanted = np.zeros(0) if outputs is None else np.asarray(outputs, dtype=float)
+        if wanted.shape != (count,) or q.shape != (self.links.q.numel(),):
+            raise ModelError(
+                f"{self.name}: outputs and guess have shapes {wanted.shape} and {q.shape}, "
+                f"expected ({count},) and ({self.links.q.numel()},)"
+            )
         values = self.dae.parameter_values if parameters is None else parameters
         length, best = 1.0, np.inf
         step = np.zeros(q.size)
         for _ in range(100):
             phi, h_1, jacobian = self._configuration(q + length * step, values)
-            residual = np.concatenate([phi, h_1 - wanted])
+            residual = np.concatenate([phi, h_1[:count] - wanted])
+            if residual.size == 0:
+                return q
+            jacobian = jacobian.reshape(phi.size + h_1.size, -1)[: residual.size]
             size = float(np.max(np.abs(residual), initial=0.0))
             if size < best:
                 q, best = q + length * step, size
-                step = -np.linalg.lstsq(jacobian.reshape(residual.size, -1), residual)[0]
+                step = -np.linalg.lstsq(jacobian, residual)[0]
                 length = 1.0
             elif best < 1e-10:
                 return q

@@ -32,11 +32,13 @@ class PointCoordinates:
         frame: Name of the frame.
         axes: Which of "xyz", for example "yz".
         point: The point in the frame, m, shape (3,).
+        name: Of the outputs, "<name>.y"; the frame's if empty. Two points of one frame need it.
     """
 
     frame: str
     axes: str = "xyz"
     point: Vector = (0.0, 0.0, 0.0)
+    name: str = ""
 
     def __post_init__(self) -> None:
         check_axes("axes", self.axes)
@@ -45,7 +47,7 @@ class PointCoordinates:
         return links.position(self.frame, self.point)[["xyz".index(a) for a in self.axes]]
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
-        return tuple(Signal(f"{self.frame}.{axis}", "m") for axis in self.axes)
+        return tuple(Signal(f"{self.name or self.frame}.{axis}", "m") for axis in self.axes)
 
 
 @dataclass(frozen=True)

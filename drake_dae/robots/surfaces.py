@@ -156,9 +156,9 @@ class Ellipsoid:
 
     Attributes:
         center: m, shape (3,).
-        semi_axes: a, b, c in m along the world's axes, shape (3,).
-        inside: Whether the free side is the inside. Coordinates: longitude and latitude of the
-            scaled sphere, rad, singular on the z axis.
+        semi_axes: a, b, c in m along the world's axes, shape (3,). Coordinates: longitude and
+            latitude of the scaled sphere, rad, singular on the z axis.
+        inside: Whether the free side is the inside.
     """
 
     center: Vector

@@ -18,6 +18,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import (
     FloatArray,
     InconsistentStateError,
+    ModelError,
     NonFiniteError,
     SimulationError,
     SingularityError,
@@ -124,8 +125,17 @@ class DaePlant(ParameterizedSystem):
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,); a run from there is refused if it is off N*."""
-        context.SetContinuousState(np.asarray(state, dtype=float))
+        """Sets x as given, shape (n,); a run from there is refused if it is off N*.
+
+        Raises:
+            ModelError: A wrong shape.
+        """
+        x = np.asarray(state, dtype=float)
+        if x.shape != (self.dae.num_states,):
+            raise ModelError(
+                f"{self.dae.name}: a state has shape ({self.dae.num_states},), got {x.shape}"
+            )
+        context.SetContinuousState(x)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -199,8 +209,8 @@ class DaePlant(ParameterizedSystem):
             time, x = context.get_time(), self.state(context)
             raise SimulationError(
                 f"the state left the constraint too far at t = {time:.6g} s, state "
-                f"{np.array2string(x, precision=4, separator=', ')}: {error}. Take smaller steps or "
-                "a better accuracy",
+                f"{np.array2string(x, precision=4, separator=', ')}: {error}. Take smaller "
+                "steps or a better accuracy",
                 time,
                 x,
             ) from error

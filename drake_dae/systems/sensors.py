@@ -55,10 +55,12 @@ class ForceSensor(LeafSystem):
                 f"a ForceSensor's bias and noise_deviation are numbers or shape ({size},), got "
                 f"{bias!r} and {noise_deviation!r}"
             ) from None
-        if self.time_constant < 0 or self.sample_period < 0 or (self._deviation < 0).any():
+        numbers = [self.time_constant, self.sample_period, *self._bias, *self._deviation]
+        negative = self.time_constant < 0 or self.sample_period < 0 or (self._deviation < 0).any()
+        if negative or not np.all(np.isfinite(numbers)):
             raise ModelError(
-                "a ForceSensor's time_constant, sample_period and noise_deviation must not be "
-                f"negative, got {time_constant}, {sample_period}, {noise_deviation!r}"
+                "a ForceSensor's time_constant, sample_period and noise_deviation must be finite "
+                f"and not negative, got {time_constant}, {sample_period}, {noise_deviation!r}"
             )
         if not (self.time_constant or self.sample_period):
             raise ModelError(
