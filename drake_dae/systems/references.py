@@ -282,11 +282,7 @@ class ReferenceGenerator(LeafSystem):
         return self._evaluate(time).copy()
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
-        value = self._evaluate(context.get_time())
-        if not np.isfinite(value).all():
-            time = context.get_time()
-            raise NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)
-        output.SetFromVector(value)
+        output.SetFromVector(self._evaluate(context.get_time()))
 
 
 def _stack(
@@ -304,7 +300,18 @@ def _stack(
         ]
         return _at_time(TracedFunction("reference", {"time": time}, {"R": ca.vertcat(*rows)}))
     functions = [s.derivatives(part) for s, part in zip(signals, parts, strict=True)]
-    return lambda now: np.concatenate([function(now) for function in functions])
+
+    def evaluate(time: float) -> FloatArray:
+        value = np.concatenate([function(time) for function in functions])
+        if not np.isfinite(value).all():
+            raise _not_finite(time, value)
+        return value
+
+    return evaluate
+
+
+def _not_finite(time: float, value: FloatArray) -> NonFiniteError:
+    return NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)
 
 
 def _at_time(function: TracedFunction) -> Callable[[float], FloatArray]:
@@ -313,6 +320,9 @@ def _at_time(function: TracedFunction) -> Callable[[float], FloatArray]:
 
     def evaluate(time: float) -> FloatArray:
         moment[0] = time
-        return function.evaluate(moment)[0]
+        value = function.evaluate(moment)[0]
+        if not function.is_finite:
+            raise _not_finite(time, value)
+        return value
 
     return evaluate
