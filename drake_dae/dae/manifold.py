@@ -1,6 +1,7 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
 from collections.abc import Sequence
+from math import isfinite
 
 import casadi as ca
 import numpy as np
@@ -47,7 +48,13 @@ class Manifold:
             step = ca.SX(system.num_states, 1)
         inputs = {"state": system.state, "parameters": system.parameter_symbol}
         self._newton = TracedFunction(
-            f"{system.name} manifold", inputs, {"residual": residual, "step": step}
+            f"{system.name} manifold",
+            inputs,
+            {
+                "residual": residual,
+                "step": step,
+                "sizes": ca.vertcat(ca.norm_2(residual), ca.norm_2(step)),
+            },
         )
         self._gradient = TracedFunction(
             f"{system.name} manifold gradient", inputs, {"gradient": gradient}
@@ -81,23 +88,21 @@ class Manifold:
         """
         x = np.array(state, dtype=float).reshape(-1)
         p = self._defaults if parameters is None else np.asarray(parameters, dtype=float)
-        residual, step = self._newton(x, p)
-        norm = _size(residual)
+        residual, step, (norm, reach) = self._newton(x, p)
         length, mended = 1.0, False
         for _ in range(iterations):
-            if norm == 0.0 or norm == np.inf:
+            if norm == 0.0 or not isfinite(norm):
                 break
             trial = x + length * step
-            new_residual, new_step = self._newton.evaluate(trial, p)
-            new_norm = _size(new_residual)
+            new_residual, new_step, (new_norm, new_reach) = self._newton.evaluate(trial, p)
             if new_norm < norm:
-                x, norm, length, mended = trial, new_norm, 1.0, False
+                x, norm, reach, length, mended = trial, new_norm, new_reach, 1.0, False
                 residual[:], step[:] = new_residual, new_step
             elif mended and norm <= CONSISTENT:
                 break
             elif mended:
                 length /= 2.0
-            elif _size(step) <= ROUND_OFF * max(1.0, _size(x)):
+            elif reach <= ROUND_OFF * max(1.0, float(np.linalg.norm(x))):
                 return x
             else:
                 # Where gradients depend on each other, QR gives no step, but least squares do.
@@ -158,9 +163,3 @@ def _least_squares_step(gradients: FloatArray, residual: FloatArray) -> FloatArr
         return np.zeros(gradients.shape[1])
     solution = np.linalg.lstsq(gradients / length[:, None], -residual / length, rcond=DEPENDENT)
     return np.asarray(solution[0])
-
-
-def _size(values: FloatArray) -> float:
-    """Largest entry; infinite for values that are not finite."""
-    largest = float(np.max(np.abs(values), initial=0.0))
-    return largest if np.isfinite(largest) else np.inf
