@@ -263,3 +263,39 @@ def test_measured_force_replaces_nothing_when_the_model_is_right():
     np.testing.assert_allclose(
         closed_form.control_matrix[1] @ (changed - expected), 0.0, atol=1e-12
     )
+
+
+def test_measured_force_takes_the_place_of_the_models():
+    """(71): an output v1 of degree 1 is fed back from the measurement, its gain acts on v1 - r."""
+    problem = PROBLEMS["mixed_degrees"]()
+    plain = TrackingLaw(problem.system, poles(-3.0))
+    measured = TrackingLaw(problem.system, poles(-3.0), plain.structure, measured_force=True)
+    state = problem.consistent(np.random.default_rng(0))
+    reference, closed_form = reference_at(problem, 0.3), problem.known(state)
+    force = closed_form.alpha  # beta u does not act on v1.
+    expected = plain.control(state, reference)
+    changed = [
+        measured.control(state, reference, measured_force=force + np.array([error, 7.0])) - expected
+        for error in (0.0, 0.5)
+    ]
+    # Ten operations on numbers of order 1.
+    np.testing.assert_allclose(changed[0], 0.0, atol=1e-13)
+    # B du = (0, -K dv1): the other output does not notice.
+    np.testing.assert_allclose(
+        closed_form.control_matrix @ changed[1], [0.0, -3.0 * 0.5], rtol=1e-12, atol=1e-13
+    )
+
+
+def test_measured_force_needs_an_output_that_is_a_force():
+    with pytest.raises(ModelError, match="measured_force needs an output that is a constraint inp"):
+        TrackingLaw(pendulum().system, poles(-1.0), measured_force=True)
+    arm = PROBLEMS["two_link_arm"]().system
+    for gain, message in (
+        (-1.0, "positive semidefinite"),
+        ([[1.0, 2.0]], r"number or shape \(1, 1\)"),
+        (np.nan, r"number or shape \(1, 1\)"),
+    ):
+        with pytest.raises(GainError, match=message):
+            TrackingLaw(arm, poles(-1.0), measured_force=True, force_gain=gain)
+    with pytest.raises(GainError, match="force_gain needs measured_force"):
+        TrackingLaw(arm, poles(-1.0), force_gain=1.0)
