@@ -229,3 +229,32 @@ def test_solve_positive_definite_keeps_structural_zeros():
     x = solve_positive_definite(ca.SX([[2.0, 1.0], [1.0, 3.0]]), b)
     assert x[:, 0].nnz() == 0
     assert solve_positive_definite(ca.SX.eye(2), ca.SX(2, 0)).shape == (2, 0)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_the_pivot_of_a_positive_definite_matrix_is_an_angle(size):
+    """A = G^T G holds the products of the columns of G, whose angles its QR factors show."""
+    matrix = ca.SX.sym("a", size, size)
+    factors = PositiveDefiniteFactorization(matrix)
+    b = ca.SX.sym("b", size)
+    function = TracedFunction(
+        "pivot",
+        {"a": ca.vec(matrix), "b": b},
+        {
+            "pivot": factors.pivot,
+            "square": ca.dot(factors.forward(b), factors.scaled(factors.forward(b))),
+        },
+    )
+    random = np.random.default_rng(size)
+    columns, right = random.normal(size=(size + 2, size)), random.normal(size=size)
+    triangle = np.linalg.qr(columns)[1]
+    sines = np.abs(np.diag(triangle)) / np.linalg.norm(columns, axis=0)
+    pivot, square = function((columns.T @ columns).ravel(), right)
+    assert pivot[0] == pytest.approx(sines.min() ** 2, rel=1e-9)
+    wanted = right @ np.linalg.solve(columns.T @ columns, right)
+    assert square[0] == pytest.approx(wanted, rel=1e-9)
+    if size > 1:
+        columns[:, 1] = 2.0 * columns[:, 0]
+        assert function((columns.T @ columns).ravel(), right)[0][0] < 1e-14
+        columns[:, 0] = 0.0
+        assert function((columns.T @ columns).ravel(), right)[0][0] == 0.0

@@ -137,14 +137,16 @@ def test_a_robot_with_a_mass_matrix():
         )
 
 
-def test_a_reaction_is_another_way_to_write_g_v():
+def test_the_motion_may_be_given_in_fewer_operations():
     arm = PROBLEMS["two_link_arm"]().system
     plain = with_inertia(arm)
+    rate = ca.jtimes(arm.k, arm.state, arm.f)
 
-    def gradient(v: ca.SX) -> ca.SX:
-        return ca.vertcat(ca.SX(2, 1), ca.jtimes(arm.k, arm.state, v, True)[:2])
+    def motion(x: ca.SX, v: ca.SX) -> tuple[ca.SX, ca.SX]:
+        reaction = ca.vertcat(ca.SX(2, 1), ca.jtimes(arm.k, arm.state, v, True)[:2])
+        residual = ca.mtimes(plain.mass_matrix, x) - plain.f - reaction
+        return residual, ca.jtimes(rate, arm.state, x)
 
-    short = with_inertia(arm, reaction=gradient)
     state = np.array([1.0, -1.3, 0.2, 0.3])
     values = [
         TracedFunction(
@@ -152,10 +154,15 @@ def test_a_reaction_is_another_way_to_write_g_v():
             {"x": system.state},
             {"a": find_structure(system).drift, "b": find_structure(system).control_matrix},
         )(state)
-        for system in (plain, short)
+        for system in (plain, with_inertia(arm, motion=motion))
     ]
     for one, two in zip(*values, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12)
-    wrong = with_inertia(arm, reaction=lambda v: 2 * ca.mtimes(plain.g, v))
-    with pytest.raises(ModelError, match="'reaction' is not g v"):
-        find_structure(wrong)
+    wrongs = (
+        lambda x, v: (motion(x, 2 * v)[0], motion(x, v)[1]),
+        lambda x, v: (motion(x, v)[0], 2 * motion(x, v)[1]),
+        lambda x, v: (motion(x, v)[0], ca.SX(2, 1)),
+    )
+    for wrong in wrongs:
+        with pytest.raises(ModelError, match="'motion' is not"):
+            find_structure(with_inertia(arm, motion=wrong))

@@ -159,19 +159,44 @@ class PositiveDefiniteFactorization:
 
     Args:
         matrix: A, shape (n, n); its structural zeros are used.
+
+    Attributes:
+        pivot: A holds the products of some vectors; the smallest squared sine of the angle between
+            one of them and the span of those before it: 0 exactly where A is singular.
     """
 
     def __init__(self, matrix: ca.SX) -> None:
         self._identity = ca.is_equal(matrix, ca.SX.eye(matrix.shape[0]))
-        if not self._identity:
-            self._factors = ca.ldl(matrix, False)
+        self.pivot = ca.SX(1)
+        if self._identity:
+            return
+        self._diagonal, upper, _ = ca.ldl(matrix, False)
+        self._lower = upper.T + ca.SX.eye(matrix.shape[0])
+        for i in range(matrix.shape[0]):
+            square = self._diagonal[i] / matrix[i, i]
+            self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))
 
     def solve(self, right: ca.SX) -> ca.SX:
         """X of A X = B, shape (n, k); columns of B that are structurally zero stay so."""
-        if self._identity:
-            return right
-        result = ca.SX(*right.shape)
-        chosen = [j for j in range(right.shape[1]) if right[:, j].nnz()]
-        if chosen:
-            result[:, chosen] = ca.ldl_solve(right[:, chosen], *self._factors)
-        return ca.sparsify(result)
+        return self.backward(self.forward(right))
+
+    def forward(self, right: ca.SX) -> ca.SX:
+        """Y = L^-1 B, shape (n, k)."""
+        return right if self._identity else _by_columns(self._lower, right)
+
+    def backward(self, half: ca.SX) -> ca.SX:
+        """X = L^-T D^-1 Y, shape (n, k)."""
+        return half if self._identity else _by_columns(self._lower.T, self.scaled(half))
+
+    def scaled(self, half: ca.SX) -> ca.SX:
+        """D^-1 Y, shape (n, k), so that the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
+        return half if self._identity else half / ca.repmat(self._diagonal, 1, half.shape[1])
+
+
+def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
+    """The solution with a triangular matrix, of the columns that are not structurally zero."""
+    result = ca.SX(*right.shape)
+    for j in range(right.shape[1]):
+        if right[:, j].nnz():
+            result[:, j] = ca.solve(triangle, right[:, j])
+    return ca.sparsify(result)

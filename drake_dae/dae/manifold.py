@@ -57,7 +57,7 @@ class Manifold:
             },
         )
         self._gradient = TracedFunction(
-            f"{system.name} manifold gradient", inputs, {"gradient": gradient}
+            f"{system.name} manifold gradient", inputs, {"gradient": gradient}, often=False
         )
         self._defaults = system.parameter_values
 

@@ -13,10 +13,14 @@ with c the last derivatives L_f^(r_i - 1) k_i of the constraints. Each order bri
 so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and A is J M^-1 J^T.
 """
 
+from collections.abc import Callable
+
 import casadi as ca
+import numpy as np
 
 from drake_dae.dae.expressions import Factorization, PositiveDefiniteFactorization
 from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
 
 
 class Motion:
@@ -50,20 +54,7 @@ class Motion:
         ]
         self._rows = [i for i in range(system.num_states) if i not in plain]
         force = g[self._rows, :]
-        inertia = PositiveDefiniteFactorization(mass[self._rows, self._rows])
         self.constraint_gradient = ca.jacobian(constraint, x)
-        gradient = ca.sparsify(self.constraint_gradient[:, self._rows])
-        reaction = inertia.solve(force)
-        self.constraint_matrix = ca.sparsify(ca.mtimes(gradient, reaction))
-        coupling = Factorization(self.constraint_matrix)
-        self.pivot = coupling.pivot
-
-        def unknowns(residual: ca.SX, rate: ca.SX) -> ca.SX:
-            free = inertia.solve(-residual)
-            multiplier = coupling.solve(-rate - ca.mtimes(gradient, free))
-            return ca.vertcat(free + ca.mtimes(reaction, multiplier), multiplier)
-
-        self._unknowns = unknowns
         self._symbols: list[ca.SX] = [x]
         self._rates: list[ca.SX] = []
         self._values: list[ca.SX] = []
@@ -74,13 +65,15 @@ class Motion:
         self._symbols.append(first)
         #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
         self.constraint_input = first[len(self._rows) :, :]  # Of a scalar [1:] would be a row.
-        self._residual = (
-            ca.mtimes(mass[self._rows, self._rows], rate[self._rows])
-            - f[self._rows]
-            - system.reaction_to(self.constraint_input)[self._rows]
-            - ca.mtimes(h[self._rows, :], self.control)
+        residual, self._constraint_rate = self._first_order(constraint)
+        self._residual = residual[self._rows] - ca.mtimes(h[self._rows, :], self.control)
+        gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
+        if _agree(system, gradient, force):
+            gradient = force
+        self._unknowns, self.constraint_matrix, self.pivot = _solver(
+            mass[self._rows, self._rows], force, gradient
         )
-        self._constraint_rate = ca.jtimes(constraint, x, rate)
+        self._equations: list[ca.SX] = []
         self._solve_order()
 
     @property
@@ -105,9 +98,78 @@ class Motion:
         """An expression in terms of state, control and parameters alone."""
         return self._inline(expression, len(self._values))
 
+    def inverse(self, expression: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX] | None:
+        """The control for which an expression of the motion takes wanted values.
+
+        The equations of the motion and `expression = wanted` are solved together for the control
+        and for the unknowns that it moves, block by block along their structure (Dulmage and
+        Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
+        it is inverse dynamics.
+
+        Args:
+            expression: Shape (p, 1), in terms of the state and of this motion's unknowns.
+            wanted: Shape (p, 1).
+
+        Returns:
+            u in terms of the state, shape (p, 1), and a scalar that is 0 exactly where it is not
+            determined; None if the equations are not linear in what the control moves.
+        """
+        used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
+        orders = max(used, default=0)
+        symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
+        values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
+        moved = ca.which_depends(values, self.control, 1, True) if orders else []
+        still = [i for i, moves in enumerate(moved) if not moves]
+        unknowns = ca.vertcat(symbols[[i for i, moves in enumerate(moved) if moves]], self.control)
+        equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - wanted)
+        involved = ca.which_depends(equations, unknowns, 1, True)
+        equations = equations[[i for i, involves in enumerate(involved) if involves]]
+        if equations.numel() != unknowns.numel():
+            return None
+        matrix = ca.sparsify(ca.jacobian(equations, unknowns))
+        if ca.depends_on(matrix, unknowns):
+            return None
+        blocks = []
+        for rows, columns in _diagonal_blocks(matrix.sparsity()):
+            own = unknowns[columns]
+            known = ca.substitute(equations[rows], own, ca.SX.zeros(own.numel()))
+            factors = Factorization(ca.densify(matrix[rows, columns]))
+            blocks.append((own, factors.solve(-known), factors.pivot))
+        # From the control back to what it needs: the rest moves, but nobody asks for it.
+        needed, pivot = self.control, ca.SX(1)
+        for own, solution, own_pivot in reversed(blocks):
+            if ca.depends_on(needed, own):
+                needed, pivot = ca.vertcat(needed, solution), ca.fmin(pivot, own_pivot)
+        if still and ca.depends_on(needed, symbols[still]):
+            pivot = ca.fmin(pivot, self.pivot)
+        _, found = ca.substitute_inplace(
+            [symbols[still], *(own for own, _, _ in blocks)],
+            [values[still], *(solution for _, solution, _ in blocks)],
+            [self.control, pivot],
+        )
+        return found[0], found[1]
+
     def unknowns(self) -> ca.SX:
         """State and all unknowns that exist up to now, below each other."""
         return ca.vertcat(*self._symbols)
+
+    def _first_order(self, constraint: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """E x' - f - g v and c', in terms of the first unknowns."""
+        system, rate = self.system, self._rates[0]
+        residual = ca.mtimes(system.mass_matrix, rate) - system.f
+        residual -= ca.mtimes(system.g, self.constraint_input)
+        constraint_rate = ca.jtimes(constraint, system.state, rate)
+        if system.motion is None:
+            return residual, constraint_rate
+        shorter = ca.vertcat(*system.motion(rate, self.constraint_input))
+        longer = ca.vertcat(residual, constraint_rate)
+        if shorter.shape != longer.shape or not _agree(
+            system, shorter, longer, self._symbols[1], self.control
+        ):
+            raise ModelError(
+                f"{system.name}: 'motion' is not (E x' - f - g v, c') near the nominal state"
+            )
+        return shorter[: system.num_states], shorter[system.num_states :, :]
 
     def _next_unknown(self) -> ca.SX:
         size = len(self._rows) + self.system.num_constraints
@@ -120,17 +182,17 @@ class Motion:
     def _add_order(self) -> None:
         following = self._next_unknown()
         self._rates.append(following)
-        self._residual = self._total_derivative(self._residual)
-        self._constraint_rate = self._total_derivative(self._constraint_rate)
+        size = self._residual.numel()
+        both = self._total_derivative(ca.vertcat(self._residual, self._constraint_rate))
+        self._residual, self._constraint_rate = both[:size, :], both[size:, :]
         self._symbols.append(following)
         self._solve_order()
 
     def _solve_order(self) -> None:
         """The newest unknowns enter residual and constraint rate linearly: solve for them."""
         newest = self._symbols[-1]
-        known = ca.substitute(
-            ca.vertcat(self._residual, self._constraint_rate), newest, ca.SX.zeros(newest.numel())
-        )
+        self._equations.append(ca.vertcat(self._residual, self._constraint_rate))
+        known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
         count = len(self._rows)
         solution = self._unknowns(known[:count, :], known[count:, :])
         self._values.append(ca.densify(self._inline(solution, len(self._values))))
@@ -146,3 +208,58 @@ class Motion:
             if orders
             else expression
         )
+
+
+def _diagonal_blocks(pattern: ca.Sparsity) -> list[tuple[list[int], list[int]]]:
+    """Rows and columns of the blocks of a square matrix, in the order in which they are solved."""
+    count, rows, columns, row_starts, column_starts, _, _ = pattern.btf()
+    return [
+        (
+            rows[row_starts[k] : row_starts[k + 1]],
+            columns[column_starts[k] : column_starts[k + 1]],
+        )
+        for k in range(count)
+    ]
+
+
+def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
+    """Whether two expressions are the same function, by their numbers around the nominal state."""
+    symbols = [system.state, *unknowns, system.parameter_symbol]
+    function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        x = system.nominal_state + 0.1 * random.standard_normal(system.num_states)
+        numbers = [random.standard_normal(u.numel()) for u in unknowns]
+        one, other = (v.full() for v in function(x, *numbers, system.parameter_values))
+        size = np.max(np.abs(one), initial=0.0) + np.max(np.abs(other), initial=0.0)
+        if not np.allclose(one, other, rtol=1e-9, atol=1e-11 * size):
+            return False
+    return True
+
+
+def _solver(
+    mass: ca.SX, force: ca.SX, gradient: ca.SX
+) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
+    """Solves [[E, -g], [dc/dx, 0]] (w, v) = -(residual, rate), from E, g and (dc/dx)^T.
+
+    Returns:
+        The solver, A(x), and a scalar that is 0 exactly where A is singular.
+    """
+    inertia = PositiveDefiniteFactorization(mass)
+    half = inertia.forward(force)
+    coupling: Factorization | PositiveDefiniteFactorization
+    if gradient is force:  # A = g^T E^-1 g, as J M^-1 J^T
+        other = ca.sparsify(inertia.scaled(half))
+        matrix = ca.sparsify(ca.tril2symm(ca.tril(ca.mtimes(other.T, half))))
+        coupling = PositiveDefiniteFactorization(matrix)
+    else:
+        other = ca.sparsify(inertia.scaled(inertia.forward(gradient)))
+        matrix = ca.sparsify(ca.mtimes(other.T, half))
+        coupling = Factorization(matrix)
+
+    def solve(residual: ca.SX, rate: ca.SX) -> ca.SX:
+        free = inertia.forward(-residual)
+        multiplier = coupling.solve(-rate - ca.mtimes(other.T, free))
+        return ca.vertcat(inertia.backward(free + ca.mtimes(half, multiplier)), multiplier)
+
+    return solve, matrix, coupling.pivot

@@ -29,6 +29,7 @@ class Structure:
         motion: Time derivatives along the motion on N*.
         elimination: (9)-(14).
         output_chains: Per output l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i.
+        highest_derivatives: z_i^(mu_i) in terms of the unknowns of `motion`, shape (p, 1).
         drift: a_1(x), a_2(x) of (28): L_f*^mu_i l*_i, shape (p, 1).
         control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p).
         states: The consistent states at which numbers were decided, shape (samples, n).
@@ -44,6 +45,7 @@ class Structure:
     motion: Motion
     elimination: Elimination
     output_chains: tuple[tuple[ca.SX, ...], ...]
+    highest_derivatives: ca.SX
     drift: ca.SX
     control_matrix: ca.SX
     states: FloatArray
@@ -121,7 +123,9 @@ def find_structure(
             "A(x) of (2) loses rank: the constraints are redundant or their forces cannot act "
             "independently. Remove a redundant constraint, or keep away from this state",
         )
-    output_chains, drift, control_matrix = _output_chains(motion, elimination, samples)
+    output_chains, drift, control_matrix, highest_derivatives = _output_chains(
+        motion, elimination, samples
+    )
     degrees = tuple(len(chain) for chain in output_chains)
     control_margin = samples.margin(
         control_matrix,
@@ -148,6 +152,7 @@ def find_structure(
         output_chains=output_chains,
         drift=drift,
         control_matrix=control_matrix,
+        highest_derivatives=highest_derivatives,
         states=samples.states,
         constraint_margin=constraint_margin,
         control_margin=control_margin,
@@ -230,7 +235,7 @@ def _constraint_chains(system: DaeSystem, fields: Fields, guesses: FloatArray) -
 
 def _output_chains(
     motion: Motion, elimination: Elimination, samples: Samples
-) -> tuple[tuple[tuple[ca.SX, ...], ...], ca.SX, ca.SX]:
+) -> tuple[tuple[tuple[ca.SX, ...], ...], ca.SX, ca.SX, ca.SX]:
     """l*_i, ..., L_f*^(mu_i - 1) l*_i by Assumption (4), a(x) of (28) and B(x) of (16)."""
     system = motion.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
@@ -240,6 +245,7 @@ def _output_chains(
         elimination.constraint_gradient, elimination.constraint_matrix
     )
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
+    highest_derivatives = ca.SX(count, 1)
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     acts = np.array([value.any(axis=1) for value, _ in n_star_values]).T
     following = elimination.l_star
@@ -250,6 +256,7 @@ def _output_chains(
         for row, i in enumerate(undecided):
             if acts[row].all():
                 drift[i], control_matrix[i, :] = following[row], rows[row, :]
+                highest_derivatives[i] = moving[row]
             elif acts[row].any():
                 state = samples.states[int(np.argmin(acts[row]))]
                 raise AssumptionError(
@@ -292,7 +299,7 @@ def _output_chains(
                 5,
             )
         undecided = still
-    return tuple(tuple(chain) for chain in chains), drift, control_matrix
+    return tuple(tuple(chain) for chain in chains), drift, control_matrix, highest_derivatives
 
 
 def _reaches(fields: ca.SX, drift: ca.SX, expression: ca.SX, state: ca.SX) -> bool:

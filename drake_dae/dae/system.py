@@ -118,8 +118,9 @@ class DaeSystem:
         nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
         name: For messages.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
-        reaction: g(x) v as a function of the symbol v, shape (n, 1), for when it takes fewer
-            operations than the product: for a robot J^T lambda is the gradient of lambda^T phi.
+        motion: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
+            derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
+            operations than the expressions above: for a robot it is inverse dynamics.
 
     Raises:
         ModelError: A shape that does not fit, a symbol that is neither state nor parameter, or
@@ -142,7 +143,7 @@ class DaeSystem:
     nominal_state: FloatArray = field(default=None)  # type: ignore[arg-type]
     name: str = "system"
     mass_matrix: ca.SX = None
-    reaction: Callable[[ca.SX], ca.SX] | None = None
+    motion: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
 
     def __post_init__(self) -> None:
         if not (_is_symbol(self.state) and self.state.numel()):
@@ -302,24 +303,6 @@ class DaeSystem:
             **labels,
         )
 
-    def reaction_to(self, constraint_input: ca.SX) -> ca.SX:
-        """g(x) v, shape (n, 1), by `reaction` where there is one.
-
-        Raises:
-            ModelError: `reaction` is not g v at the nominal state.
-        """
-        product = ca.mtimes(self.g, constraint_input)
-        if self.reaction is None:
-            return product
-        value = ca.SX(self.reaction(constraint_input))
-        symbols = [self.state, constraint_input, self.parameter_symbol]
-        both = ca.Function("reactions", symbols, [ca.horzcat(product, value)])
-        inputs = np.arange(1.0, self.num_constraints + 1.0)
-        found = both(self.nominal_state, inputs, self.parameter_values).full()
-        if not np.allclose(found[:, 0], found[:, 1], rtol=1e-9, atol=1e-9 * np.abs(found).max()):
-            raise ModelError(f"{self.name}: 'reaction' is not g v at the nominal state")
-        return value
-
     @cached_property
     def explicit(self) -> "DaeSystem":
         """The same system with E = 1: f, g and h are those of the paper."""
@@ -334,7 +317,7 @@ class DaeSystem:
             g=solved[:, 1 : 1 + m],
             h=solved[:, 1 + m :],
             mass_matrix=None,
-            reaction=None,
+            motion=None,
         )
 
     @property

@@ -115,10 +115,18 @@ class TrackingLaw:
                 else:
                     highest[i] -= ca.mtimes(ca.DM(self.force_gain[j : j + 1]), missing)
         wanted = highest - ca.mtimes(gain, errors())
-        factors = Factorization(self.structure.control_matrix)
-        control = factors.solve(wanted - self.structure.drift)
-        elimination = self.structure.elimination
-        output = elimination.l_star + ca.mtimes(elimination.n_star, control)
+        found = self.structure.motion.inverse(self.structure.highest_derivatives, wanted)
+        if found is None:  # L_h* of an output vanishes, but not by structure.
+            factors = Factorization(self.structure.control_matrix)
+            found = factors.solve(wanted - self.structure.drift), factors.pivot
+        control, pivot = found
+        # What the control reaches at once is as wanted.
+        output = ca.vertcat(
+            *[
+                chain[0] if chain else wanted[i]
+                for i, chain in enumerate(self.structure.output_chains)
+            ]
+        )
         inputs = {
             "state": system.state,
             "reference": reference,
@@ -133,7 +141,7 @@ class TrackingLaw:
             {
                 "control": control,
                 "tracking_error": output - nominal,
-                "pivot": ca.fmin(factors.pivot, elimination.pivot),
+                "pivot": pivot,
             },
         )
         self._coordinates = TracedFunction(
@@ -144,6 +152,7 @@ class TrackingLaw:
                 "parameters": system.parameter_symbol,
             },
             {"coordinates": coordinates},
+            often=False,
         )
 
     @property

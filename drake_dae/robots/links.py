@@ -1,6 +1,6 @@
 """What the links of a robot provide: M(q), H(q, v) and where their frames are."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, Protocol
@@ -54,6 +54,24 @@ class Links(Protocol):
 
     def position(self, frame: Any, point: ArrayLike = (0.0, 0.0, 0.0)) -> ca.SX:
         """Position in the world of a point that is fixed in a frame, m, shape (3, 1)."""
+
+    def jacobian(self, phi: "Residual") -> ca.SX:
+        """J = (dphi/dq) N of constraints phi(q), shape (m, nv)."""
+
+    def motion(
+        self, acceleration: ca.SX, phi: "Residual", multiplier: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """M(q) v' + H(q, v) - J(q)^T lambda of (37), shape (nv, 1), and phi'', shape (m, 1).
+
+        Args:
+            acceleration: v', shape (nv, 1).
+            phi: The constraints.
+            multiplier: lambda, shape (m, 1).
+        """
+
+
+Residual = Callable[[Links], ca.SX]
+"""phi(q) of links, or of stand-ins for them with the same frames, shape (m, 1)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +171,19 @@ class LinkExpressions:
         pose = self._pose(frame)
         origin = pose[1] if isinstance(pose, tuple) else pose
         return origin + ca.mtimes(self.rotation(frame), offset) if offset.any() else origin
+
+    def jacobian(self, phi: Residual) -> ca.SX:
+        """J = (dphi/dq) N of constraints phi(q), shape (m, nv)."""
+        return ca.mtimes(ca.jacobian(phi(self), self.q), self.velocity_map)
+
+    def motion(self, acceleration: ca.SX, phi: Residual, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """M(q) v' + H(q, v) - J(q)^T lambda of (37), shape (nv, 1), and phi'', shape (m, 1)."""
+        residual, velocity = phi(self), ca.mtimes(self.velocity_map, self.v)
+        reaction = ca.jtimes(residual, self.q, multiplier, True)
+        inertial = ca.mtimes(self.mass_matrix, acceleration) + self.bias
+        rate, moving = ca.jtimes(residual, self.q, velocity), ca.vertcat(self.q, self.v)
+        twice = ca.jtimes(rate, moving, ca.vertcat(velocity, acceleration))
+        return inertial - ca.mtimes(self.velocity_map.T, reaction), twice
 
     def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
         if frame not in self.frames:

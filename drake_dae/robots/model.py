@@ -73,7 +73,7 @@ class RobotModel:
         self.name = name
         q, v = links.q, links.v
         nq, nv = q.numel(), v.numel()
-        phi = ca.vertcat(ca.SX(0, 1), *[c.residual(links) for c in self.constraints])
+        phi = self._residual(links)
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
         forces = tuple(s for c in self.constraints for s in c.force_signals)
         position_outputs = tuple(s for p in self.positions for s in p.signals(links))
@@ -98,14 +98,16 @@ class RobotModel:
         # The links, then the stages: E x' = f + g lambda + h u.
         actuation_matrix = ca.SX(ca.DM(links.actuation_matrix))
         mass, bias = links.mass_matrix, links.bias
+        carried = ca.SX(nv, nv)
         stages = self._attach(actuation)
         self.stages = stages.stages if stages else ()
         self.joint_force = stages.joint_force if stages else None
         if stages and stages.stages[0].carries_rotors:
             rotors = links.actuation_matrix * links.reflected_inertia @ links.actuation_matrix.T
-            mass = mass - ca.SX(ca.sparsify(ca.DM(rotors)))
+            carried = ca.SX(ca.sparsify(ca.DM(rotors)))
+            mass = mass - carried
         self._check_mass_matrix(mass, nominal)
-        jacobian = ca.mtimes(ca.jacobian(phi, q), links.velocity_map)
+        jacobian = links.jacobian(self._residual)
         inertia = ca.diagcat(ca.SX.eye(nq), mass)
         f = ca.vertcat(ca.mtimes(links.velocity_map, v), -bias)
         h = ca.vertcat(ca.SX(nq, nu), actuation_matrix)
@@ -123,6 +125,17 @@ class RobotModel:
                 parameters += attached.parameters
         for constraint in self.constraints:
             parameters += constraint.parameters
+
+        def motion(rate: ca.SX, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
+            acceleration = rate[nq : nq + nv]
+            moved, phi_rate = links.motion(acceleration, self._residual, multiplier)
+            moved -= ca.mtimes(carried, acceleration)
+            if not stages:
+                return ca.vertcat(rate[:nq] - f[:nq], moved), phi_rate
+            moved -= ca.mtimes(actuation_matrix, stages.joint_force)
+            driven = ca.mtimes(stages.mass, rate[nq + nv :]) - stages.drift
+            return ca.vertcat(rate[:nq] - f[:nq], moved, driven), phi_rate
+
         #: Largest |u| per actuator, infinite where there is none or where u is no joint force.
         self.control_limits = (
             links.effort_limits
@@ -148,11 +161,7 @@ class RobotModel:
             output_signals=position_outputs + forces,
             nominal_state=np.concatenate([nominal, np.zeros(state.numel() - nq)]),
             name=name,
-            reaction=lambda multiplier: ca.vertcat(
-                ca.SX(nq, 1),
-                ca.mtimes(links.velocity_map.T, ca.jtimes(phi, q, multiplier, True)),
-                ca.SX(state.numel() - nq - nv, 1),
-            ),
+            motion=motion,
         )
         self._configuration = TracedFunction(
             f"{name} configuration",
@@ -269,6 +278,10 @@ class RobotModel:
                 "has fewer actuators than joints"
             )
         return state
+
+    def _residual(self, links: Links) -> ca.SX:
+        """phi(q), shape (m, 1)."""
+        return ca.vertcat(ca.SX(0, 1), *[c.residual(links) for c in self.constraints])
 
     def _attach(self, actuation: Sequence[Stage]) -> ActuationChain | None:
         if not actuation:

@@ -34,7 +34,15 @@ from drake_dae.robots.joints import (
     joint_velocity_map,
     read_links,
 )
-from drake_dae.robots.tree import Inertia, inverse_dynamics, link_poses, mass_matrix
+from drake_dae.robots.links import Residual
+from drake_dae.robots.tree import (
+    Inertia,
+    frame_jacobian,
+    inverse_dynamics,
+    link_motions,
+    link_poses,
+    mass_matrix,
+)
 
 SUPPORTED_FORCE_ELEMENTS = (
     UniformGravityFieldElement,
@@ -124,7 +132,7 @@ class MultibodyExpressions:
         )
         self.mass_matrix = mass_matrix(self._links, self._rotors())
         gravity = plant.gravity_field().gravity_vector()
-        self.bias = inverse_dynamics(self._links, self.v, gravity) - self._applied_force
+        self.bias = self._newton_euler(self.v, gravity) - self._applied_force
         self._compare_with_plant()
 
     def rotation(self, frame: str | Frame) -> ca.SX:
@@ -148,11 +156,80 @@ class MultibodyExpressions:
         Raises:
             ModelError: No frame, or more than one, has that name; or a point that is not finite.
         """
-        offset = np.array(point, dtype=float)
-        if offset.shape != (3,) or not np.all(np.isfinite(offset)):
-            raise ModelError(f"a point has 3 finite coordinates, got {point!r}")
-        rotation, origin = self._frame_pose(frame)
-        return origin + rotation @ ca.SX(offset)
+        return _point(self._frame_pose(frame), point)
+
+    def jacobian(self, phi: Residual) -> ca.SX:
+        """J = (dphi/dq) N of constraints phi(q), shape (m, nv), by those of the frames."""
+        poses = _PoseSymbols(self)
+        residual = phi(poses)
+        result = ca.mtimes(poses.replace(ca.jacobian(residual, self.q)), self.velocity_map)
+        for frame, (rotation, origin) in poses.symbols.items():
+            link = self._bodies[int(frame.body().index())][0]
+            turn = sum(
+                (
+                    ca.mtimes(ca.jacobian(residual, rotation[:, k]), -ca.skew(rotation[:, k]))
+                    for k in range(3)
+                ),
+                ca.SX(residual.numel(), 3),
+            )
+            by_twist = ca.sparsify(ca.horzcat(ca.jacobian(residual, origin), turn))
+            twist = frame_jacobian(self._links, link, self._frame_pose(frame)[1], self.v.numel())
+            result += ca.mtimes(poses.replace(by_twist), twist)
+        return result
+
+    def motion(self, acceleration: ca.SX, phi: Residual, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """M v' + H - J^T lambda of (37), shape (nv, 1), and phi'', shape (m, 1).
+
+        The constraint forces are wrenches on frames in the recursive Newton-Euler algorithm, which
+        also gives the accelerations of the frames: neither M nor J is formed.
+        """
+        gravity = self.plant.gravity_field().gravity_vector()
+        motions = link_motions(self._links, self.v, acceleration, gravity)
+        poses = _PoseSymbols(self)
+        residual = phi(poses)
+        power = ca.dot(multiplier, residual)
+        wrenches: dict[int, tuple[ca.SX, ca.SX]] = {}
+        velocity = ca.mtimes(self.velocity_map, self.v)
+        moving = [(self.q, velocity, self._rate(velocity, acceleration))]
+        for frame, (rotation, origin) in poses.symbols.items():
+            index, X_LB = self._bodies[int(frame.body().index())]
+            turn, lever = map(ca.SX, constant_pose(X_LB @ frame.GetFixedPoseInBodyFrame()))
+            R_WL, link = self._link_poses[index][0], motions[index]
+            force, slope = ca.gradient(power, origin), ca.gradient(power, rotation)
+            moment = sum((ca.cross(rotation[:, k], slope[:, k]) for k in range(3)), ca.SX(3, 1))
+            force = ca.mtimes(R_WL.T, poses.replace(force))
+            moment = ca.mtimes(R_WL.T, poses.replace(moment)) + ca.cross(lever, force)
+            own = wrenches.get(index, (ca.SX(3, 1), ca.SX(3, 1)))
+            wrenches[index] = own[0] + moment, own[1] + force
+            # R' = R_WL [w] R_LF and R'' = R_WL gradient R_LF, with the link's spin w.
+            moving.append(
+                (
+                    ca.vec(rotation),
+                    ca.vec(R_WL @ (ca.skew(link.spin) @ turn)),
+                    ca.vec(R_WL @ (link.gradient @ turn)),
+                )
+            )
+            moving.append(
+                (
+                    origin,
+                    R_WL @ (link.velocity + ca.cross(link.spin, lever)),
+                    R_WL @ (link.acceleration + link.gradient @ lever) + ca.SX(gravity),
+                )
+            )
+        place, first, second = (ca.vertcat(*column) for column in zip(*moving, strict=True))
+        speed = ca.SX.sym("speed", first.numel())
+        rate = ca.jtimes(residual, place, speed)
+        twice = ca.jtimes(rate, ca.vertcat(place, speed), ca.vertcat(speed, second))
+        twice = poses.replace(ca.substitute(twice, speed, first))
+        force = inverse_dynamics(self._links, motions, gravity, self.v.numel(), wrenches)
+        force += ca.SX(self._rotors()) * acceleration - self._applied_force
+        force -= ca.mtimes(self.velocity_map.T, poses.replace(ca.gradient(power, self.q)))
+        return force, twice
+
+    def _rate(self, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
+        """q'' for q' = N(q) v."""
+        moving = ca.vertcat(self.q, self.v)
+        return ca.jtimes(velocity, moving, ca.vertcat(velocity, acceleration))
 
     @cached_property
     def kinetic_energy(self) -> ca.SX:
@@ -306,9 +383,7 @@ class MultibodyExpressions:
 
     def _frame_pose(self, frame: str | Frame) -> tuple[ca.SX, ca.SX]:
         """R_WF and p_WF."""
-        found = self._find_frame(frame) if isinstance(frame, str) else frame
-        if found.GetParentPlant() is not self.plant:
-            raise ModelError(f"frame '{found.name()}' belongs to another plant")
+        found = self._frame(frame)
         index = int(found.index())
         if index not in self._frames:
             link, X_LB = self._bodies[int(found.body().index())]
@@ -316,6 +391,12 @@ class MultibodyExpressions:
             R_WL, p_WL = self._link_poses[link]
             self._frames[index] = (R_WL @ ca.SX(rotation), p_WL + R_WL @ ca.SX(offset))
         return self._frames[index]
+
+    def _frame(self, frame: str | Frame) -> Frame:
+        found = self._find_frame(frame) if isinstance(frame, str) else frame
+        if found.GetParentPlant() is not self.plant:
+            raise ModelError(f"frame '{found.name()}' belongs to another plant")
+        return found
 
     def _find_frame(self, name: str) -> Frame:
         if name == "world":
@@ -333,6 +414,11 @@ class MultibodyExpressions:
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise ModelError(f"the plant has no frame '{name}'; {hint}frames: {', '.join(names)}")
 
+    def _newton_euler(self, v: ca.SX, gravity: FloatArray) -> ca.SX:
+        """Generalized forces at velocities v without acceleration, shape (nv, 1)."""
+        motions = link_motions(self._links, v, ca.SX(v.numel(), 1), gravity)
+        return inverse_dynamics(self._links, motions, gravity, v.numel())
+
     # The comparison with the plant.
 
     def _compare_with_plant(self) -> None:
@@ -342,8 +428,8 @@ class MultibodyExpressions:
         over that of M if that is larger: forces that cancel have no scale of their own.
         """
         plant = self.plant
-        gravity = -inverse_dynamics(
-            self._links, ca.SX.zeros(self.v.numel()), plant.gravity_field().gravity_vector()
+        gravity = -self._newton_euler(
+            ca.SX.zeros(self.v.numel()), plant.gravity_field().gravity_vector()
         )
         inputs = {
             "q": self.q,
@@ -352,7 +438,7 @@ class MultibodyExpressions:
         }
         ours = {
             "mass matrix": self.mass_matrix,
-            "Coriolis and centrifugal forces": inverse_dynamics(self._links, self.v, np.zeros(3)),
+            "Coriolis and centrifugal forces": self._newton_euler(self.v, np.zeros(3)),
             "gravity": gravity,
             "force elements and damping": gravity + self._applied_force,
             "bias": self.bias,
@@ -393,3 +479,51 @@ class MultibodyExpressions:
                         f"{name} differs from the plant's own by {error:.1e} (relative) at "
                         f"q = {q}, v = {v}; this is an error in drake_dae, please report the model"
                     )
+
+
+class _PoseSymbols:
+    """Stands in for links: the poses of their frames are symbols, to differentiate by them."""
+
+    def __init__(self, links: MultibodyExpressions) -> None:
+        self._links = links
+        self._poses: dict[int, tuple[Frame, ca.SX, ca.SX]] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._links, name)
+
+    @property
+    def symbols(self) -> dict[Frame, tuple[ca.SX, ca.SX]]:
+        """Frame -> (R_WF, p_WF), of those that were asked for and can move."""
+        return {frame: (rotation, origin) for frame, rotation, origin in self._poses.values()}
+
+    def rotation(self, frame: str | Frame) -> ca.SX:
+        return self._pose(frame)[0]
+
+    def position(self, frame: str | Frame, point: ArrayLike = (0.0, 0.0, 0.0)) -> ca.SX:
+        return _point(self._pose(frame), point)
+
+    def replace(self, expression: ca.SX) -> ca.SX:
+        """The symbols replaced by the poses that they stand for."""
+        pairs = [
+            (symbol, value)
+            for frame, *pose in self._poses.values()
+            for symbol, value in zip(pose, self._links._frame_pose(frame), strict=True)
+        ]
+        symbols, values = ([ca.vec(pair[i]) for pair in pairs] for i in (0, 1))
+        return ca.substitute(expression, ca.vertcat(*symbols), ca.vertcat(*values))
+
+    def _pose(self, frame: str | Frame) -> tuple[ca.SX, ca.SX]:
+        found = self._links._frame(frame)
+        if self._links._bodies[int(found.body().index())][0] == 0:
+            return self._links._frame_pose(found)
+        symbols = (found, ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3))
+        return self._poses.setdefault(int(found.index()), symbols)[1:]
+
+
+def _point(pose: tuple[ca.SX, ca.SX], point: ArrayLike) -> ca.SX:
+    """Where a point of a frame with this pose is in the world."""
+    offset = np.array(point, dtype=float)
+    if offset.shape != (3,) or not np.all(np.isfinite(offset)):
+        raise ModelError(f"a point has 3 finite coordinates, got {point!r}")
+    rotation, origin = pose
+    return origin + rotation @ ca.SX(offset)

@@ -5,8 +5,9 @@ expressed in L unless said otherwise. A link moves by one elementary motion, so 
 is sparse; a joint with several is a chain of links, of which the last carries the inertia.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -189,36 +190,111 @@ def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
     return ca.sparsify(_symmetric(M))
 
 
-def inverse_dynamics(links: Sequence[Link], v: ca.SX, gravity: FloatArray) -> ca.SX:
-    """Generalized forces for v' = 0, shape (nv, 1), by the recursive Newton-Euler algorithm.
+def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) -> ca.SX:
+    """Velocity in m/s and angular velocity of a frame for a unit of each entry of v, in the world.
+
+    Args:
+        links: The tree, parents before children; the world is link 0.
+        index: Of the link that the frame is fixed to.
+        origin: Of the frame, p_W in m, shape (3, 1).
+        size: nv.
+
+    Returns:
+        Shape (6, nv): the velocity of the origin above the angular velocity.
+    """
+    poses, result = link_poses(links), ca.SX(6, size)
+    while index > 0:
+        link, (rotation, position) = links[index], poses[index]
+        for j, direction in link.turning.items():
+            axis = rotation @ direction
+            result[:, j] += ca.vertcat(ca.cross(axis, origin - position), axis)
+        for j, direction in link.shifting.items():
+            result[:3, j] += poses[link.parent][0] @ direction
+        index = link.parent
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class LinkMotion:
+    """How a link moves, in its own axes; each of shape (3, 1), except as noted.
+
+    Attributes:
+        spin: Angular velocity in rad/s.
+        spin_rate: Its derivative in rad/s^2.
+        velocity: Of the origin, in m/s.
+        acceleration: Of the origin, less gravity, in m/s^2: the world is accelerated upward, which
+            pulls every body down.
+        gradient: A point r of the link has the acceleration `acceleration` + gradient r, in 1/s^2,
+            shape (3, 3).
+    """
+
+    spin: ca.SX
+    spin_rate: ca.SX
+    velocity: ca.SX
+    acceleration: ca.SX
+    gradient: ca.SX
+
+
+def link_motions(
+    links: Sequence[Link], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
+) -> list[LinkMotion]:
+    """How every link moves.
 
     Args:
         links: The tree, parents before children; the world is link 0.
         v: Velocities, shape (nv, 1).
+        acceleration: v', shape (nv, 1).
         gravity: In the world, shape (3,), in m/s^2.
     """
-    # The acceleration of a point r of link i is accelerations[i] + gradients[i] r. The world is
-    # accelerated upward, which pulls every body down.
-    spins, spin_rates = [_zero(3)], [_zero(3)]
-    accelerations, gradients = [ca.SX(-gravity)], [_zero(3, 3)]
+    motions = [LinkMotion(_zero(3), _zero(3), _zero(3), ca.SX(-gravity), _zero(3, 3))]
     for link in links[1:]:
-        P, to_link = link.parent, link.rotation.T
-        turning = sum((v[j] * d for j, d in link.turning.items()), _zero(3))
-        shifting = sum((v[j] * d for j, d in link.shifting.items()), _zero(3))
-        spin = to_link @ spins[P]
-        spin_rates.append(to_link @ spin_rates[P] + ca.cross(spin, turning))
-        spins.append(spin + turning)
-        acceleration = gradients[P] @ link.offset + 2 * ca.cross(spins[P], shifting)
-        accelerations.append(to_link @ (accelerations[P] + acceleration))
-        outer = _symmetric(spins[-1] @ spins[-1].T)
-        gradients.append(ca.skew(spin_rates[-1]) + outer - ca.trace(outer) * ca.SX.eye(3))
+        parent, to_link = motions[link.parent], link.rotation.T
+        turning, turning_rate, shifting, shifting_rate = (
+            sum((rates[j] * d for j, d in directions.items()), _zero(3))
+            for directions in (link.turning, link.shifting)
+            for rates in (v, acceleration)
+        )
+        carried = to_link @ parent.spin
+        spin = carried + turning
+        spin_rate = to_link @ parent.spin_rate + ca.cross(carried, turning) + turning_rate
+        velocity = parent.velocity + ca.cross(parent.spin, link.offset) + shifting
+        moved = parent.gradient @ link.offset + 2 * ca.cross(parent.spin, shifting) + shifting_rate
+        outer = _symmetric(spin @ spin.T)
+        motions.append(
+            LinkMotion(
+                spin,
+                spin_rate,
+                to_link @ velocity,
+                to_link @ (parent.acceleration + moved),
+                ca.skew(spin_rate) + outer - ca.trace(outer) * ca.SX.eye(3),
+            )
+        )
+    return motions
 
-    tau = _zero(v.numel())
+
+def inverse_dynamics(
+    links: Sequence[Link],
+    motions: Sequence[LinkMotion],
+    gravity: FloatArray,
+    size: int,
+    wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = MappingProxyType({}),
+) -> ca.SX:
+    """Generalized forces, shape (nv, 1), by the recursive Newton-Euler algorithm.
+
+    Args:
+        links: The tree, parents before children; the world is link 0.
+        motions: Of the links.
+        gravity: In the world, shape (3,), in m/s^2.
+        size: nv.
+        wrenches: Index of a link -> moment about its origin in N m and force in N that act on it,
+            in the link's axes, each of shape (3, 1).
+    """
+    tau = _zero(size)
     moments, forces = [_zero(3) for _ in links], [_zero(3) for _ in links]
     poses = link_poses(links)
     for index in range(len(links) - 1, 0, -1):
         link, inertia, weightless = links[index], links[index].inertia, links[index].weightless
-        acceleration, gradient = accelerations[index], gradients[index]
+        acceleration, gradient = motions[index].acceleration, motions[index].gradient
         T = gradient @ inertia.second
         force = forces[index] + inertia.mass * acceleration + gradient @ inertia.first
         moment = moments[index] + ca.cross(inertia.first, acceleration)
@@ -227,6 +303,8 @@ def inverse_dynamics(links: Sequence[Link], v: ca.SX, gravity: FloatArray) -> ca
             lift = poses[index][0].T @ ca.SX(gravity)
             force += weightless.mass * lift
             moment += ca.cross(weightless.first, lift)
+        if index in wrenches:
+            moment, force = moment - wrenches[index][0], force - wrenches[index][1]
         for j, entry in link.generalized_force(moment, force):
             tau[j] += entry
         moment, force = link.force_to_parent(moment, force)
