@@ -178,6 +178,8 @@ def test_underactuated_robot_takes_an_actuation_matrix():
         (lambda: textbook(mass_matrix=ca.DM([[2, 1], [0, 2]])), "not symmetric"),
         (lambda: textbook(mass_matrix=ca.DM.eye(3)), "mass_matrix has shape"),
         (lambda: textbook(actuation_matrix=np.eye(3)), "actuation_matrix has shape"),
+        (lambda: textbook(position_limits=([0.0], [1.0])), r"position_limits .* shape \(2,\)"),
+        (lambda: textbook(velocity_limits=([1, 1], [1, 2])), "velocity_limits .* the lower one"),
         (lambda: textbook(constraints=[WALL, WALL], outputs=[]), "unique"),
         (
             lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]),

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import LogVectorOutput
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_dae import build, load_scenario
+from drake_dae import DaePlant, DaeSystem, build, load_scenario
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation import simulate as module
@@ -270,3 +270,25 @@ def test_lines_where_there_is_no_terminal(monkeypatch, capsys):
         "2.00/2.00 s",
     ]
     assert all(line.endswith(" x real time") and "\r" not in line for line in lines)
+
+
+def test_a_state_that_escapes_in_finite_time_ends_the_run():
+    """x' = x^2 from 1 is 1 / (1 - t), which Drake follows with ever smaller steps."""
+    system = DaeSystem.from_functions(
+        ["x"],
+        f=lambda s: [s[0] ** 2],
+        h=lambda s: [1],
+        l=lambda s: [s[0]],
+        nominal_state=[1.0],
+    )
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(system))
+    control = builder.AddSystem(ConstantVectorSource([0.0]))
+    builder.Connect(control.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    config = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-6)
+    with pytest.raises(SimulationError, match="grows without bound") as caught:
+        simulate(diagram, diagram.CreateDefaultContext(), 3.0, config)
+    # Up to the accuracy.
+    assert caught.value.time == pytest.approx(1.0, abs=1e-5)
+    assert caught.value.state[0] > 1e6

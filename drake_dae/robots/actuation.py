@@ -254,8 +254,9 @@ class ActuationChain:
     """Stages attached to a robot, wired from the joints to the control.
 
     Attributes:
-        stages: In this order, toward the motor.
-        joint_force: tau(q, v, s), what the joints get, shape (p, 1).
+        stages: In this order, toward the motor; none for rigid joints.
+        joint_force: tau(q, v, s), what the joints get from the stages, shape (p, 1).
+        direct: What the joints get from u at once, shape (p, p): 1 for rigid joints, otherwise 0.
         state: All stages' states, shape (k, 1).
         mass, drift, drive: E s' = drift + drive u, shapes (k, k), (k, 1), (k, p).
         control_signals: Names and units of u.
@@ -263,6 +264,7 @@ class ActuationChain:
 
     stages: tuple[AttachedStage, ...]
     joint_force: ca.SX
+    direct: ca.SX
     state: ca.SX
     mass: ca.SX
     drift: ca.SX
@@ -276,7 +278,7 @@ def chain(
     """Wires stages: each drives the one before it, the control drives the last.
 
     Args:
-        stages: At least one.
+        stages: From the joints toward the motor.
         links: The robot.
         position: Actuated positions, shape (p, 1).
         velocity: Actuated velocities, shape (p, 1).
@@ -284,8 +286,20 @@ def chain(
     Raises:
         ModelError: A stage behind one that nothing can drive.
     """
-    attached = [stage.attach(links) for stage in stages]
     p = position.numel()
+    if not stages:
+        none = ca.SX(0, 1)
+        return ActuationChain(
+            stages=(),
+            joint_force=ca.SX(p, 1),
+            direct=ca.SX.eye(p),
+            state=none,
+            mass=ca.SX(0, 0),
+            drift=none,
+            drive=ca.SX(0, p),
+            control_signals=tuple(links.actuator_signals),
+        )
+    attached = [stage.attach(links) for stage in stages]
     loads = [(position, velocity)]
     for stage, before in zip(stages[1:], attached, strict=False):
         if before.shaft is None:
@@ -304,6 +318,7 @@ def chain(
     return ActuationChain(
         stages=tuple(attached),
         joint_force=delivered[0],
+        direct=ca.SX(p, p),
         state=ca.vertcat(*[own.state for own in attached]),
         mass=ca.diagcat(*[own.mass for own in attached]),
         drift=ca.vertcat(*drifts),

@@ -48,6 +48,10 @@ class Links(Protocol):
     def gear_ratios(self) -> FloatArray: ...
     @property
     def default_positions(self) -> FloatArray: ...
+    @property
+    def position_limits(self) -> tuple[FloatArray, FloatArray]: ...
+    @property
+    def velocity_limits(self) -> tuple[FloatArray, FloatArray]: ...
 
     def rotation(self, frame: Any) -> ca.SX:
         """R_WF(q), shape (3, 3)."""
@@ -92,6 +96,7 @@ class LinkExpressions:
         reflected_inertia: What of M(q) is rotors, kg m^2 (kg), shape (nu,); 0 if None.
         gear_ratios: Motor turns per joint turn, shape (nu,); 1 if None.
         default_positions: A usual configuration, shape (nq,); zero if None.
+        position_limits, velocity_limits: Lower and upper, shapes (nq,) and (nv,); none if None.
 
     Raises:
         ModelError: A shape that does not fit.
@@ -112,6 +117,8 @@ class LinkExpressions:
     reflected_inertia: FloatArray = field(default=None)  # type: ignore[arg-type]
     gear_ratios: FloatArray = field(default=None)  # type: ignore[arg-type]
     default_positions: FloatArray = field(default=None)  # type: ignore[arg-type]
+    position_limits: tuple[FloatArray, FloatArray] = field(default=None)  # type: ignore[assignment]
+    velocity_limits: tuple[FloatArray, FloatArray] = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         nq, nv = self.q.numel(), self.v.numel()
@@ -130,6 +137,8 @@ class LinkExpressions:
             "reflected_inertia": _numbers(self.reflected_inertia, nu, 0.0),
             "gear_ratios": _numbers(self.gear_ratios, nu, 1.0),
             "default_positions": _numbers(self.default_positions, nq, 0.0),
+            "position_limits": _limits("position_limits", self.position_limits, nq),
+            "velocity_limits": _limits("velocity_limits", self.velocity_limits, nv),
         }
         for key, value in fill.items():
             object.__setattr__(self, key, value)
@@ -197,3 +206,17 @@ class LinkExpressions:
 
 def _numbers(given: ArrayLike | None, size: int, default: float) -> FloatArray:
     return np.full(size, default) if given is None else np.array(given, dtype=float)
+
+
+def _limits(
+    name: str, given: tuple[ArrayLike, ArrayLike] | None, size: int
+) -> tuple[FloatArray, FloatArray]:
+    lower, upper = (np.full(size, end) for end in (-np.inf, np.inf))
+    if given is not None:
+        lower, upper = (np.array(end, dtype=float) for end in given)
+    if lower.shape != (size,) or upper.shape != (size,) or not np.all(lower < upper):
+        raise ModelError(
+            f"{name} must be a lower and an upper limit of shape ({size},), the lower one below, "
+            f"got {given!r}"
+        )
+    return lower, upper

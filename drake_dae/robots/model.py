@@ -71,109 +71,37 @@ class RobotModel:
         self.constraints = tuple(constraints)
         self.positions = tuple(positions)
         self.name = name
-        q, v = links.q, links.v
-        nq, nv = q.numel(), v.numel()
         phi = self._residual(links)
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
-        forces = tuple(s for c in self.constraints for s in c.force_signals)
-        position_outputs = tuple(s for p in self.positions for s in p.signals(links))
-        m, nu = phi.numel(), links.actuation_matrix.shape[1]
-        if m > nu:
-            raise ModelError(
-                f"{name}: {m} constraint forces are outputs, but {nu} actuators can steer {nu} "
-                "outputs; take constraints away, or add actuators"
-            )
-        if h_1.numel() + m != nu:
-            raise ModelError(
-                f"{name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces are "
-                f"outputs already, so {nu - m} position outputs are needed; given are "
-                f"{h_1.numel()} ({', '.join(s.name for s in position_outputs) or 'none'})"
-            )
+        self._check_number(phi.numel(), h_1.numel())
         nominal = np.asarray(
             links.default_positions if nominal_positions is None else nominal_positions, float
         )
-        if nominal.shape != (nq,):
-            raise ModelError(f"{name}: nominal_positions has shape {nominal.shape}, not ({nq},)")
-
-        # The links, then the stages: E x' = f + g lambda + h u.
-        actuation_matrix = ca.SX(ca.DM(links.actuation_matrix))
-        mass, bias = links.mass_matrix, links.bias
-        carried = ca.SX(nv, nv)
-        stages = self._attach(actuation)
-        self.stages = stages.stages if stages else ()
-        self.joint_force = stages.joint_force if stages else None
-        if stages and stages.stages[0].carries_rotors:
-            rotors = links.actuation_matrix * links.reflected_inertia @ links.actuation_matrix.T
-            carried = ca.SX(ca.sparsify(ca.DM(rotors)))
-            mass = mass - carried
-        self._check_mass_matrix(mass, nominal)
-        jacobian = links.jacobian(self._residual)
-        inertia = ca.diagcat(ca.SX.eye(nq), mass)
-        f = ca.vertcat(ca.mtimes(links.velocity_map, v), -bias)
-        h = ca.vertcat(ca.SX(nq, nu), actuation_matrix)
-        state, parameters = ca.vertcat(q, v), list(links.parameters)
-        state_signals = (*links.position_signals, *links.velocity_signals)
-        control_signals = tuple(links.actuator_signals)
-        if stages:
-            inertia = ca.diagcat(inertia, stages.mass)
-            f = ca.vertcat(f + ca.mtimes(h, stages.joint_force), stages.drift)
-            h = ca.vertcat(ca.SX(nq + nv, nu), stages.drive)
-            state = ca.vertcat(state, stages.state)
-            control_signals = stages.control_signals
-            for attached in stages.stages:
-                state_signals += attached.state_signals
-                parameters += attached.parameters
-        for constraint in self.constraints:
-            parameters += constraint.parameters
-
-        def motion(rate: ca.SX, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
-            acceleration = rate[nq : nq + nv]
-            moved, phi_rate = links.motion(acceleration, self._residual, multiplier)
-            moved -= ca.mtimes(carried, acceleration)
-            if not stages:
-                return ca.vertcat(rate[:nq] - f[:nq], moved), phi_rate
-            moved -= ca.mtimes(actuation_matrix, stages.joint_force)
-            driven = ca.mtimes(stages.mass, rate[nq + nv :]) - stages.drift
-            return ca.vertcat(rate[:nq] - f[:nq], moved, driven), phi_rate
-
+        if nominal.shape != (links.q.numel(),):
+            raise ModelError(
+                f"{name}: nominal_positions has shape {nominal.shape}, not ({links.q.numel()},)"
+            )
+        self._chain = self._attach(actuation)
+        self.stages = self._chain.stages
+        self.joint_force = self._chain.joint_force if self.stages else None
         #: Largest |u| per actuator, infinite where there is none or where u is no joint force.
         self.control_limits = (
             links.effort_limits
-            if control_signals == tuple(links.actuator_signals)
-            else np.full(nu, np.inf)
+            if self._chain.control_signals == tuple(links.actuator_signals)
+            else np.full(len(links.actuator_signals), np.inf)
         )
-        self.dae = DaeSystem(
-            state=state,
-            mass_matrix=inertia,
-            f=f,
-            g=ca.vertcat(ca.SX(nq, m), jacobian.T, ca.SX(state.numel() - nq - nv, m)),
-            h=h,
-            k=phi,
-            l=ca.vertcat(h_1, ca.SX(m, 1)),
-            m=ca.vertcat(ca.SX(nu - m, m), ca.SX.eye(m)),
-            parameters=tuple(parameters),
-            state_signals=state_signals,
-            constraint_input_signals=forces,
-            constraint_output_signals=tuple(
-                s for c in self.constraints for s in c.residual_signals
-            ),
-            control_signals=control_signals,
-            output_signals=position_outputs + forces,
-            nominal_state=np.concatenate([nominal, np.zeros(state.numel() - nq)]),
-            name=name,
-            motion=motion,
-        )
+        self.dae = self._equations(phi, h_1, nominal)
         self._configuration = TracedFunction(
             f"{name} configuration",
-            {"q": q, "parameters": self.dae.parameter_symbol},
-            {"phi": phi, "h_1": h_1, "jacobian": ca.jacobian(ca.vertcat(phi, h_1), q)},
+            {"q": links.q, "parameters": self.dae.parameter_symbol},
+            {"phi": phi, "h_1": h_1, "jacobian": ca.jacobian(ca.vertcat(phi, h_1), links.q)},
         )
         self._trace_equilibrium()
-        if stages:
+        if self.stages:
             # On the constraints first: shafts that rest off them would strain the springs.
             with suppress(InconsistentStateError):
                 nominal = self.configuration(None, nominal)
-            rest = self._rest(nominal, np.zeros(m), self.dae.parameter_values)[0]
+            rest = self._rest(nominal, np.zeros(phi.numel()), self.dae.parameter_values)[0]
             self.dae = replace(self.dae, nominal_state=rest)
 
     @classmethod
@@ -283,11 +211,25 @@ class RobotModel:
         """phi(q), shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[c.residual(links) for c in self.constraints])
 
-    def _attach(self, actuation: Sequence[Stage]) -> ActuationChain | None:
-        if not actuation:
-            return None
+    def _check_number(self, m: int, count: int) -> None:
+        """m constraint forces and the position outputs are as many as the actuators."""
+        nu = self.links.actuation_matrix.shape[1]
+        if m > nu:
+            raise ModelError(
+                f"{self.name}: {m} constraint forces are outputs, but {nu} actuators can steer "
+                f"{nu} outputs; take constraints away, or add actuators"
+            )
+        if count + m != nu:
+            names = [s.name for p in self.positions for s in p.signals(self.links)]
+            raise ModelError(
+                f"{self.name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces "
+                f"are outputs already, so {nu - m} position outputs are needed; given are "
+                f"{count} ({', '.join(names) or 'none'})"
+            )
+
+    def _attach(self, actuation: Sequence[Stage]) -> ActuationChain:
         select = self.links.actuation_matrix
-        if not np.allclose(select.T @ select, np.eye(select.shape[1])):
+        if actuation and not np.allclose(select.T @ select, np.eye(select.shape[1])):
             raise ModelError(
                 f"{self.name}: actuation stages need one actuator per actuated joint, so "
                 "orthonormal columns of the actuation matrix"
@@ -295,6 +237,63 @@ class RobotModel:
         transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
         position = ca.mtimes(transposed, self.links.q)
         return chain(actuation, self.links, position, ca.mtimes(transposed, self.links.v))
+
+    def _equations(self, phi: ca.SX, h_1: ca.SX, nominal: FloatArray) -> DaeSystem:
+        """E x' = f + g lambda + h u of the links and then of the stages."""
+        links, stages = self.links, self._chain
+        nq, nv, m = links.q.numel(), links.v.numel(), phi.numel()
+        nu, k = links.actuation_matrix.shape[1], stages.state.numel()
+        # The rotors turn with the first stage, or else with the joints.
+        rotors = ca.SX(nv, nv)
+        if self.stages and self.stages[0].carries_rotors:
+            B = links.actuation_matrix
+            rotors = ca.SX(ca.sparsify(ca.DM(B * links.reflected_inertia @ B.T)))
+        mass = links.mass_matrix - rotors
+        self._check_mass_matrix(mass, nominal)
+        actuation_matrix = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+        velocity = ca.mtimes(links.velocity_map, links.v)
+        torque = ca.mtimes(actuation_matrix, stages.joint_force)
+
+        def motion(rate: ca.SX, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
+            acceleration = rate[nq : nq + nv]
+            inertial, phi_rate = links.motion(acceleration, self._residual, multiplier)
+            balance = inertial - ca.mtimes(rotors, acceleration) - torque
+            driven = ca.mtimes(stages.mass, rate[nq + nv :]) - stages.drift
+            return ca.vertcat(rate[:nq] - velocity, balance, driven), phi_rate
+
+        force_signals = tuple(s for c in self.constraints for s in c.force_signals)
+        return DaeSystem(
+            state=ca.vertcat(links.q, links.v, stages.state),
+            mass_matrix=ca.diagcat(ca.SX.eye(nq), mass, stages.mass),
+            f=ca.vertcat(velocity, torque - links.bias, stages.drift),
+            g=ca.vertcat(ca.SX(nq, m), links.jacobian(self._residual).T, ca.SX(k, m)),
+            h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(actuation_matrix, stages.direct), stages.drive),
+            k=phi,
+            l=ca.vertcat(h_1, ca.SX(m, 1)),
+            m=ca.vertcat(ca.SX(nu - m, m), ca.SX.eye(m)),
+            parameters=(
+                *links.parameters,
+                *(p for stage in self.stages for p in stage.parameters),
+                *(p for constraint in self.constraints for p in constraint.parameters),
+            ),
+            state_signals=(
+                *links.position_signals,
+                *links.velocity_signals,
+                *(s for stage in self.stages for s in stage.state_signals),
+            ),
+            constraint_input_signals=force_signals,
+            constraint_output_signals=tuple(
+                s for c in self.constraints for s in c.residual_signals
+            ),
+            control_signals=stages.control_signals,
+            output_signals=(
+                *(s for p in self.positions for s in p.signals(links)),
+                *force_signals,
+            ),
+            nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
+            name=self.name,
+            motion=motion,
+        )
 
     def _trace_equilibrium(self) -> None:
         """Balance of forces and of the stages at v = 0, to be solved for (s, u)."""
