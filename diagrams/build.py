@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
@@ -62,9 +63,9 @@ def build(
                 "joint a <transmission>"
             )
 
-    # What it touches, what it shall do, and where.
-    contacts = _contacts(scenario.constraints, links)
-    positions = _outputs(scenario.outputs, contacts, links)
+    # What it touches or holds, what it shall do, and where.
+    bound = _constraints(scenario.constraints, links)
+    positions = _outputs(scenario.outputs, bound, links)
     with _at("start.positions"):
         guess = links.default_positions.copy()
         for name, value in scenario.start.positions.items():
@@ -76,8 +77,8 @@ def build(
             stage.attach(links)  # Now, while the index is known.
             stages.append(stage)
     with _at("actuation" if stages else "outputs"):
-        name = Path(scenario.robot.file).stem
-        model = RobotModel(links, contacts, positions, guess, name, stages)
+        name = Path(scenario.robot.file).name.split(".")[0]  # Of "two_arms.dmd.yaml", too.
+        model = RobotModel(links, bound, positions, guess, name, stages)
     structure = _structure(model.dae)
 
     # The law and its references.
@@ -87,7 +88,7 @@ def build(
         with _at("force"):
             sensor = _sensor(measured, model.dae.num_constraints)
     with _at("force or gains" if measured else "gains"):
-        gain = measured.gain if measured else 0.0
+        gain = _one_or_many(measured.gain) if measured else 0.0
         law = TrackingLaw(model.dae, _gains(scenario.gains), structure, measured is not None, gain)
     wanted = _references(scenario.references, law)
     with _at("force" if measured else "start.positions"):
@@ -143,33 +144,44 @@ def _parse(robot: forms.Robot, scene_graph: SceneGraph) -> MultibodyPlant:
     return plant
 
 
-def _contacts(
-    given: Sequence[forms.PointOnSurface], links: Links
-) -> list[constraints.PointOnSurface]:
-    result: list[constraints.PointOnSurface] = []
+def _constraints(given: Sequence[typing.Any], links: Links) -> list[constraints.Constraint]:
+    result: list[constraints.Constraint] = []
     for index, form in enumerate(given):
         with _at(f"constraints.{index}.name"):
-            if not form.name or form.name in [contact.name for contact in result]:
+            if not form.name or form.name in [other.name for other in given[:index]]:
                 raise ScenarioError(f"each constraint needs a name of its own, got '{form.name}'")
-        with _at(f"constraints.{index}.surface"):
-            surface = _make(surfaces, form.surface)
+        values = {item.name: getattr(form, item.name) for item in fields(form)}
+        values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        if isinstance(form, forms.PointOnSurface):
+            with _at(f"constraints.{index}.surface"):
+                values["surface"] = _make(surfaces, form.surface)
+        elif isinstance(form, forms.WeldedFrames):
+            with _at(f"constraints.{index}.pose"):
+                values["pose"] = _pose(form.pose)
         with _at(f"constraints.{index}"):
-            point = typing.cast(surfaces.Vector, tuple(form.point))
-            contact = constraints.PointOnSurface(form.frame, surface, point, form.name)
-            contact.residual(links)  # Now, while the index is known.
-            result.append(contact)
+            constraint = getattr(constraints, type(form).__name__)(**values)
+            constraint.residual(links)  # Now, while the index is known.
+            result.append(constraint)
     return result
 
 
+def _pose(form: forms.Pose) -> RigidTransform:
+    for key, value in (("translation", form.translation), ("rpy_deg", form.rpy_deg)):
+        if len(value) != 3:
+            raise ScenarioError(f"{key}: 3 numbers are needed, got {value}")
+    return RigidTransform(RollPitchYaw(np.deg2rad(form.rpy_deg)), form.translation)
+
+
 def _outputs(
-    given: Sequence[typing.Any], contacts: Sequence[constraints.PointOnSurface], links: Links
+    given: Sequence[typing.Any], bound: Sequence[constraints.Constraint], links: Links
 ) -> list[outputs.PositionOutput]:
+    contacts = [c for c in bound if isinstance(c, constraints.PointOnSurface)]
     result = []
     for index, form in enumerate(given):
         with _at(f"outputs.{index}"):
             output: outputs.PositionOutput
             if isinstance(form, forms.SurfaceCoordinates):
-                contact = contacts[_index(form.constraint, contacts, "constraint")]
+                contact = contacts[_index(form.constraint, contacts, "point on a surface")]
                 output = outputs.SurfaceCoordinates(contact)
             else:
                 output = _make(outputs, form)
@@ -179,22 +191,25 @@ def _outputs(
 
 
 def _stage(form: typing.Any) -> actuation.Stage:
-    """A stage of actuation; one number serves all actuators, none is the robot's own."""
+    """A stage of actuation; what was left out is the robot's own."""
     values = {item.name: getattr(form, item.name) for item in fields(form)}
     for item in fields(form):
-        if item.metadata.get("required") and not values[item.name]:
+        if item.metadata.get("required") and not values[item.name].size:
             raise ScenarioError(f"{item.name}: empty; give one number, or one per actuator")
-    numbers = {
-        name: value[0] if len(value) == 1 else value for name, value in values.items() if value
-    }
+    numbers = {name: _one_or_many(value) for name, value in values.items() if value.size}
     return typing.cast(actuation.Stage, getattr(actuation, type(form).__name__)(**numbers))
 
 
 def _sensor(form: forms.MeasuredForce, size: int) -> ForceSensor:
     if not 0 <= form.seed < 2**32:
         raise ScenarioError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {form.seed}")
-    bias, noise = (v[0] if len(v) == 1 else v for v in (form.bias, form.noise_deviation))
+    bias, noise = _one_or_many(form.bias), _one_or_many(form.noise_deviation)
     return ForceSensor(size, form.time_constant, form.sample_period, bias, noise)
+
+
+def _one_or_many(value: FloatArray) -> float | FloatArray:
+    """A list of one number is that number, which serves all."""
+    return float(value.item()) if value.size == 1 else value
 
 
 def _structure(dae: DaeSystem) -> Structure:

@@ -9,14 +9,20 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
+import numpy as np
 from pydrake.common.yaml import yaml_dump_typed
 from pydrake.systems.analysis import SimulatorConfig
 
-from drake_dae.diagrams.typed_yaml import REQUIRED, read_typed
+from drake_dae.diagrams.typed_yaml import REQUIRED, Numbers, read_typed
 from drake_dae.errors import ScenarioError
 
 FOLDER = Path(__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
+
+
+def _none() -> Numbers:
+    """No numbers: the key was left out."""
+    return np.zeros(0)
 
 
 @dataclass
@@ -94,6 +100,36 @@ class PointOnSurface:
 
 
 @dataclass
+class Pose:
+    """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
+
+    translation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+
+@dataclass
+class WeldedFrames:
+    """`robots.constraints.WeldedFrames`."""
+
+    frame_a: str = field(default="", metadata=REQUIRED)
+    frame_b: str = field(default="", metadata=REQUIRED)
+    pose: Pose = field(default_factory=Pose)
+    name: str = "weld"
+
+
+@dataclass
+class CoincidentPoints:
+    """`robots.constraints.CoincidentPoints`."""
+
+    frame_a: str = field(default="", metadata=REQUIRED)
+    point_a: list[float] = field(default_factory=list, metadata=REQUIRED)
+    frame_b: str = field(default="", metadata=REQUIRED)
+    point_b: list[float] = field(default_factory=list, metadata=REQUIRED)
+    axes: str = "xyz"
+    name: str = "pin"
+
+
+@dataclass
 class PointCoordinates:
     """`robots.outputs.PointCoordinates`."""
 
@@ -126,38 +162,42 @@ class JointPositions:
     joints: list[str] = field(default_factory=list, metadata=REQUIRED)
 
 
-@dataclass
+@dataclass(eq=False)
 class FlexibleJoints:
-    """`robots.actuation.FlexibleJoints`; one number serves all, full matrices are for Python.
+    """`robots.actuation.FlexibleJoints`; one number serves all actuators.
 
-    An inertia that is left out is what the URDF declares.
+    Each is a number, one per actuator, or a matrix row by row, `[[8000, 500], [500, 6000]]`. An
+    inertia that is left out is what the URDF declares.
     """
 
-    stiffness: list[float] = field(default_factory=list, metadata=REQUIRED)
-    inertia: list[float] = field(default_factory=list)
-    damping: list[float] = field(default_factory=lambda: [0.0])
+    stiffness: Numbers = field(default_factory=_none, metadata=REQUIRED)
+    inertia: Numbers = field(default_factory=_none)
+    damping: Numbers = field(default_factory=lambda: np.array(0.0))
 
 
-@dataclass
+@dataclass(eq=False)
 class DcMotors:
     """`robots.actuation.DcMotors`; one number serves all actuators.
 
-    A gear ratio that is left out is what the URDF declares.
+    Each is a number, or one per actuator. A gear ratio that is left out is what the URDF declares.
     """
 
-    torque_constant: list[float] = field(default_factory=list, metadata=REQUIRED)
-    inductance: list[float] = field(default_factory=list, metadata=REQUIRED)
-    resistance: list[float] = field(default_factory=list, metadata=REQUIRED)
-    gear_ratio: list[float] = field(default_factory=list)
+    torque_constant: Numbers = field(default_factory=_none, metadata=REQUIRED)
+    inductance: Numbers = field(default_factory=_none, metadata=REQUIRED)
+    resistance: Numbers = field(default_factory=_none, metadata=REQUIRED)
+    gear_ratio: Numbers = field(default_factory=_none)
 
 
-@dataclass
+@dataclass(eq=False)
 class ElectrohydraulicServos:
-    """`robots.actuation.ElectrohydraulicServos`; one number serves all, G(q) is for Python."""
+    """`robots.actuation.ElectrohydraulicServos`; one number serves all, G(q) is for Python.
 
-    stiffness: list[float] = field(default_factory=list, metadata=REQUIRED)
-    leakage: list[float] = field(default_factory=list, metadata=REQUIRED)
-    geometry: list[float] = field(default_factory=lambda: [1.0])
+    Each is a number or one per actuator; leakage and geometry may be matrices, row by row.
+    """
+
+    stiffness: Numbers = field(default_factory=_none, metadata=REQUIRED)
+    leakage: Numbers = field(default_factory=_none, metadata=REQUIRED)
+    geometry: Numbers = field(default_factory=lambda: np.array(1.0))
 
 
 @dataclass
@@ -165,25 +205,25 @@ class ModelForce:
     """The law uses the force of its model: (28)."""
 
 
-@dataclass
+@dataclass(eq=False)
 class MeasuredForce:
     """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
 
     Attributes:
         time_constant: Of the sensor's lag, s.
         sample_period: s; 0 for none.
-        bias: N, one number for all forces or one each.
-        noise_deviation: N, likewise.
+        bias: N (N m for a moment), one number for all forces or one each.
+        noise_deviation: Likewise.
         seed: Of the noise.
-        gain: Gbar of (59), one number; with rigid joints alone.
+        gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
     """
 
     time_constant: float = 0.0
     sample_period: float = 0.0
-    bias: list[float] = field(default_factory=lambda: [0.0])
-    noise_deviation: list[float] = field(default_factory=lambda: [0.0])
+    bias: Numbers = field(default_factory=lambda: np.array(0.0))
+    noise_deviation: Numbers = field(default_factory=lambda: np.array(0.0))
     seed: int = 0
-    gain: float = 0.0
+    gain: Numbers = field(default_factory=lambda: np.array(0.0))
 
 
 @dataclass
@@ -271,7 +311,7 @@ class Scenario:
     Attributes:
         description: One line for `drake-dae list`.
         robot: Where it is read from.
-        constraints: What it touches.
+        constraints: What it touches or holds; a form without a tag is a PointOnSurface.
         outputs: Position outputs; the constraint forces follow them.
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
@@ -286,7 +326,9 @@ class Scenario:
 
     description: str = ""
     robot: Robot = field(default_factory=Robot, metadata=REQUIRED)
-    constraints: list[PointOnSurface] = field(default_factory=list)
+    constraints: list[PointOnSurface | WeldedFrames | CoincidentPoints] = field(
+        default_factory=list
+    )
     outputs: list[PointCoordinates | AxisCoordinates | SurfaceCoordinates | JointPositions] = field(
         default_factory=list
     )

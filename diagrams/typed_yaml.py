@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 
+import numpy as np
 import yaml  # type: ignore[import-untyped]
 from pydrake.common.yaml import yaml_dump, yaml_load_data, yaml_load_typed
 
@@ -15,6 +16,10 @@ from drake_dae.errors import ScenarioError
 REQUIRED = {"required": True}
 """Metadata of a field that must be given. Drake's loader makes every object empty before it fills
 it, so that such a field needs a default all the same."""
+
+Numbers = np.ndarray
+"""Type of a field that takes a number, a list of numbers or a matrix row by row. Drake's loader
+knows this one array type, of floats and of any shape."""
 
 _BUILT_IN = "tag:yaml.org,2002:"
 """Before the names of YAML's own tags."""
@@ -140,6 +145,8 @@ def _check(data: typing.Any, schema: typing.Any, path: str) -> None:
             raise ScenarioError(f"{where}: expected names with values, got {_show(data)}")
         for key, item in data.items():
             _check(item, arguments[1], f"{where}.{key}")
+    elif schema is Numbers:
+        _check_numbers(data, where)
     elif _is_object(_form(data, schema)):
         known = _keys(schema, data)
         if not isinstance(data, dict):
@@ -159,9 +166,24 @@ def _check(data: typing.Any, schema: typing.Any, path: str) -> None:
         raise ScenarioError(f"{where}: expected {kinds[schema]}, got {_show(data)}{hint}")
 
 
+def _check_numbers(data: typing.Any, where: str) -> None:
+    """Refuses what is neither a number, nor a list of them, nor such lists of equal lengths."""
+    rows = data if isinstance(data, list) else [data]
+    matrix = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if matrix else rows
+    wrong = [entry for entry in entries if not _is_scalar(entry, float)]
+    if wrong:
+        raise ScenarioError(
+            f"{where}: expected a number, a list of numbers, or a matrix as a list of rows, got "
+            f"{_show(wrong[0])}"
+        )
+    if matrix and len({len(row) for row in rows}) > 1:
+        raise ScenarioError(f"{where}: the rows of {_show(data)} have different lengths")
+
+
 def _check_required(data: typing.Any, schema: typing.Any, path: str) -> None:
     """Refuses checked data that lacks a required key."""
-    if isinstance(data, list):
+    if typing.get_origin(schema) is list:
         for index, item in enumerate(data):
             _check_required(item, typing.get_args(schema)[0], f"{path}.{index}")
     form = _form(data, schema)

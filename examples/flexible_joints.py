@@ -26,6 +26,7 @@ def main(folder: Path) -> float:
     """Returns the largest distance of an error from its prediction, in m, rad and N."""
     multibody = MultibodyPlant(0.0)
     Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
+    multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
     model = dae.RobotModel.from_multibody(
         multibody,

@@ -24,6 +24,7 @@ def main(folder: Path) -> tuple[float, float]:
     """Returns the final position error in m and the largest force error in N."""
     multibody = MultibodyPlant(0.0)
     Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
+    multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
     wall = dae.PointOnSurface("tool", dae.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")
     model = dae.RobotModel.from_multibody(

@@ -40,7 +40,10 @@ def parse(name: str) -> MultibodyPlant:
     plant = MultibodyPlant(0.0)
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
-    parser.AddModelsFromUrl(f"package://drake_dae_models/{name}.urdf")
+    mounted = (FOLDER / "models" / f"{name}.dmd.yaml").exists()
+    parser.AddModelsFromUrl(
+        f"package://drake_dae_models/{name}.{'dmd.yaml' if mounted else 'urdf'}"
+    )
     plant.Finalize()
     return plant
 

@@ -6,7 +6,6 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import SpatialInertia
 
 from drake_dae import (
     AxisCoordinates,
@@ -20,7 +19,7 @@ from drake_dae.robots.actuation import Stage
 
 APART = 1.8
 LENGTH = 0.2
-"""Of the bases, which face each other, and of the object, in m."""
+"""Of the bases and of the object, in m, as in two_arms.dmd.yaml and held_box.urdf."""
 
 NOMINAL = np.tile([0.0, -0.7162933, 0.0, -1.7685105, 0.0, 0.9140075, 0.0], 2)
 """Both elbows up, the object level, 0.4 m above the floor, midway between the bases."""
@@ -35,31 +34,11 @@ GRASP = WeldedFrames(
 
 
 def two_arms_plant() -> MultibodyPlant:
-    """Arms "left" and "right", and the object of 4 kg, which is fixed to the left tool.
-
-    The object's x axis points from the left tool to the right one.
-    """
+    """Arms "left" and "right", and the object of 4 kg, which is fixed to the left tool."""
     plant = MultibodyPlant(0.0)
     parser = Parser(plant)
-    parser.SetAutoRenaming(True)
-    places = {
-        "left": RigidTransform(),
-        "right": RigidTransform(RollPitchYaw(0.0, 0.0, np.pi), [APART, 0.0, 0.0]),
-    }
-    for name, place in places.items():
-        (instance,) = parser.AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
-        plant.RenameModelInstance(instance, name)
-        # The file welds the base to the origin.
-        plant.RemoveJoint(plant.GetJointByName("base_weld", instance))
-        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance), place)
-    left = plant.GetModelInstanceByName("left")
-    inertia = SpatialInertia.SolidBoxWithMass(4.0, LENGTH, 0.08, 0.08)
-    plant.AddRigidBody("object", left, inertia)
-    plant.WeldFrames(
-        plant.GetFrameByName("tool", left),
-        plant.GetFrameByName("object"),
-        RigidTransform(RollPitchYaw(0.0, -np.pi / 2, 0.0), [0.0, 0.0, LENGTH / 2]),
-    )
+    parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
+    parser.AddModelsFromUrl("package://drake_dae_models/two_arms.dmd.yaml")
     plant.Finalize()
     return plant
 

@@ -5,9 +5,8 @@ import timeit
 
 import numpy as np
 import pytest
-from arms import touching
-from pydrake.systems.analysis import SimulatorConfig
-from two_arms import two_arms
+from arms import fixed_step, touching
+from two_arms import APART, two_arms
 
 from drake_dae import (
     DcMotors,
@@ -28,7 +27,7 @@ CASES = {
     "rigid": [],
     "flexible": [SPRINGS],
     "motors": [MOTORS],
-    "servos": [ElectrohydraulicServos(1e5, 1e-5, 0.05)],
+    "hydraulics": [ElectrohydraulicServos(1e6, 1e-6, 0.05)],
     "flexible + motors": [SPRINGS, MOTORS],
 }
 MODELS = {
@@ -36,7 +35,29 @@ MODELS = {
     "seven_joint": lambda stages: touching("seven_joint", stages),
     "two_arms": two_arms,
 }
-WANTED = {("seven_joint", "flexible"): 80, ("two_arms", "flexible"): 150}
+FORCE = sinusoids(20.0, 5.0, 2.0)
+REFERENCES = {
+    "two_link": [sinusoids(0.3, 0.1, 1.5), FORCE],
+    "seven_joint": [
+        sinusoids(0.0, 0.1, 1.5),
+        sinusoids(0.6, 0.1, 1.5),
+        constant(np.zeros(4)),
+        FORCE,
+    ],
+    "two_arms": [
+        sinusoids(APART / 2, 0.05, 1.5),
+        sinusoids(0.0, 0.1, 1.5),
+        sinusoids(0.4, 0.05, 1.5),
+        constant(np.zeros(5)),
+        FORCE,
+        constant(np.zeros(5)),
+    ],
+}
+LAW_TARGETS = {("seven_joint", "flexible"): 80.0, ("two_arms", "flexible"): 150.0}
+"""us."""
+TRACING_TARGETS = {("two_arms", "flexible"): 5.0}
+"""s."""
+STEP = 5e-3
 
 
 def microseconds(function):
@@ -44,44 +65,36 @@ def microseconds(function):
     return 1e6 * min(timeit.repeat(lambda: function.evaluate(*arrays), number=300, repeat=5)) / 300
 
 
-@pytest.mark.parametrize(
-    ("name", "case"),
-    [(n, c) for n in ("two_link", "seven_joint") for c in CASES]
-    + [("two_arms", c) for c in ("rigid", "flexible")],
-)
-def test_law(name, case, report):
-    model = MODELS[name](CASES[case])
+def wanted(targets, key, unit):
+    return f" (wanted at most {targets[key]:g} {unit})" if key in targets else ""
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", MODELS)
+def test_law_and_closed_loop(name, case, report):
+    """At a fixed step: the law leaves nothing stiff in the loop, whose poles are all at -8."""
+    model, key = MODELS[name](CASES[case]), (name, case)
     began = time.perf_counter()
     law = TrackingLaw(model.dae, poles(-8.0))
     traced = time.perf_counter() - began
     plant = RobotPlant(model, law.structure)
-    wanted = WANTED.get((name, case))
-    text = (
-        f"{name}, {case}: law {law.function.num_operations} operations, "
-        f"{microseconds(law.function):.1f} us"
-        + (f" (wanted at most {wanted})" if wanted else "")
-        + f"; plant {plant.dynamics.num_operations}, {microseconds(plant.dynamics):.1f} us; "
-        f"traced in {traced:.2f} s"
+    loop = make_closed_loop(plant, law, REFERENCES[name])
+    context = loop.diagram.CreateDefaultContext()
+    starts = np.cumsum([0, *[degree + 1 for degree in law.degrees]])[:-1]
+    first = loop.reference.reference(0.0)[starts]
+    count = len(model.position_signals)
+    q = model.configuration(first[:count], model.dae.nominal_state[: model.links.q.numel()])
+    plant.set_consistent_state(
+        plant.GetMyMutableContextFromRoot(context), model.rest_state(q, first[count:])
     )
-    if name != "two_arms":
-        count = len(model.position_signals)
-        references = [sinusoids(0.3, 0.1, 1.5), sinusoids(20.0, 5.0, 2.0)]
-        if count > 1:
-            references = [
-                sinusoids(0.0, 0.1, 1.5),
-                sinusoids(0.6, 0.1, 1.5),
-                constant(np.zeros(count - 2)),
-                sinusoids(20.0, 5.0, 2.0),
-            ]
-        loop = make_closed_loop(plant, law, references)
-        context = loop.diagram.CreateDefaultContext()
-        starts = np.cumsum([0, *[degree + 1 for degree in law.degrees]])[:-1]
-        first = loop.reference.reference(0.0)[starts]
-        q = model.configuration(first[:count], model.dae.nominal_state[: model.links.q.numel()])
-        plant.set_consistent_state(
-            plant.GetMyMutableContextFromRoot(context), model.rest_state(q, first[count:])
-        )
-        config = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-6)
-        run = simulate(loop.diagram, context, 3.0, config)
-        text += f"; closed loop {run.times_real_time:.0f} times real time at accuracy 1e-6"
-    report(text)
+    run = simulate(loop.diagram, context, 1.0, fixed_step(STEP))
+    record = loop.record(context)
+    off = np.max(np.abs(record["tracking_error"] - loop.predicted_error(record)))
+    report(
+        f"{name}, {case}: law {law.function.num_operations} operations, "
+        f"{microseconds(law.function):.1f} us{wanted(LAW_TARGETS, key, 'us')}; plant "
+        f"{plant.dynamics.num_operations}, {microseconds(plant.dynamics):.1f} us; traced in "
+        f"{traced:.2f} s{wanted(TRACING_TARGETS, key, 's')}; closed loop "
+        f"{run.times_real_time:.1f} times real time at {1e3 * STEP:g} ms, errors off the "
+        f"predicted ones by {off:.0e}"
+    )
