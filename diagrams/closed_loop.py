@@ -115,16 +115,19 @@ def make_closed_loop(
         sensor: Measures the constraint force for a law with measured force. Without one the force
             is connected as it is, where that closes no algebraic loop.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
-            its geometry can be drawn.
+            its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
             scene_graph; None draws nothing.
         live: Draw while simulating, `FRAME_RATE` times a second; this shortens the integrator's
             steps. False draws only in `make_animation`.
 
+    A loop that draws nothing and samples nothing converts to AutoDiffXd, for Drake's Linearize.
+
     Raises:
-        WiringError: Measured force would close an algebraic loop, or a sampled loop that diverges;
-            or a sensor that no law uses.
+        WiringError: A law or a sensor of sizes that are not the plant's; measured force that would
+            close an algebraic loop, or a sampled loop that diverges; or a sensor that no law uses.
     """
+    _check_sizes(system, law, sensor)
     builder = DiagramBuilder()
 
     # The plant, its reference and its controller.
@@ -162,14 +165,36 @@ def make_closed_loop(
     # The view: the robot at its link positions, the surfaces, the contact forces.
     if isinstance(plant, RobotPlant):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
-        if scene_graph is not None:
-            _add_geometry(builder, plant, scene_graph, meshcat, live)
         if meshcat is not None:
+            if scene_graph is not None:
+                _add_geometry(builder, plant, scene_graph, meshcat, live)
             _add_contacts(builder, plant, meshcat, live)
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")
     return ClosedLoop(diagram, plant, controller, reference, loggers, meshcat, sensor)
+
+
+def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
+    """Drake would name the ports, but not what is wrong with them."""
+    own, other = plant.dae, law.system
+    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
+    if sizes[0] != sizes[1]:
+        has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
+        raise WiringError(
+            f"the law is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. Make "
+            "the law for the plant's system, TrackingLaw(plant.dae, ...), or for a model of the "
+            "same structure"
+        )
+    if sensor is not None:
+        size = sensor.GetInputPort("force").size()
+        if size != own.num_constraints:
+            names = ", ".join(signal.name for signal in own.constraint_input_signals) or "none"
+            raise WiringError(
+                f"the sensor measures {size} forces, the plant '{own.name}' has "
+                f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
+                "...)"
+            )
 
 
 def _add_force_feedback(
@@ -301,7 +326,7 @@ def _add_geometry(
     builder: DiagramBuilder,
     plant: RobotPlant,
     scene_graph: SceneGraph,
-    meshcat: Meshcat | None,
+    meshcat: Meshcat,
     live: bool,
 ) -> None:
     """Drake's own picture of the robot, posed by our link state; its plant is not simulated."""
@@ -316,11 +341,10 @@ def _add_geometry(
     builder.Connect(
         pose.get_output_port(), scene_graph.get_source_pose_port(links.plant.get_source_id())
     )
-    if meshcat is not None:
-        period = 1.0 / FRAME_RATE if live else _ON_REQUEST
-        MeshcatVisualizer.AddToBuilder(
-            builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
-        )
+    period = 1.0 / FRAME_RATE if live else _ON_REQUEST
+    MeshcatVisualizer.AddToBuilder(
+        builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
+    )
 
 
 def _add_contacts(builder: DiagramBuilder, plant: RobotPlant, meshcat: Meshcat, live: bool) -> None:

@@ -8,10 +8,14 @@ numbers in the documentation are those of that paper.
 
 from importlib.metadata import version
 
+from drake_dae.dae.analysis import Analysis, analyze
+from drake_dae.dae.extension import Extension, dynamic_extension, extend
 from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem, Parameter, Signal
 from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.build import build
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation, make_closed_loop
 from drake_dae.diagrams.scenario import load_scenario
@@ -41,6 +45,7 @@ from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
+from drake_dae.systems.realization import StateRealization
 from drake_dae.systems.references import (
     ExpressionSignal,
     ReferenceGenerator,
@@ -51,10 +56,12 @@ from drake_dae.systems.references import (
 )
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.symbolic import from_symbolic
 
 __version__ = version("drake_dae")
 
 __all__ = [
+    "Analysis",
     "AxisCoordinates",
     "ClosedLoop",
     "CoincidentPoints",
@@ -67,6 +74,7 @@ __all__ = [
     "Ellipsoid",
     "ExpressionOutput",
     "ExpressionSignal",
+    "Extension",
     "FeedbackGains",
     "FlexibleJoints",
     "ForceSensor",
@@ -74,6 +82,7 @@ __all__ = [
     "JointPositions",
     "LinkExpressions",
     "MultibodyExpressions",
+    "NormalForm",
     "Parameter",
     "Plane",
     "PointCoordinates",
@@ -84,6 +93,7 @@ __all__ = [
     "RobotPlant",
     "Signal",
     "Sphere",
+    "StateRealization",
     "Structure",
     "SurfaceCoordinates",
     "Torus",
@@ -91,10 +101,15 @@ __all__ = [
     "TrackingLaw",
     "TrajectorySignal",
     "WeldedFrames",
+    "ZeroDynamics",
+    "analyze",
     "build",
     "coefficients",
     "constant",
+    "dynamic_extension",
+    "extend",
     "find_structure",
+    "from_symbolic",
     "load_scenario",
     "make_animation",
     "make_closed_loop",

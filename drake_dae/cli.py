@@ -1,6 +1,7 @@
 """The command `drake-dae`."""
 
 import argparse
+import json
 import logging
 import os
 import sys
@@ -16,6 +17,7 @@ from pydrake.systems.framework import Context
 import drake_dae
 from drake_dae.diagrams.build import build
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation
+from drake_dae.diagrams.preview import preview
 from drake_dae.diagrams.scenario import (
     DEFAULT_SCENARIO,
     Scenario,
@@ -39,7 +41,11 @@ _MARK = "# Scenario as run by drake-dae"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code: 0, 1 for an error, 130 after Ctrl-C."""
+    """Runs the command line; returns the exit code.
+
+    0, or 1 for an error, 2 for a problem that `analyze` found (as for wrong usage), 130 after
+    Ctrl-C.
+    """
     parser = argparse.ArgumentParser(
         prog="drake-dae",
         description="Robots in contact: position and force tracking on Drake's systems framework.",
@@ -47,20 +53,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=drake_dae.__version__)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="show the shipped scenarios")
-    run = commands.add_parser("simulate", help="run a scenario")
-    run.add_argument(
+    named = argparse.ArgumentParser(add_help=False)
+    named.add_argument(
         "scenario",
         nargs="?",
         default=DEFAULT_SCENARIO,
         help=f"a shipped scenario or a YAML file (default: {DEFAULT_SCENARIO})",
     )
-    run.add_argument(
-        "--out", type=Path, help="folder for the results (default: runs/<scenario>-<time>)"
-    )
-    run.add_argument(
-        "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
-    )
-    run.add_argument(
+    named.add_argument(
         "--set",
         dest="settings",
         action="append",
@@ -68,12 +68,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="KEY=VALUE",
         help='change the scenario, for example "integrator.accuracy=1e-8"; may be repeated',
     )
+    run = commands.add_parser("simulate", parents=[named], help="run a scenario")
+    run.add_argument(
+        "--out", type=Path, help="folder for the results (default: runs/<scenario>-<time>)"
+    )
+    run.add_argument(
+        "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
+    )
+    examine = commands.add_parser(
+        "analyze",
+        parents=[named],
+        help="examine a scenario without running it",
+        description="Examines the robot of a scenario (relative degrees, index, Assumptions "
+        "(1)-(5), zero dynamics) and what its reference takes: the nearest singularity, control "
+        "and joint forces against their limits, contact forces, joint limits, and when the "
+        "reference leaves what the robot can reach.",
+        epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
+        "error",
+    )
+    examine.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(arguments)
     # Drake tells where each Meshcat listens, also the one that only records.
     logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         if options.command == "list":
             return _list()
+        if options.command == "analyze":
+            return _analyze(options)
         return _simulate(options)
     except DrakeDaeError as error:
         # Texts of Drake and YAML may have several lines.
@@ -97,6 +118,16 @@ def _list() -> int:
     for name, path in paths.items():
         print(f"{name.ljust(width)}  {load_scenario(path).description}")
     return 0
+
+
+def _analyze(options: argparse.Namespace) -> int:
+    path = find_scenario(options.scenario)
+    found = preview(load_scenario(path, options.settings))
+    if options.json:
+        print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
+    else:
+        print(f"{path.stem}\n\n{found}")
+    return 2 if found.problems else 0
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -1,5 +1,7 @@
 """The exception family: every failure says what was wrong, which value, and what to do."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -32,7 +34,10 @@ class AssumptionError(DrakeDaeError):
     Attributes:
         assumption: Number of the assumption in the paper, (1) to (5).
         state: A consistent state, shape (n,), where it fails, or None if it fails everywhere.
+        system: The `DaeSystem` that `find_structure` found it in, for `analyze`; else None.
     """
+
+    system: Any = None
 
     def __init__(self, message: str, assumption: int, state: ArrayLike | None = None) -> None:
         super().__init__(f"Assumption ({assumption}): {message}")
@@ -41,10 +46,12 @@ class AssumptionError(DrakeDaeError):
 
 
 class InconsistentStateError(DrakeDaeError):
-    """A state that is not on the manifold N* of (4).
+    """A state that is not on the manifold N* of (4), or not where it was asked to be.
 
     Attributes:
-        residual: The constraint outputs and their derivatives, shape (sum r_i,).
+        residual: What is not zero: the constraint outputs and their derivatives, shape
+            (sum r_i,), then the output errors if outputs were pinned; x' where no equilibrium is
+            found; from `NormalForm.state` what is left in the coordinates, shape (n,).
     """
 
     def __init__(self, message: str, residual: ArrayLike) -> None:
@@ -76,3 +83,7 @@ class SingularityError(SimulationError):
 
 class NonFiniteError(SimulationError):
     """A derivative or an output that is NaN or infinite."""
+
+
+class NonMinimumPhaseWarning(UserWarning):
+    """A law for a system with unstable zero dynamics: outputs follow, but states run off."""

@@ -6,6 +6,7 @@ derivation in its docstring, and share no code with the library.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import casadi as ca
@@ -43,6 +44,9 @@ class Problem:
         reference: Per output start, slope and amplitude of a signal that can be followed.
         derivatives: x -> k and its derivatives, constraint-major, shape (sum r_i,).
         horizon: How long it can be followed, in s.
+        source: Where degrees or index are published; "" if made up for the tests.
+        minimum_phase: Whether the zero dynamics are exponentially stable at the equilibrium next to
+            the nominal state; None if they are trivial, or have no such equilibrium.
     """
 
     system: DaeSystem
@@ -56,6 +60,8 @@ class Problem:
     reference: Sequence[tuple[float, float, float]]
     derivatives: Callable[[Array], Array] = field(default=lambda x: np.zeros(0))
     horizon: float = 1.5
+    source: str = ""
+    minimum_phase: bool | None = None
 
     @property
     def manifold_dimension(self) -> int:
@@ -135,6 +141,7 @@ def pendulum() -> Problem:
         consistent=_pendulum_state,
         reference=[(0.45, 0.0, 0.1)],
         derivatives=_pendulum_derivatives,
+        source="Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, VII.1",
     )
 
 
@@ -152,6 +159,7 @@ def pendulum_tension() -> Problem:
         reference=[(-25.0, 0.0, 1.0)],
         derivatives=_pendulum_derivatives,
         horizon=0.1,  # Later it comes to x = 0, where u does not act on the tension.
+        source="Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, VII.1",
     )
 
 
@@ -250,6 +258,7 @@ def two_link_arm() -> Problem:
         consistent=_arm_state,
         reference=[(20.0, 0.0, 5.0), (0.5, 0.0, 0.1)],
         derivatives=_arm_derivatives,
+        source="McClamroch and Wang, IEEE Transactions on Automatic Control 33(5), 1988: r = 2",
     )
 
 
@@ -300,6 +309,7 @@ def circuit() -> Problem:
         consistent=consistent,
         reference=[(0.0, 0.0, 1.0)],
         derivatives=lambda x: np.array([x[0] - x[1]]),
+        source="Tischendorf, Surveys on Mathematics for Industry 8, 1999: L-I cutsets",
     )
 
 
@@ -341,7 +351,9 @@ def linear() -> Problem:
         consistent=lambda random: null @ random.standard_normal(n - m),
         reference=[(0.0, 0.0, 1.0), (0.5, 0.0, 1.0)],
         derivatives=lambda state: k @ state,
-        horizon=0.5,  # Its zero dynamics are not stable.
+        horizon=0.5,  # One of its zeros is -134 1/s: SciPy takes small steps.
+        source="Krishnan and McClamroch 1992; by matrices: Dai, Singular Control Systems, 1989",
+        minimum_phase=True,
     )
 
 
@@ -502,6 +514,7 @@ def flexible_pendulum() -> Problem:
         known=closed_form,
         consistent=lambda random: random.uniform(-0.3, 0.3, 4),
         reference=[(0.1, 0.0, 0.3)],
+        source="Spong, Journal of Dynamic Systems, Measurement, and Control 109(4), 1987: mu = 4",
     )
 
 
@@ -569,6 +582,7 @@ def knife_edge() -> Problem:
         consistent=_sleigh_state,
         reference=[(0.5, 0.0, 0.5), (1.0, 0.0, 0.3)],
         derivatives=_sleigh_derivatives,
+        source="Bloch, Nonholonomic Mechanics and Control, 2003, chapter 1: the knife edge",
     )
 
 
@@ -601,6 +615,341 @@ def knife_edge_force() -> Problem:
         consistent=_sleigh_state,
         reference=[(3.0, 0.0, 0.5), (0.5, 1.0, 0.1)],
         derivatives=_sleigh_derivatives,
+    )
+
+
+def chaplygin_sleigh() -> Problem:
+    """A sleigh with its centre of mass a distance a ahead of the blade; v is the blade's force.
+
+    k = -s vx + c vy - a w with (vx, vy) of the centre of mass. On N*, V' = a w^2 + u1/m and
+    (I + m a^2) w' = -m a w V + u2, as Bloch has them. k' = -w V + (1/m + a^2/I) v - a u2/I.
+    """
+    m, inertia, a = 3.0, 0.4, 0.3
+    system = DaeSystem.from_functions(
+        ["x", "y", "heading", "vx", "vy", "w"],
+        f=lambda x: [x[3], x[4], x[5], 0, 0, 0],
+        g=lambda x: [0, 0, 0, -ca.sin(x[2]) / m, ca.cos(x[2]) / m, -a / inertia],
+        h=lambda x: [
+            *[[0, 0]] * 3,
+            [ca.cos(x[2]) / m, 0],
+            [ca.sin(x[2]) / m, 0],
+            [0, 1 / inertia],
+        ],
+        k=lambda x: -ca.sin(x[2]) * x[3] + ca.cos(x[2]) * x[4] - a * x[5],
+        l=lambda x: [x[2], ca.cos(x[2]) * x[3] + ca.sin(x[2]) * x[4]],
+        m=lambda x: [0, 0],
+        output_signals=["heading", "V"],
+        nominal_state=[0.0, 0.0, 0.3, 0.5, 0.4, 1.0],
+        name="Chaplygin sleigh",
+    )
+
+    def derivatives(x: Array) -> Array:
+        return np.array([-np.sin(x[2]) * x[3] + np.cos(x[2]) * x[4] - a * x[5]])
+
+    def closed_form(x: Array) -> Known:
+        speed, whole = np.cos(x[2]) * x[3] + np.sin(x[2]) * x[4], inertia + m * a**2
+        return known(
+            1 / m + a**2 / inertia,
+            x[5] * speed * m * inertia / whole,
+            [[0, a * m / whole]],
+            [-m * a * x[5] * speed / whole, x[5] * (a * x[5] + derivatives(x)[0])],
+            [[0, 1 / whole], [1 / m, 0]],
+        )
+
+    def consistent(random: np.random.Generator) -> Array:
+        x, y, heading, speed, rate = random.uniform(0.5, 1.5, 5)
+        s, c = np.sin(heading), np.cos(heading)
+        across = a * rate
+        return np.array([x, y, heading, c * speed - s * across, s * speed + c * across, rate])
+
+    return Problem(
+        system=system,
+        constraint_degrees=(1,),
+        output_degrees=(2, 1),
+        index=2,
+        zero_dynamics=2,
+        output_order=(0, 1),
+        known=closed_form,
+        consistent=consistent,
+        reference=[(0.5, 0.0, 0.5), (1.0, 0.0, 0.3)],
+        derivatives=derivatives,
+        source="Bloch, Nonholonomic Mechanics and Control, 2003, 1.7: the Chaplygin sleigh",
+    )
+
+
+def rolling_disk() -> Problem:
+    """An upright disk that rolls without slipping: two nonholonomic constraints, r = (1, 1).
+
+    k = (vx - R c W, vy - R s W), v is the force on the rim. d(k)/dt = R w W (s, -c) + A v - R u1/I
+    (c, s) with A = 1/m + R^2/I (c, s) (c, s)', which has the eigenvectors (s, -c) and (c, s). So
+    alpha = -m R w W (s, -c), beta = m R/(I + m R^2) (c, s), and (I + m R^2) W' = u1, J w' = u2.
+    """
+    m, inertia, spin, radius = 2.0, 0.09, 0.05, 0.3
+    whole = inertia + m * radius**2
+    system = DaeSystem.from_functions(
+        ["x", "y", "heading", "roll", "vx", "vy", "w", "W"],
+        f=lambda x: [x[4], x[5], x[6], x[7], 0, 0, 0, 0],
+        g=lambda x: [
+            *[[0, 0]] * 4,
+            [1 / m, 0],
+            [0, 1 / m],
+            [0, 0],
+            [-radius * ca.cos(x[2]) / inertia, -radius * ca.sin(x[2]) / inertia],
+        ],
+        h=lambda x: [*[[0, 0]] * 6, [0, 1 / spin], [1 / inertia, 0]],
+        k=lambda x: [
+            x[4] - radius * ca.cos(x[2]) * x[7],
+            x[5] - radius * ca.sin(x[2]) * x[7],
+        ],
+        l=lambda x: [x[2], x[3]],
+        m=lambda x: [[0, 0], [0, 0]],
+        output_signals=["heading", "roll"],
+        name="rolling disk",
+    )
+
+    def closed_form(x: Array) -> Known:
+        s, c = np.sin(x[2]), np.cos(x[2])
+        along, across = np.array([c, s]), np.array([s, -c])
+        return known(
+            np.eye(2) / m + radius**2 / inertia * np.outer(along, along),
+            -m * radius * x[6] * x[7] * across,
+            np.column_stack([m * radius / whole * along, [0, 0]]),
+            [0, 0],
+            [[0, 1 / spin], [1 / whole, 0]],
+        )
+
+    def consistent(random: np.random.Generator) -> Array:
+        x, y, heading, roll, w, spun = random.uniform(-1.0, 1.0, 6)
+        speed = radius * spun
+        return np.array(
+            [x, y, heading, roll, speed * np.cos(heading), speed * np.sin(heading), w, spun]
+        )
+
+    def derivatives(x: Array) -> Array:
+        speed = radius * x[7]
+        return np.array([x[4] - np.cos(x[2]) * speed, x[5] - np.sin(x[2]) * speed])
+
+    return Problem(
+        system=system,
+        constraint_degrees=(1, 1),
+        output_degrees=(2, 2),
+        index=2,
+        zero_dynamics=2,
+        output_order=(0, 1),
+        known=closed_form,
+        consistent=consistent,
+        reference=[(0.5, 0.0, 0.5), (0.0, 1.0, 0.5)],
+        derivatives=derivatives,
+        source="Bloch, Nonholonomic Mechanics and Control, 2003, 1.4: the vertical rolling disk",
+    )
+
+
+def swing_network() -> Problem:
+    """Two generators and a load without inertia: power flow as an algebraic constraint.
+
+    d_i' = w_i, M_i w_i' = P_i - D_i w_i - b_i sin(d_i - t) (+ u for the first), and the load bus
+    takes k = sum b_i sin(d_i - t) - P = 0. Its angle t is an algebraic variable of an index 1
+    system; as a state with t' = v it has r = 1, and A = -sum b_i cos(d_i - t) is the power flow
+    Jacobian. With z = d_1 the second generator is left: it swings and is damped.
+    """
+    inertia, damping, power, load = (0.1, 0.15), (0.2, 0.4), (0.7, 0.6), 1.3
+    links = (2.0, 1.5)
+    system = DaeSystem.from_functions(
+        [Signal("d1", "rad"), "w1", Signal("d2", "rad"), "w2", Signal("t", "rad")],
+        f=lambda x: [
+            x[1],
+            (power[0] - damping[0] * x[1] - links[0] * ca.sin(x[0] - x[4])) / inertia[0],
+            x[3],
+            (power[1] - damping[1] * x[3] - links[1] * ca.sin(x[2] - x[4])) / inertia[1],
+            0,
+        ],
+        g=lambda x: [0, 0, 0, 0, 1],
+        h=lambda x: [0, 1 / inertia[0], 0, 0, 0],
+        k=lambda x: links[0] * ca.sin(x[0] - x[4]) + links[1] * ca.sin(x[2] - x[4]) - load,
+        l=lambda x: x[0],
+        m=lambda x: 0,
+        nominal_state=[0.1, 0.0, 0.1, 0.0, -0.3],
+        name="swing network",
+    )
+
+    def closed_form(x: Array) -> Known:
+        stiff = np.array(links) * np.cos([x[0] - x[4], x[2] - x[4]])
+        drift = power[0] - damping[0] * x[1] - links[0] * np.sin(x[0] - x[4])
+        return known(
+            -stiff.sum(),
+            stiff @ [x[1], x[3]] / stiff.sum(),
+            0,
+            drift / inertia[0],
+            1 / inertia[0],
+        )
+
+    def consistent(random: np.random.Generator) -> Array:
+        """From the flows, which are given: b_1 sin(d1 - t) = P - b_2 sin(d2 - t)."""
+        first, angle = random.uniform(0.5, 0.8), random.uniform(-0.4, 0.0)
+        d1 = angle + np.arcsin(first / links[0])
+        d2 = angle + np.arcsin((load - first) / links[1])
+        return np.array([d1, random.uniform(-0.3, 0.3), d2, random.uniform(-0.3, 0.3), angle])
+
+    return Problem(
+        system=system,
+        constraint_degrees=(1,),
+        output_degrees=(2,),
+        index=2,
+        zero_dynamics=2,
+        output_order=(0,),
+        known=closed_form,
+        consistent=consistent,
+        reference=[(0.1, 0.0, 0.2)],
+        derivatives=lambda x: np.array(
+            [links[0] * np.sin(x[0] - x[4]) + links[1] * np.sin(x[2] - x[4]) - load]
+        ),
+        source="Hill and Mareels, IEEE Transactions on Circuits and Systems 37(11), 1990: index 1 "
+        "where the power flow Jacobian is regular, so 2 with t' = v; network: Bergen and Hill, "
+        "IEEE Transactions on Power Apparatus and Systems 100(1), 1981",
+        minimum_phase=True,
+    )
+
+
+def _tanks(levels, gains, splits, name: str, minimum_phase: bool) -> Problem:
+    """Four tanks, two pumps: levels in cm, pump voltages in V, the numbers of Johansson 2000.
+
+    A_1 h_1' = -a_1 s_1 + a_3 s_3 + g_1 k_1 u_1,  A_3 h_3' = -a_3 s_3 + (1 - g_2) k_2 u_2, and with
+    1, 2 and 3, 4 exchanged, where s_i = sqrt(2 g h_i). z = (h_1, h_2), mu = (1, 1). The zeros solve
+    (1 + s T_3)(1 + s T_4) = (1 - g_1)(1 - g_2)/(g_1 g_2): both negative where g_1 + g_2 > 1.
+    """
+    area, hole = np.array([28.0, 32.0, 28.0, 32.0]), np.array([0.071, 0.057, 0.071, 0.057])
+    (k1, k2), (g1, g2), gravity = gains, splits, 981.0
+
+    def f(x: ca.SX) -> list[ca.SX]:
+        out = [hole[i] * ca.sqrt(2 * gravity * x[i]) for i in range(4)]
+        return [
+            (out[2] - out[0]) / area[0],
+            (out[3] - out[1]) / area[1],
+            -out[2] / area[2],
+            -out[3] / area[3],
+        ]
+
+    system = DaeSystem.from_functions(
+        [Signal(f"h{i + 1}", "cm") for i in range(4)],
+        f=f,
+        h=lambda x: [
+            [g1 * k1 / area[0], 0],
+            [0, g2 * k2 / area[1]],
+            [0, (1 - g2) * k2 / area[2]],
+            [(1 - g1) * k1 / area[3], 0],
+        ],
+        l=lambda x: [x[0], x[1]],
+        control_signals=[Signal("pump1", "V"), Signal("pump2", "V")],
+        output_signals=[Signal("h1", "cm"), Signal("h2", "cm")],
+        nominal_state=levels,
+        name=name,
+    )
+
+    def closed_form(x: Array) -> Known:
+        out = hole * np.sqrt(2 * gravity * x)
+        return unconstrained(
+            2, (out[2:] - out[:2]) / area[:2], np.diag([g1 * k1, g2 * k2] / area[:2])
+        )
+
+    return Problem(
+        system=system,
+        constraint_degrees=(),
+        output_degrees=(1, 1),
+        index=0,
+        zero_dynamics=2,
+        output_order=(0, 1),
+        known=closed_form,
+        consistent=lambda random: np.array(levels) + random.uniform(-0.2, 0.2, 4),
+        reference=[(levels[0], 0.0, 0.1), (levels[1], 0.0, 0.1)],
+        source="Johansson, IEEE Transactions on Control Systems Technology 8(3), 2000",
+        minimum_phase=minimum_phase,
+    )
+
+
+def quadruple_tank() -> Problem:
+    """The minimum phase setting, P-: most of each pump goes to its lower tank. See `_tanks`."""
+    return _tanks([12.4, 12.7, 1.8, 1.4], (3.33, 3.35), (0.70, 0.60), "quadruple tank", True)
+
+
+def quadruple_tank_crossed() -> Problem:
+    """The nonminimum phase setting, P+: most of each pump goes to the upper tank across."""
+    return _tanks(
+        [12.6, 13.0, 4.8, 4.9], (3.14, 3.29), (0.43, 0.34), "crossed quadruple tank", False
+    )
+
+
+def aircraft() -> Problem:
+    """A planar vertical takeoff aircraft whose roll jets also push sideways: e = 0.5.
+
+    x'' = -s u1 + e c u2, y'' = c u1 + e s u2 - 1, roll'' = u2: mu = (2, 2), det B = -e. With z at
+    rest e roll'' = sin roll is left, an inverted pendulum.
+    """
+    e = 0.5
+    system = DaeSystem.from_functions(
+        ["x", "y", "roll", "vx", "vy", "rate"],
+        f=lambda x: [x[3], x[4], x[5], 0, -1, 0],
+        h=lambda x: [
+            *[[0, 0]] * 3,
+            [-ca.sin(x[2]), e * ca.cos(x[2])],
+            [ca.cos(x[2]), e * ca.sin(x[2])],
+            [0, 1],
+        ],
+        l=lambda x: [x[0], x[1]],
+        name="aircraft",
+    )
+
+    def closed_form(x: Array) -> Known:
+        s, c = np.sin(x[2]), np.cos(x[2])
+        return unconstrained(2, [0, -1], [[-s, e * c], [c, e * s]])
+
+    return Problem(
+        system=system,
+        constraint_degrees=(),
+        output_degrees=(2, 2),
+        index=0,
+        zero_dynamics=2,
+        output_order=(0, 1),
+        known=closed_form,
+        consistent=lambda random: random.uniform(-0.3, 0.3, 6),
+        reference=[(0.0, 0.0, 0.2), (0.0, 0.0, 0.2)],
+        horizon=1.0,  # Its zero dynamics are not stable.
+        source="Hauser, Sastry and Meyer, Automatica 28(4), 1992",
+        minimum_phase=False,
+    )
+
+
+def dc_motor() -> Problem:
+    """A motor controlled by its field: field and armature currents i, j and speed w.
+
+    i' = -a i + u, j' = -b j + c - d i w, w' = e i j, z = w. So w'' = e ((-a i + u) j + i j') and
+    B = e j: mu = 2 as long as j is not 0. At constant speed i = 0, and j' = -b j + c is left.
+    """
+    a, b, c, d, e = 1.2, 0.8, 1.6, 0.7, 1.5
+    system = DaeSystem.from_functions(
+        ["i", "j", "w"],
+        f=lambda x: [-a * x[0], -b * x[1] + c - d * x[0] * x[2], e * x[0] * x[1]],
+        h=lambda x: [1, 0, 0],
+        l=lambda x: x[2],
+        nominal_state=[0.0, 2.0, 1.0],
+        name="DC motor",
+    )
+
+    def closed_form(x: Array) -> Known:
+        armature = -b * x[1] + c - d * x[0] * x[2]
+        return unconstrained(1, e * (-a * x[0] * x[1] + x[0] * armature), e * x[1])
+
+    return Problem(
+        system=system,
+        constraint_degrees=(),
+        output_degrees=(2,),
+        index=0,
+        zero_dynamics=1,
+        output_order=(0,),
+        known=closed_form,
+        consistent=lambda random: np.array([0, 2, 1]) + random.uniform(-0.3, 0.3, 3),
+        reference=[(1.0, 0.0, 0.2)],
+        source="Khalil, Nonlinear Systems, 2002, chapter 13: the field-controlled DC motor",
+        minimum_phase=True,
     )
 
 
@@ -717,6 +1066,13 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         flexible_pendulum,
         knife_edge,
         knife_edge_force,
+        chaplygin_sleigh,
+        rolling_disk,
+        swing_network,
+        quadruple_tank,
+        quadruple_tank_crossed,
+        aircraft,
+        dc_motor,
         gantry,
         scalar,
         held_point,
@@ -808,23 +1164,27 @@ def hidden_normal_form(seed: int) -> Hidden:
     In coordinates w the constraints and the outputs with mu_i > 0 are heads of chains of
     integrators, which v and u enter at the end:
 
-        c^(r)  = a(w) + A(w) (v - beta(w) u),    z^(mu) = b(w) + D v + (B1 - D beta(w)) u,
+        c^(r)  = A(w) (v - beta(w) u - a(w)),    z^(mu) = b(w) + D v + (B1 - D beta(w)) u,
 
-    so that v = beta u - A^-1 a and z^(mu) = ... + B1 u; an output of degree 0 is l(w) + m v with
-    the rows m beta of B. Other coordinates are moved by everything. Then a regular feedback
-    u -> gamma(x) + sigma u, a change of basis of v, a polynomial diffeomorphism x = T(w), which is
-    triangular and so inverted exactly, and a rotation hide all that. None changes a degree.
+    so that v = a + beta u and z^(mu) = ... + B1 u. An output of degree 0 is l(w) + m v with the
+    rows m beta of B. An output of degree mu > 0 may also be a constraint input v_j: then the row
+    beta_j is zero and a_j is the head of its chain. A constraint may have others of at least its
+    degree added. Other coordinates are moved by everything. Then a regular feedback u -> gamma(x) +
+    sigma u, a change of basis of v, a polynomial diffeomorphism x = T(w), which is triangular and
+    so inverted exactly, and a rotation hide all that. None changes a degree.
     """
     random = np.random.default_rng(seed)
     while True:
-        m, p = int(random.integers(0, 3)), int(random.integers(1, 4))
+        m, p = int(random.integers(0, 4)), int(random.integers(1, 5))
         r = tuple(int(i) for i in random.integers(1, 4, m))
-        # At most as many outputs of degree 0 as constraint inputs: m beta has rank m.
+        # Of m constraint inputs at most m are outputs: m beta has as many rows as are met at once,
+        # and no column of a beta_j that is zero.
         met = int(random.integers(0, min(m, p) + 1))
+        felt = int(random.integers(0, min(m, p) - met + 1))
         mu = [0] * met + [int(i) for i in random.integers(1, 4, p - met)]
-        free = int(random.integers(0, 3))
+        free = int(random.integers(0, 4))
         n = sum(r) + sum(mu) + free
-        if 1 <= n <= 9 and m < n:
+        if 1 <= n <= 8 and m < n:
             break
     w = ca.SX.sym("w", n)
 
@@ -837,37 +1197,47 @@ def hidden_normal_form(seed: int) -> Hidden:
             columns,
         )
 
-    beta = random.normal(size=(m, p)) + smooth(m, p, 0.1)
     while True:
+        beta = random.normal(size=(m, p)) + smooth(m, p, 0.1)
+        beta[m - felt :, :] = 0
         b1, rows = random.normal(size=(p - met, p)), random.normal(size=(met, m))
         nominal_beta = np.array(ca.Function("beta", [w], [ca.densify(beta)])(np.zeros(n)))
         b = np.vstack([rows @ nominal_beta.reshape(m, p), b1])
-        if p == 0 or np.linalg.svd(b, compute_uv=False)[-1] > 0.3:
+        if np.linalg.svd(b, compute_uv=False)[-1] > 0.3:
             break
-        beta = random.normal(size=(m, p)) + smooth(m, p, 0.1)
     a = np.linalg.qr(random.normal(size=(m, m)))[0] + smooth(m, m, 0.1)
     by_force = random.normal(size=(p - met, m))
 
+    starts = np.cumsum([0, *r, *mu[met:]])
+    heads = [w[int(start)] for start in starts[:-1]]
+    force_drift, output_drift = smooth(m), smooth(p - met)
+    for j in range(felt):
+        force_drift[m - felt + j] = heads[m + j]
     f, g, h = ca.SX(n, 1), ca.SX(n, m), ca.SX(n, p)
-    heads, row = [], 0
-    constraint_drift, output_drift = smooth(m), smooth(p - met)
-    for i, degree in enumerate((*r, *mu[met:])):
-        heads.append(w[row])
-        for j in range(row, row + degree - 1):
+    for i, (start, end) in enumerate(pairwise(starts)):
+        for j in range(start, end - 1):
             f[j] = w[j + 1]
-        last = row + degree - 1
+        last = int(end) - 1
         if i < m:
-            f[last] = constraint_drift[i]
+            f[last] = -ca.mtimes(a[i, :], force_drift)
             g[last, :] = a[i, :]
             h[last, :] = -ca.mtimes(a[i, :], beta)
         else:
             f[last] = output_drift[i - m]
             g[last, :] = by_force[i - m : i - m + 1]
             h[last, :] = b1[i - m : i - m + 1] - ca.mtimes(by_force[i - m : i - m + 1], beta)
-        row += degree
+    row = int(starts[-1])
     f[row:], g[row:, :], h[row:, :] = smooth(free), smooth(free, m), smooth(free, p)
-    output = ca.vertcat(ca.SX(0, 1), smooth(met), *heads[m:])
+    output = ca.vertcat(ca.SX(0, 1), smooth(met), ca.SX(felt, 1), *heads[m + felt :])
     force = ca.vertcat(ca.SX(rows), ca.SX(p - met, m))
+    for j in range(felt):
+        force[met + j, m - felt + j] = 1
+    constraint = ca.vertcat(ca.SX(0, 1), *heads[:m])
+    added = 0.5 * random.normal(size=(m, m))
+    for i in range(m):
+        # By one way only, so that the rows stay independent.
+        others = [j for j in range(m) if (r[j], j) > (r[i], i)]
+        constraint[i] += sum(added[i, j] * heads[j] for j in others)
 
     # A regular feedback and a change of basis.
     f += ca.mtimes(h, smooth(p))
@@ -897,7 +1267,7 @@ def hidden_normal_form(seed: int) -> Hidden:
         f=hidden(ca.mtimes(jacobian, f)),
         g=hidden(ca.mtimes(jacobian, g)),
         h=hidden(ca.mtimes(jacobian, h)),
-        k=hidden(ca.vertcat(ca.SX(0, 1), *heads[:m])),
+        k=hidden(constraint),
         l=hidden(output[[int(i) for i in order]]),
         m=force[[int(i) for i in order], :],
         name=f"hidden {seed}",

@@ -96,6 +96,23 @@ def test_the_page_holds_the_animation(demo):
     assert np.ptp(hand[:, 1]) > 0.1
 
 
+@pytest.mark.parametrize(
+    ("name", "link", "force"),
+    [("two_arms", "right/link7", "grasp.fx"), ("five_bar", "five_bar/right2", "pin.fx")],
+)
+def test_a_closed_loop_of_links(name, link, force, tmp_path, capsys):
+    """Without a surface there is no contact to draw, but all else."""
+    assert main(["simulate", name, "--out", str(tmp_path), "--set", "duration=0.5"]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
+    tracks = animation((tmp_path / "animation.html").read_text())
+    assert np.ptp(tracks[f"/drake/visualizer/{link}", "position"].values) > 0.01
+    assert not [path for path, _ in tracks if path.startswith("/contact/")]
+    printed = capsys.readouterr().out
+    assert force in printed
+    # Round-off of forces that shall be zero is no contact that opens.
+    assert "pulls" not in printed
+
+
 def test_the_scenario_as_run_gives_the_same_record(demo, tmp_path):
     folder, _, _ = demo
     path = folder / "scenario.yaml"

@@ -1,11 +1,14 @@
 """TrackingController as a Drake system."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 from arms import arm, consistent_states, law
 
-from drake_dae import TrackingController
-from drake_dae.errors import NonFiniteError, SingularityError
+from drake_dae import DaeSystem, TrackingController, TrackingLaw, poles
+from drake_dae.errors import NonFiniteError, NonMinimumPhaseWarning, SingularityError
 
 
 def controller(name="two_link"):
@@ -70,3 +73,22 @@ def test_an_input_that_is_not_finite_is_named():
     system.GetInputPort("reference").FixValue(context, np.zeros(4))
     with pytest.raises(NonFiniteError, match="input estimated_state is not finite at t = 0 s"):
         system.GetOutputPort("control").Eval(context)
+
+
+@pytest.mark.parametrize(("rate", "unstable"), [(0.7, True), (-0.7, False), (0.0, False)])
+def test_a_non_minimum_phase_system_is_named_so(rate, unstable):
+    """b' = rate b - a beside a' = u with output a: the zero dynamics have the pole `rate`."""
+    system = DaeSystem.from_functions(
+        ["a", "b"],
+        f=lambda x: [0, rate * x[1] - x[0]],
+        h=lambda x: [1, 0],
+        l=lambda x: [x[0]],
+        name="tank",
+    )
+    law = TrackingLaw(system, poles(-2.0))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        TrackingController(law)
+    assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
+    if unstable:
+        assert re.search(r"^tank: non-minimum phase: .* 0\.7 1/s", str(caught[0].message))

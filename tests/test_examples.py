@@ -26,6 +26,11 @@ CLAIMS = {
     "flexible_joints": (1e-7,),
     "dc_motors": (1e-9, 1e-4),
     "hydraulic_servos": (1e-7,),
+    "flexible_motors": (1e-5, 1e-6),
+    "drake_tools": (1e-6, 1e-4),
+    "section_two": (1e-12, 1e-9, 1e-10),
+    "unicycle": (1e-12,),
+    "quadruple_tank": (1e-12, 1e-12),
 }
 
 

@@ -69,6 +69,53 @@ def test_leibniz_rule():
         )
 
 
+def test_bracket_is_bilinear_over_numbers():
+    for _, (f, g, h), state, (a, b) in cases():
+        equal(
+            lie_bracket(a * f + b * g, h, X),
+            a * lie_bracket(f, h, X) + b * lie_bracket(g, h, X),
+            state,
+        )
+
+
+def test_chain_rule():
+    for (k, el), (f, _, _), state, _ in cases():
+        equal(
+            lie_derivative(ca.sin(k) * ca.exp(el / 10), f, X),
+            ca.cos(k) * ca.exp(el / 10) * lie_derivative(k, f, X)
+            + ca.sin(k) * ca.exp(el / 10) * lie_derivative(el, f, X) / 10,
+            state,
+        )
+
+
+def test_coordinates_do_not_matter():
+    """x = T(w): derivatives of k(T(w)) along T*f are those of k along f, brackets move along."""
+    # Triangular, so that the Jacobian has determinant 1 and a polynomial inverse.
+    bent = ca.vertcat(X[0], X[1] + X[0] ** 2, X[2] - X[0] * X[1], X[3] + X[2] ** 2)
+    jacobian = ca.jacobian(bent, X)
+
+    def moved(expression: ca.SX) -> ca.SX:
+        return ca.substitute(expression, X, bent)
+
+    def field_in_w(field: ca.SX) -> ca.SX:
+        return ca.solve(jacobian, moved(field))
+
+    for (k, _), (f, g, _), state, _ in cases():
+        equal(
+            lie_derivative(moved(k), field_in_w(f), X),
+            moved(lie_derivative(k, f, X)),
+            state,
+            # The inverse of the Jacobian, of condition 10, twice.
+            1e-10,
+        )
+        equal(
+            lie_bracket(field_in_w(f), field_in_w(g), X),
+            field_in_w(lie_bracket(f, g, X)),
+            state,
+            1e-10,
+        )
+
+
 def test_bracket_is_antisymmetric():
     for _, (f, g, _), state, _ in cases():
         equal(lie_bracket(f, g, X), -lie_bracket(g, f, X), state)

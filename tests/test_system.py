@@ -1,4 +1,4 @@
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 
 import casadi as ca
 import numpy as np
@@ -193,6 +193,10 @@ BAD_VALUES = {
     "a list of MX": (lambda x: [ca.MX.sym("a"), 0], "f must be a CasADi SX expression"),
     "NaN": (lambda x: [x[1], np.nan], "f holds a constant that is not finite"),
     "infinity": (lambda x: [x[1], ca.inf], "f holds a constant that is not finite"),
+    "NaN in a product": (
+        lambda x: [x[1], np.nan * x[0] + 1],
+        r"f holds a constant that is not finite, nan, in entry \[1, 0\] of shape \(2, 1\)",
+    ),
     "text": (lambda x: "x1", "f must be a CasADi SX expression.* got str"),
     "nothing": (lambda x: None, "function f returned nothing"),
     "rows of two lengths": (lambda x: [[1, 2], [3]], "lists of one length"),
@@ -207,6 +211,72 @@ def test_bad_expressions_are_refused(what):
     drift, message = BAD_VALUES[what]
     with pytest.raises(ModelError, match=message):
         double_integrator(f=drift)
+
+
+@pytest.mark.parametrize("key", "fghklm")
+def test_constants_that_are_not_finite_are_named_with_function_and_shape(key):
+    base = constrained()
+    expression = ca.SX(getattr(base, key))
+    row, column = expression.shape[0] - 1, expression.shape[1] - 1
+    expression[row, column] = ca.inf * base.state[0]
+    rows, columns = expression.shape
+    with pytest.raises(ModelError) as caught:
+        replace(base, **{key: expression})
+    assert f"{key} holds a constant that is not finite, inf, in entry [{row}, {column}] of" in str(
+        caught.value
+    )
+    assert f"of shape ({rows}, {columns})" in str(caught.value)
+
+
+NOT_SMOOTH = {
+    "fabs": lambda x: ca.fabs(x),
+    "sign": lambda x: x * ca.sign(x),
+    "fmin": lambda x: ca.fmin(x, 1),
+    "fmax": lambda x: ca.fmax(x, 0) ** 2,
+    "floor": lambda x: ca.floor(x),
+    "ceil": lambda x: ca.ceil(x),
+    "fmod": lambda x: ca.fmod(x, 2),
+    "if_else": lambda x: ca.if_else(x, x, 2.0),
+    "a comparison": lambda x: (x > 0) * x,
+    "copysign": lambda x: ca.copysign(1, x),
+    "remainder": lambda x: ca.remainder(x, 2),
+}
+
+
+@pytest.mark.parametrize("key", "fghklm")
+@pytest.mark.parametrize("what", NOT_SMOOTH)
+def test_functions_that_are_not_smooth_are_refused(key, what):
+    """In any function, in any entry, and inside others."""
+    base = constrained()
+    expression = ca.SX(getattr(base, key))
+    expression[-1] += ca.sin(NOT_SMOOTH[what](base.state[2] + 1) + 3)
+    with pytest.raises(ModelError) as caught:
+        replace(base, **{key: expression})
+    assert f"system: {key} is not smooth: it takes " in str(caught.value)
+    assert f"takes {what} of the state" in str(caught.value)
+    shape = getattr(base, key).shape
+    assert f"in entry [{shape[0] - 1}, {shape[1] - 1}] of shape {shape}" in str(caught.value)
+
+
+def test_kinks_in_parameters_alone_are_no_kinks():
+    system = double_integrator(
+        f=lambda x, p: [x[1], -ca.fabs(p.a) * x[0] + ca.if_else(p.a > 0, 1, 2)],
+        h=lambda x, p: [0, 1],
+        l=lambda x, p: x[0],
+        parameters={"a": -3.0},
+    )
+    np.testing.assert_array_equal(evaluated(system, "f", np.array([1.0, 0.0])), [[0.0], [-1.0]])
+
+
+def test_smooth_functions_are_taken():
+    """All that CasADi has; roots and arcs are smooth inside their domain."""
+    smooth = [
+        *(ca.sin, ca.cos, ca.tan, ca.exp, ca.log, ca.sqrt, ca.asin, ca.acos, ca.atan),
+        *(ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.acosh, ca.atanh, ca.erf),
+        *(lambda x: ca.atan2(x, 2), lambda x: x**3, lambda x: x**-1.5, lambda x: ca.hypot(x, 1)),
+    ]
+    for function in smooth:
+        double_integrator(f=lambda x, function=function: [x[1], function(x[0])])
 
 
 @pytest.mark.parametrize(

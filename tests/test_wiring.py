@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import arm, fixed_step, touching
+from arms import arm, fixed_step, law, touching
 
 from drake_dae import (
     DcMotors,
@@ -52,6 +52,24 @@ def test_a_sampled_loop_that_diverges_is_refused():
 def test_a_sensor_that_no_law_uses_is_refused():
     with pytest.raises(WiringError, match="takes no measured force"):
         rigid(ForceSensor(1, 0.01), measured=False)
+
+
+def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
+    with pytest.raises(
+        WiringError,
+        match=r"measures 2 forces, the plant 'two_link' has 1 \(wall.force\); .* ForceSensor\(1, ",
+    ):
+        rigid(ForceSensor(2, time_constant=0.01))
+
+
+def test_a_law_for_another_system_is_refused_with_both_sizes():
+    found = arm("two_link")
+    with pytest.raises(
+        WiringError,
+        match=r"for 'seven_joint' with 14 states, 7 controls and 1 constraints, the plant "
+        r"'two_link' has 4 states, 2 controls and 1 constraints\. .*TrackingLaw\(plant.dae",
+    ):
+        make_closed_loop(RobotPlant(found.model, found.structure), law("seven_joint"), REFERENCES)
 
 
 def test_behind_motors_the_force_may_be_connected_directly():

@@ -1,7 +1,7 @@
 """Traced expressions as fast functions of NumPy arrays."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isfinite
 
 import casadi as ca
@@ -80,6 +80,20 @@ class TracedFunction:
     def is_finite(self) -> bool:
         """Whether every output of the last call was finite."""
         return isfinite(self._check[0])
+
+    def derivative(self, output: int, inputs: Sequence[int]) -> "TracedFunction":
+        """The derivatives of an output with respect to some inputs, side by side."""
+        names = self.input_names
+        symbols = [ca.SX.sym(name, size) for name, size in zip(names, self.sizes, strict=True)]
+        value = ca.vec(self._function(*symbols)[output])
+        slope = ca.jacobian(value, ca.vertcat(*[symbols[i] for i in inputs]))
+        return TracedFunction(
+            f"{self.output_names[output]} of {self.name}, differentiated by "
+            + " and ".join(names[i] for i in inputs),
+            dict(zip(names, symbols, strict=True)),
+            {"slope": slope},
+            often=False,
+        )
 
     def __call__(self, *arguments: ArrayLike) -> tuple[FloatArray, ...]:
         """Calls the function and returns fresh arrays.

@@ -102,7 +102,7 @@ class Manifold:
                 break
             elif mended:
                 length /= 2.0
-            elif reach <= ROUND_OFF * max(1.0, float(np.linalg.norm(x))):
+            elif 0.0 < reach <= ROUND_OFF * max(1.0, float(np.linalg.norm(x))):
                 return x
             else:
                 # Where gradients depend on each other, QR gives no step, but least squares do.

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.manifold import Manifold, are_dependent
+from drake_dae.dae.region import ConsistentRegion, Region
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import AssumptionError, FloatArray, InconsistentStateError, ModelError
+from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
 
 ZERO = 1e-9
 """A sum of products below this, relative to the sizes of its terms, is zero."""
@@ -35,11 +37,18 @@ class Margin:
         relative: The same after rows and columns are scaled to about length one, by factors that
             are common to all states, so that units do not matter.
         state: Where `relative` is smallest, shape (n,).
+        vanishing_row: The row that is zero there; None if none is.
     """
 
     singular_value: float
     relative: float
     state: FloatArray
+    vanishing_row: int | None = None
+
+    @property
+    def is_singular(self) -> bool:
+        """Whether the rank is lost at `state`."""
+        return self.relative < SINGULAR
 
 
 class Fields:
@@ -68,6 +77,7 @@ class Samples:
         manifold: N*, or what is known of it.
         fields: Of the system.
         guesses: The nominal state first, shape (count, n).
+        region: Where the states must be; None for anywhere.
 
     Attributes:
         states: Shape (samples, n).
@@ -79,15 +89,22 @@ class Samples:
         ModelError: A function is not finite at the nominal state.
     """
 
-    def __init__(self, manifold: Manifold, fields: Fields, guesses: FloatArray) -> None:
+    def __init__(
+        self,
+        manifold: Manifold,
+        fields: Fields,
+        guesses: FloatArray,
+        region: Region | None = None,
+    ) -> None:
         self.manifold = manifold
         self.system = manifold.system
+        self._consistent = ConsistentRegion(manifold, region)
         self.fields: list[dict[str, FloatArray]] = []
         states: list[FloatArray] = []
         failure = None
         for number, guess in enumerate(guesses):
             try:
-                state = manifold.project(guess)
+                state = self._consistent.project(guess)
             except InconsistentStateError as error:
                 failure = failure or error
                 continue
@@ -180,59 +197,40 @@ class Samples:
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return all(are_dependent(gradient) for (gradient,) in gradients)
 
-    def margin(
-        self,
-        matrix: ca.SX,
-        rows: Sequence[str],
-        assumptions: tuple[int, int],
-        message: str,
-    ) -> Margin:
-        """The smallest singular values of a square matrix at the states and what lies between.
+    def margin(self, matrix: ca.SX, search: bool = False) -> Margin:
+        """The smallest singular values of a matrix at the states and at what lies between.
 
-        A determinant that changes its sign on the way from the first state is zero there, unless
-        N* has no way, or the determinant is infinite on it.
+        The determinant of a square matrix that changes its sign on the way from the first state is
+        zero there, unless N* has no way, or the determinant is infinite on it.
 
         Args:
-            matrix: Shape (k, k).
-            rows: What the rows belong to, for the message.
-            assumptions: The number that is violated if a whole row vanishes, and if not.
-            message: Of the second.
-
-        Raises:
-            AssumptionError: The matrix is singular somewhere.
+            matrix: Shape (k, l), k <= l.
+            search: Also go downhill from the worst states, in the region, or if there is none in
+                the box that the states span.
         """
-        function = traced(self.system, matrix=matrix)
-        matrices = [value for (value,) in self.values(matrix=matrix)]
-        row_scale, column_scale = _equilibration(np.mean(np.abs(matrices), axis=0))
-
-        def scaled(state: FloatArray) -> FloatArray:
-            value = _matrix(function(state, self.system.parameter_values)[0])
-            return value / row_scale[:, None] / column_scale
-
-        def distance(state: FloatArray) -> float:
-            return smallest_singular_value(scaled(state))
-
-        crossings = (self._crossing(scaled, there) for there in self.states[1:])
-        candidates = [*self.states, *(state for state in crossings if state is not None)]
-        state = min(candidates, key=distance)
-        if distance(state) >= SINGULAR:
-            value = min(smallest_singular_value(value) for value in matrices)
-            return Margin(value, distance(state), state)
+        scaled = _ScaledMatrix(self, matrix)
+        candidates = list(self.states)
+        if matrix.is_square():
+            crossings = (self._crossing(scaled, there) for there in self.states[1:])
+            candidates += [state for state in crossings if state is not None]
+        if search:
+            box = Region(self.states.min(axis=0), self.states.max(axis=0))
+            consistent = ConsistentRegion(self.manifold, self._consistent.region or box)
+            starts = sorted(candidates, key=scaled.distance)[:3]
+            candidates += [consistent.descend(scaled.slope, start) for start in starts]
+        state = min(candidates, key=scaled.distance)
         length = np.linalg.norm(scaled(state), axis=1)
-        if length.min() < SINGULAR:
-            raise AssumptionError(
-                f"the relative degree of {rows[int(np.argmin(length))]} is not defined at x = "
-                f"{show(state)}: the inputs act on that derivative around this state, but not "
-                "there. Keep away from this state, or choose another function",
-                assumptions[0],
-                state,
-            )
-        raise AssumptionError(
-            f"{message}. Smallest singular value {distance(state):.1e} (rows and columns scaled) "
-            f"at x = {show(state)}",
-            assumptions[1],
-            state,
+        return Margin(
+            singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
+            relative=scaled.distance(state),
+            state=state,
+            vanishing_row=int(np.argmin(length)) if length.min() < SINGULAR else None,
         )
+
+    def is_regular(self, matrix: ca.SX) -> bool:
+        """Whether a square matrix is regular at every state."""
+        scaled = _ScaledMatrix(self, matrix)
+        return all(scaled.distance(state) >= SINGULAR for state in self.states)
 
     def _crossing(
         self, matrix: Callable[[FloatArray], FloatArray], there: FloatArray
@@ -258,6 +256,47 @@ class Samples:
             else:
                 there = middle
         return here
+
+
+class _ScaledMatrix:
+    """A matrix of the state, rows and columns scaled to about length one over all samples."""
+
+    def __init__(self, samples: Samples, matrix: ca.SX) -> None:
+        self._matrix, self._system = matrix, samples.system
+        self._function = traced(samples.system, matrix=matrix)
+        sizes = np.mean([np.abs(value) for (value,) in samples.values(matrix=matrix)], axis=0)
+        self._rows, self._columns = _equilibration(sizes)
+
+    def plain(self, state: FloatArray) -> FloatArray:
+        """Not scaled."""
+        value = self._function(state, self._system.parameter_values)[0]
+        return value.reshape(self._matrix.shape)
+
+    def __call__(self, state: FloatArray) -> FloatArray:
+        return self.plain(state) / self._rows[:, None] / self._columns
+
+    def distance(self, state: FloatArray) -> float:
+        """The smallest singular value; infinite where the matrix is not finite."""
+        value = self(state)
+        return smallest_singular_value(value) if np.all(np.isfinite(value)) else np.inf
+
+    def slope(self, state: FloatArray) -> tuple[float, FloatArray]:
+        """The smallest singular value s and its gradient d(a' M b)/dx, where M b = s a."""
+        value = self(state)
+        if not np.all(np.isfinite(value)):
+            return np.inf, np.zeros(state.size)
+        left, values, right = np.linalg.svd(value, full_matrices=False)
+        a, b = left[:, -1] / self._rows, right[-1] / self._columns
+        gradient = self._gradient(state, a, b, self._system.parameter_values)[0]
+        return float(values[-1]), np.where(np.isfinite(gradient), gradient, 0.0)
+
+    @cached_property
+    def _gradient(self) -> TracedFunction:
+        x, (rows, columns) = self._system.state, self._matrix.shape
+        a, b = ca.SX.sym("a", rows), ca.SX.sym("b", columns)
+        inputs = {"x": x, "a": a, "b": b, "p": self._system.parameter_symbol}
+        product = ca.gradient(ca.bilin(self._matrix, a, b), x)
+        return TracedFunction(self._system.name, inputs, {"gradient": product}, often=False)
 
 
 def traced(system: DaeSystem, **expressions: ca.SX) -> TracedFunction:
@@ -298,7 +337,7 @@ def _positive(sizes: FloatArray) -> FloatArray:
 
 
 def smallest_singular_value(matrix: FloatArray) -> float:
-    """Of a square matrix."""
+    """Of a matrix with no more rows than columns."""
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 

@@ -1,5 +1,6 @@
 """What kind of system it is: relative degrees, index, Assumptions (1)-(5) with their margins."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -10,6 +11,7 @@ from drake_dae.dae.elimination import Elimination, affine, eliminate
 from drake_dae.dae.lie import lie_derivative, lie_derivative_along
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.motion import Motion
+from drake_dae.dae.region import Region
 from drake_dae.dae.samples import Fields, Margin, Samples, show
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
@@ -89,15 +91,30 @@ def find_structure(
         ModelError: No control input, a function that is not finite at the nominal state, or a mass
             matrix that is not symmetric and positive definite there.
     """
-    if system.num_controls == 0:
-        raise ModelError(f"{system.name}: no control inputs, so there is nothing to steer")
-    if system.num_constraints > system.num_states:
-        raise AssumptionError(
-            f"m = {system.num_constraints} constraints on n = {system.num_states} states depend "
-            "on each other; remove the redundant ones",
-            2,
-        )
-    _check_mass_matrix(system)
+    try:
+        structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
+        if violation:
+            raise violation
+    except AssumptionError as error:
+        error.system = system
+        raise
+    return structure
+
+
+def examine_structure(
+    system: DaeSystem, *, spread: ArrayLike = 0.1, count: int = 12, seed: int = 0
+) -> tuple[Structure, AssumptionError | None]:
+    """As `find_structure`, but complete also where B(x) is singular.
+
+    Returns:
+        The structure, and how B(x) violates Assumption (4) or (5); None if it does not.
+
+    Raises:
+        AssumptionError: A violation before there is a B(x): of Assumptions (1)-(3), or by an
+            output that has no degree.
+        InconsistentStateError, ModelError: As `find_structure`.
+    """
+    check_system(system)
     deviation = np.asarray(spread, dtype=float)
     if deviation.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviation)):
         raise ModelError(
@@ -108,34 +125,94 @@ def find_structure(
     guesses = system.nominal_state + deviation * np.vstack(
         [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
     )
+    constrained = examine_constraints(system, guesses)
+    violation = constraint_violation(system, constrained.margin)
+    if violation:
+        raise violation
+    structure = examine_outputs(constrained)
+    return structure, control_violation(system, structure.control_margin)
+
+
+def check_system(system: DaeSystem) -> None:
+    """Refuses what there is nothing to examine of.
+
+    Raises:
+        AssumptionError: More constraints than states.
+        ModelError: No control input, or a mass matrix that is not symmetric and positive definite.
+    """
+    if system.num_controls == 0:
+        raise ModelError(f"{system.name}: no control inputs, so there is nothing to steer")
+    _check_mass_matrix(system)
+    if system.num_constraints > system.num_states:
+        raise AssumptionError(
+            f"m = {system.num_constraints} constraints on n = {system.num_states} states depend "
+            "on each other; remove the redundant ones",
+            2,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Constrained:
+    """What the constraints alone decide, by Assumptions (1) and (3).
+
+    Attributes:
+        chains: Per constraint k_i, L_f k_i, ..., L_f^(r_i - 1) k_i.
+        samples: The consistent states at which numbers are decided.
+        motion: Time derivatives along the motion on N*.
+        elimination: (9)-(14); not finite where A(x) is singular.
+        margin: Of A(x); None without constraints.
+    """
+
+    chains: list[list[ca.SX]]
+    samples: Samples
+    motion: Motion
+    elimination: Elimination
+    margin: Margin | None
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """r_1, ..., r_m."""
+        return tuple(len(chain) for chain in self.chains)
+
+
+def examine_constraints(
+    system: DaeSystem, guesses: FloatArray, region: Region | None = None
+) -> Constrained:
+    """Finds r_1, ..., r_m and A(x) of a system that `check_system` takes.
+
+    Args:
+        system: (1)-(3).
+        guesses: States near which consistent ones are looked for, shape (count, n).
+        region: Where these must be.
+
+    Raises:
+        AssumptionError: (1), (3), or a constraint that no constraint input acts on. A singular A(x)
+            is left to `constraint_violation`.
+        InconsistentStateError, ModelError: As `find_structure`.
+    """
     fields = Fields(system.explicit)
-    chains = _constraint_chains(system.explicit, fields, guesses)
-    manifold = Manifold(system, chains)
-    samples = Samples(manifold, fields, guesses)
+    chains = _constraint_chains(system.explicit, fields, guesses, region)
+    samples = Samples(Manifold(system, chains), fields, guesses, region)
     motion = Motion(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(motion)
-    constraint_margin = None
-    if system.num_constraints:
-        constraint_margin = samples.margin(
-            elimination.constraint_matrix,
-            [f"constraint '{s.name}'" for s in system.constraint_output_signals],
-            (1, 2),
-            "A(x) of (2) loses rank: the constraints are redundant or their forces cannot act "
-            "independently. Remove a redundant constraint, or keep away from this state",
-        )
+    margin = samples.margin(elimination.constraint_matrix) if chains else None
+    return Constrained(chains, samples, motion, elimination, margin)
+
+
+def examine_outputs(constrained: Constrained) -> Structure:
+    """Finds mu_1, ..., mu_p and B(x), where A(x) is regular.
+
+    Raises:
+        AssumptionError: (4), or an output that no control acts on. A singular B(x) is left to
+            `control_violation`.
+        ModelError: A function that is not finite.
+    """
+    samples, motion, elimination = constrained.samples, constrained.motion, constrained.elimination
+    system = motion.system
     output_chains, drift, control_matrix, highest_derivatives = _output_chains(
         motion, elimination, samples
     )
     degrees = tuple(len(chain) for chain in output_chains)
-    control_margin = samples.margin(
-        control_matrix,
-        [f"output '{s.name}'" for s in system.output_signals],
-        (4, 5),
-        "B(x) of (16) is singular: the controlled outputs "
-        f"{', '.join(s.name for s in system.output_signals)} cannot be steered independently. An "
-        "output may repeat a constraint or another output; choose other outputs, or keep away "
-        "from this state",
-    )
     # Rows of n* that are zero but for round-off are no feedthrough.
     n_star = [
         ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
@@ -143,10 +220,10 @@ def find_structure(
     ]
     return Structure(
         system=system,
-        constraint_degrees=tuple(len(chain) for chain in chains),
+        constraint_degrees=constrained.degrees,
         output_degrees=degrees,
         output_order=tuple(sorted(range(len(degrees)), key=lambda i: degrees[i] == 0)),
-        manifold=manifold,
+        manifold=samples.manifold,
         motion=motion,
         elimination=replace(elimination, n_star=ca.vertcat(*n_star)),
         output_chains=output_chains,
@@ -154,8 +231,61 @@ def find_structure(
         control_matrix=control_matrix,
         highest_derivatives=highest_derivatives,
         states=samples.states,
-        constraint_margin=constraint_margin,
-        control_margin=control_margin,
+        constraint_margin=constrained.margin,
+        control_margin=samples.margin(control_matrix),
+    )
+
+
+def constraint_violation(system: DaeSystem, margin: Margin | None) -> AssumptionError | None:
+    """How a singular A(x) violates Assumption (1) or (2)."""
+    return _rank_violation(
+        margin,
+        [f"constraint '{s.name}'" for s in system.constraint_output_signals],
+        (1, 2),
+        "A(x) of (2) loses rank: the constraints are redundant or their forces cannot act "
+        "independently. Remove a redundant constraint, or keep away from this state",
+    )
+
+
+def control_violation(system: DaeSystem, margin: Margin) -> AssumptionError | None:
+    """How a singular B(x) violates Assumption (4) or (5)."""
+    return _rank_violation(
+        margin,
+        [f"output '{s.name}'" for s in system.output_signals],
+        (4, 5),
+        "B(x) of (16) is singular: the controlled outputs "
+        f"{', '.join(s.name for s in system.output_signals)} cannot be steered independently. An "
+        "output may repeat a constraint or another output; choose other outputs, or keep away "
+        "from this state",
+    )
+
+
+def _rank_violation(
+    margin: Margin | None, rows: Sequence[str], assumptions: tuple[int, int], message: str
+) -> AssumptionError | None:
+    """What a singular matrix violates.
+
+    Args:
+        margin: Of the matrix.
+        rows: What its rows belong to.
+        assumptions: The number that is violated if a whole row vanishes, and if not.
+        message: Of the second.
+    """
+    if margin is None or not margin.is_singular:
+        return None
+    if margin.vanishing_row is not None:
+        return AssumptionError(
+            f"the relative degree of {rows[margin.vanishing_row]} is not defined at x = "
+            f"{show(margin.state)}: the inputs act on that derivative around this state, but not "
+            "there. Keep away from this state, or choose another function",
+            assumptions[0],
+            margin.state,
+        )
+    return AssumptionError(
+        f"{message}. Smallest singular value {margin.relative:.1e} (rows and columns scaled) at "
+        f"x = {show(margin.state)}",
+        assumptions[1],
+        margin.state,
     )
 
 
@@ -175,7 +305,9 @@ def _check_mass_matrix(system: DaeSystem) -> None:
     )
 
 
-def _constraint_chains(system: DaeSystem, fields: Fields, guesses: FloatArray) -> list[list[ca.SX]]:
+def _constraint_chains(
+    system: DaeSystem, fields: Fields, guesses: FloatArray, region: Region | None
+) -> list[list[ca.SX]]:
     """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i by Assumptions (1) and (3)."""
     x = system.state
     chains = [[system.k[i]] for i in range(system.num_constraints)]
@@ -184,7 +316,7 @@ def _constraint_chains(system: DaeSystem, fields: Fields, guesses: FloatArray) -
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, system.g, x)
         by_control = lie_derivative_along(last, system.h, x)
-        samples = Samples(Manifold(system, chains), fields, guesses)
+        samples = Samples(Manifold(system, chains), fields, guesses, region)
         force_acts = samples.acts(by_force, last, samples.field("g"))
         control_acts = samples.acts(by_control, last, samples.field("h"))
         still, stuck = [], []

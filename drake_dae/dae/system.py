@@ -123,8 +123,9 @@ class DaeSystem:
             operations than the expressions above: for a robot it is inverse dynamics.
 
     Raises:
-        ModelError: A shape that does not fit, a symbol that is neither state nor parameter, or
-            names or symbols that are not unique.
+        ModelError: A shape that does not fit, a symbol that is neither state nor parameter, names
+            or symbols that are not unique, a constant that is not finite, or a function that is not
+            smooth in the state, such as fabs.
     """
 
     state: ca.SX
@@ -200,6 +201,7 @@ class DaeSystem:
                     "state nor a parameter; pass it in 'parameters' or put its number in"
                 )
             put(key, ca.sparsify(value))  # Zeros of an array are structural, too.
+        _check_operations(self, list(shapes))
         sizes = (
             ("state_signals", n, "x"),
             ("constraint_input_signals", constraints, "v"),
@@ -376,10 +378,66 @@ def _expression(key: str, value: Any, owner: str) -> ca.SX:
             f"{owner}: {key} must be a CasADi SX expression, an array, or a list of these (of "
             f"lists of one length for a matrix), got {type(value).__name__}"
         ) from error
-    constant = [float(e) for e in result.nonzeros() if e.is_constant()]
-    if not np.all(np.isfinite(constant)):
-        raise ModelError(f"{owner}: {key} holds a constant that is not finite: {result}")
     return result
+
+
+_KINKS = {
+    ca.OP_FABS: "fabs",
+    ca.OP_SIGN: "sign",
+    ca.OP_COPYSIGN: "copysign",
+    ca.OP_FMIN: "fmin",
+    ca.OP_FMAX: "fmax",
+    ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceil",
+    ca.OP_FMOD: "fmod",
+    ca.OP_REMAINDER: "remainder",
+    ca.OP_IF_ELSE_ZERO: "if_else",
+    **dict.fromkeys((ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE), "a comparison"),
+}
+"""Operations of CasADi that are not smooth."""
+
+
+def _check_operations(system: DaeSystem, keys: Sequence[str]) -> None:
+    """Refuses what evaluates without complaint, but makes no sense in (1)-(3)."""
+    expressions = [getattr(system, key) for key in keys]
+    if _unfit(system, ca.veccat(*expressions)) is None:
+        return
+    for key, expression in zip(keys, expressions, strict=True):
+        for row, column in zip(*expression.sparsity().get_triplet(), strict=True):
+            message = _unfit(system, expression[row, column])
+            if message:
+                raise ModelError(
+                    f"{system.name}: {key} {message}, in entry [{row}, {column}] of shape "
+                    f"{expression.shape}"
+                )
+
+
+def _unfit(system: DaeSystem, expression: ca.SX) -> str | None:
+    """A constant that is not finite, or an operation on the state that is not smooth."""
+    function = ca.Function("f", [system.state, system.parameter_symbol], [expression])
+    moving: dict[int, bool] = {}  # Whether what stands in a place of the work vector has x in it.
+    for i in range(function.n_instructions()):
+        operation = function.instruction_id(i)
+        if operation == ca.OP_OUTPUT:
+            continue
+        inputs = function.instruction_input(i)
+        moves = False
+        if operation == ca.OP_CONST:
+            value = function.instruction_constant(i)
+            if not np.isfinite(value):
+                return f"holds a constant that is not finite, {value}"
+        elif operation == ca.OP_INPUT:
+            moves = inputs[0] == 0
+        else:
+            moves = any(moving[place] for place in inputs)
+            if moves and operation in _KINKS:
+                return (
+                    f"is not smooth: it takes {_KINKS[operation]} of the state. Lie derivatives "
+                    "would be those of one side without notice; write the side on which the state "
+                    "stays, or a smooth function such as tanh(x / e) or sqrt(x**2 + e**2)"
+                )
+        moving[function.instruction_output(i)[0]] = moves
+    return None
 
 
 def _is_symbol(value: Any) -> bool:

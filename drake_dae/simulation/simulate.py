@@ -84,7 +84,6 @@ def simulate(
     context.SetAccuracy(config.accuracy)
     start = context.get_time()
     with _interrupt_flag() as interrupted, _Progress(duration, progress) as shown:
-
         pace = _Pace(start, duration)
 
         def monitor(current: Context) -> EventStatus:
@@ -193,8 +192,8 @@ class _Pace:
         if time - before < self._least:
             state = context.get_continuous_state_vector().CopyToVector()
             raise SimulationError(
-                f"the last {self.STEPS} steps led from t = {before:.9g} s only to {time:.9g} s: the "
-                f"state grows without bound, or jumps. State: "
+                f"the last {self.STEPS} steps led from t = {before:.9g} s only to {time:.9g} s: "
+                "the state grows without bound, or jumps. State: "
                 f"{np.array2string(state, precision=4, separator=', ')}. Look at the gains and at "
                 "what the model has wrong; where that is in order, choose a fixed step",
                 time,

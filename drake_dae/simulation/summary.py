@@ -5,7 +5,10 @@ from typing import Self
 
 import numpy as np
 
+from drake_dae.dae.system import Signal
+from drake_dae.dae.tables import Table
 from drake_dae.errors import FloatArray
+from drake_dae.robots.constraints import PointOnSurface
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
@@ -21,20 +24,30 @@ class Limits:
     Attributes:
         control: Largest |u|, shape (p,).
         state: Lowest and highest (q, v), shape (nq + nv,) each.
+        pushing: Names of the constraint forces that can only push; of all if None.
     """
 
     control: FloatArray | None = None
     state: tuple[FloatArray, FloatArray] | None = None
+    pushing: frozenset[str] | None = None
+
+    def can_pull(self, force: Signal) -> bool:
+        """Whether a constraint force may be negative."""
+        return self.pushing is not None and force.name not in self.pushing
 
     @classmethod
     def of(cls, model: RobotModel) -> Self:
         """Those of a robot: of what drives it, and of its joints."""
-        links, state = model.links, None
-        if hasattr(links, "position_limits") and hasattr(links, "velocity_limits"):
-            pairs = zip(links.position_limits, links.velocity_limits, strict=True)
-            lower, upper = (np.concatenate(pair) for pair in pairs)
-            state = (lower, upper)
-        return cls(model.control_limits, state)
+        pairs = zip(model.links.position_limits, model.links.velocity_limits, strict=True)
+        lower, upper = (np.concatenate(pair) for pair in pairs)
+        state = (lower, upper) if np.any(np.isfinite([lower, upper])) else None
+        pushing = {
+            signal.name
+            for constraint in model.constraints
+            if isinstance(constraint, PointOnSurface)
+            for signal in constraint.force_signals
+        }
+        return cls(model.control_limits, state, frozenset(pushing))
 
 
 def summary(
@@ -54,7 +67,7 @@ def summary(
         failure: Why it failed.
     """
     limits = limits or Limits()
-    sections = [_errors(record, predicted), _forces(record), _controls(record, limits)]
+    sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     notes = [f"constraint residual  {residual:.2g} at most, before each step's projection"]
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
@@ -72,7 +85,7 @@ def summary(
 
 def _errors(record: Record, predicted: FloatArray) -> list[str]:
     signals = record.signals["tracking_error"].signals
-    return _table(
+    return Table(
         ["tracking error", "unit", "start", "largest", "final", "off prediction by"],
         [
             [
@@ -87,14 +100,15 @@ def _errors(record: Record, predicted: FloatArray) -> list[str]:
                 signals, record["tracking_error"].T, predicted.T, strict=True
             )
         ],
-    )
+        left=2,
+    ).lines()
 
 
-def _forces(record: Record) -> list[str]:
+def _forces(record: Record, limits: Limits) -> list[str]:
     forces = record.signals["constraint_force"]
     if not forces.signals:
         return []
-    return _table(
+    return Table(
         ["constraint force", "unit", "least", "largest", ""],
         [
             [
@@ -102,17 +116,20 @@ def _forces(record: Record) -> list[str]:
                 signal.unit or "1",
                 f"{np.min(values):.4g}",
                 f"{np.max(values):.4g}",
-                "pulls: a real contact would open" if np.min(values) < 0 else "",
+                "pulls: a real contact would open"
+                if np.min(values) < 0.0 and not limits.can_pull(signal)
+                else "",
             ]
             for signal, values in zip(forces.signals, forces.values.T, strict=True)
         ],
-    )
+        left=2,
+    ).lines()
 
 
 def _controls(record: Record, limits: Limits) -> list[str]:
     controls = record.signals["control"]
     largest = np.full(len(controls.signals), np.inf) if limits.control is None else limits.control
-    return _table(
+    return Table(
         ["control", "unit", "least", "largest", "limit", ""],
         [
             [
@@ -127,7 +144,8 @@ def _controls(record: Record, limits: Limits) -> list[str]:
                 controls.signals, controls.values.T, largest, strict=True
             )
         ],
-    )
+        left=2,
+    ).lines()
 
 
 def _beyond(record: Record, limits: Limits) -> list[str]:
@@ -141,16 +159,4 @@ def _beyond(record: Record, limits: Limits) -> list[str]:
         f"its limits are {lower:.4g} and {upper:.4g}"
         for signal, values, lower, upper in rows
         if np.min(values) < lower - _SLACK or np.max(values) > upper + _SLACK
-    ]
-
-
-def _table(head: list[str], rows: list[list[str]]) -> list[str]:
-    """Columns as wide as they must be: names and notes to the left, numbers to the right."""
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    return [
-        "  ".join(
-            text.ljust(width) if i < 2 or not head[i] else text.rjust(width)
-            for i, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in [head, *rows]
     ]

@@ -1,12 +1,21 @@
 """The tracking law as a LeafSystem."""
 
+import warnings
+
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.errors import FloatArray, NonFiniteError, SingularityError
+from drake_dae.dae.zero_dynamics import Verdict, ZeroDynamics
+from drake_dae.errors import (
+    FloatArray,
+    NonFiniteError,
+    NonMinimumPhaseWarning,
+    SimulationError,
+    SingularityError,
+)
+from drake_dae.systems.autodiff import SINGULAR, Formula, TracedFormula
 from drake_dae.systems.parameters import ParameterizedSystem
-from drake_dae.systems.plant import SINGULAR
 
 
 class TrackingController(ParameterizedSystem):
@@ -22,7 +31,10 @@ class TrackingController(ParameterizedSystem):
         tracking_error: e = z - r (29) by the controller's own model, shape (p,).
 
     Both outputs feed through from all inputs. The context holds the model's parameters and then
-    the gains K (its nonzeros, column by column) as one numeric parameter.
+    the gains K (its nonzeros, column by column) as one numeric parameter. Converts to AutoDiffXd.
+
+    Warns:
+        NonMinimumPhaseWarning: The zero dynamics (35) are unstable about the nominal equilibrium.
 
     Raises:
         SingularityError, NonFiniteError: During a simulation, with time and state.
@@ -30,16 +42,22 @@ class TrackingController(ParameterizedSystem):
 
     def __init__(self, law: TrackingLaw) -> None:
         super().__init__(law.system, law.parameter_values())
+        if law.structure.zero_dynamics_dimension:
+            stability = ZeroDynamics(law.structure).stability(law.structure.states[0])
+            if stability.verdict is Verdict.UNSTABLE:
+                warnings.warn(
+                    f"{law.system.name}: {stability.reason}. The outputs follow the reference "
+                    "while other states, or the control, run off; choose other outputs",
+                    NonMinimumPhaseWarning,
+                    stacklevel=2,
+                )
         self.law = law
         self.set_name("tracking_controller")
         dae = law.system
-        self._state_port = self.DeclareVectorInputPort("estimated_state", dae.num_states)
-        self._reference_port = self.DeclareVectorInputPort("reference", len(law.reference_signals))
-        self._measured_ports = []
+        sizes = {"estimated_state": dae.num_states, "reference": len(law.reference_signals)}
         if law.measured_force:
-            self._measured_ports = [
-                self.DeclareVectorInputPort("measured_force", dae.num_constraints)
-            ]
+            sizes["measured_force"] = dae.num_constraints
+        self._input_ports = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         self.DeclareVectorOutputPort("control", dae.num_controls, self._calc_control, sources)
         self.DeclareVectorOutputPort(
@@ -54,27 +72,37 @@ class TrackingController(ParameterizedSystem):
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
         function = self.law.function
-        state = self._state_port.Eval(context)
-        values = function.evaluate(
-            state,
-            self._reference_port.Eval(context),
-            *[port.Eval(context) for port in self._measured_ports],
-            context.get_numeric_parameter(0).value(),
-        )
+        arguments = [port.Eval(context) for port in self._input_ports]
+        arguments.append(context.get_numeric_parameter(0).value())
+        values = function.evaluate(*arguments)
         if function.is_finite and values[2][0] >= SINGULAR:
             return values
-        time = context.get_time()
+        raise self._failure(context.get_time(), *arguments)
+
+    def _failure(self, time: float, state: FloatArray, *others: FloatArray) -> SimulationError:
         where = f"at t = {time:.6g} s, state {np.array2string(state, precision=4, separator=', ')}"
-        ports = [self._state_port, self._reference_port, *self._measured_ports]
-        bad = [port.get_name() for port in ports if not np.all(np.isfinite(port.Eval(context)))]
+        inputs = (state, *others[:-1])  # The last are the parameters.
+        bad = [
+            port.get_name()
+            for port, value in zip(self._input_ports, inputs, strict=True)
+            if not np.all(np.isfinite(value))
+        ]
         if bad:
-            raise NonFiniteError(
+            return NonFiniteError(
                 f"the controller's input {', '.join(bad)} is not finite {where}", time, state
             )
-        raise SingularityError(
+        return SingularityError(
             f"A(x) or B(x) of Assumptions (2), (5) is singular {where}: the outputs "
             f"{', '.join(s.name for s in self.law.system.output_signals)} cannot be steered "
             "independently there. Keep the reference away from it, or choose other outputs",
             time,
             state,
         )
+
+    def _formulas(self) -> dict[str, Formula]:
+        function = self.law.function
+        sources = ["estimated_state", *function.input_names[1:]]
+        return {
+            name: TracedFormula(function, name, sources, self._failure)
+            for name in ("control", "tracking_error")
+        }

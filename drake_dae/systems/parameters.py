@@ -2,13 +2,14 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import FloatArray, ModelError
+from drake_dae.systems.autodiff import DifferentiableSystem
 
 
-class ParameterizedSystem(LeafSystem):
+class ParameterizedSystem(DifferentiableSystem):
     """A LeafSystem whose numeric parameter 0 starts with all parameters of a DaeSystem.
 
     So a study changes numbers in a context without tracing again, and a controller can be given

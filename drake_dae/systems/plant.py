@@ -1,5 +1,7 @@
 """Any DaeSystem as a LeafSystem."""
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,10 +25,8 @@ from drake_dae.errors import (
     SimulationError,
     SingularityError,
 )
+from drake_dae.systems.autodiff import SINGULAR, Formula, TracedFormula
 from drake_dae.systems.parameters import ParameterizedSystem
-
-SINGULAR = 1e-12
-"""Below this sine between columns a matrix counts as singular; see `expressions.Factorization`."""
 
 
 class DaePlant(ParameterizedSystem):
@@ -51,6 +51,8 @@ class DaePlant(ParameterizedSystem):
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
     The default state is the consistent one next to `system.nominal_state`.
 
+    Converts to AutoDiffXd, for Drake's Linearize and DirectCollocation; without the projection.
+
     Args:
         system: The system, or its structure if that is known already.
         project: False leaves the drift off N* uncorrected, to study it.
@@ -70,24 +72,20 @@ class DaePlant(ParameterizedSystem):
         control = motion.control
         force = motion.expand(motion.constraint_input)
         x, p = dae.state, dae.parameter_symbol
-        inputs = {"state": x, "control": control, "parameters": p}
-        self.dynamics = TracedFunction(
-            f"{dae.name} dynamics",
-            inputs,
-            {
-                "derivative": motion.expand(motion.rate),
-                "pivot": elimination.pivot,
-            },
-        )
-        self._force = TracedFunction(
-            f"{dae.name} constraint force", inputs, {"force": force, "pivot": elimination.pivot}
-        )
-        self._output = TracedFunction(
-            f"{dae.name} controlled output",
-            inputs,
-            {"output": dae.l + ca.mtimes(dae.m, force), "pivot": elimination.pivot},
-        )
-        self._no_control = np.zeros(dae.num_controls)
+
+        def traced(name: str, needs_control: bool, value: ca.SX) -> TracedFunction:
+            inputs = {"state": x, "control": control, "parameters": p}
+            if not needs_control:
+                value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(dae.num_controls))
+            outputs = {"value": value, "pivot": elimination.pivot}
+            return TracedFunction(f"{dae.name} {name}", inputs, outputs)
+
+        self._force_needs_control = elimination.beta.nnz() > 0
+        self._output_needs_control = elimination.n_star.nnz() > 0
+        self.dynamics = traced("dynamics", True, motion.expand(motion.rate))
+        self._force = traced("constraint force", self._force_needs_control, force)
+        output = dae.l + ca.mtimes(dae.m, force)
+        self._output = traced("controlled output", self._output_needs_control, output)
 
         state_index = self.DeclareContinuousState(
             BasicVector(structure.manifold.project(dae.nominal_state))
@@ -95,8 +93,6 @@ class DaePlant(ParameterizedSystem):
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
         by_state = {self.xc_ticket(), self.all_parameters_ticket()}
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
-        self._force_needs_control = elimination.beta.nnz() > 0
-        self._output_needs_control = elimination.n_star.nnz() > 0
         self.DeclareStateOutputPort("state", state_index)
         self.DeclareVectorOutputPort(
             "constraint_force",
@@ -152,26 +148,65 @@ class DaePlant(ParameterizedSystem):
         derivatives.get_mutable_vector().SetFromVector(value)
 
     def _evaluate(
-        self, function: TracedFunction, context: Context, control: FloatArray
+        self, function: TracedFunction, context: Context, control: FloatArray | None
     ) -> FloatArray:
         x = context.get_continuous_state_vector().CopyToVector()
         p = context.get_numeric_parameter(0).value()
-        value, pivot = function.evaluate(x, control, p)
-        if not function.is_finite:
-            raise _failure(function, context, x, control, self.dae)
-        if pivot[0] < SINGULAR:
-            raise SingularityError(
-                f"{self.dae.name}: A(x) of Assumption (2) is singular at t = "
-                f"{context.get_time():.6g} s, so the constraint forces are not determined: the "
-                "constraints depend on each other there. State: "
-                f"{np.array2string(x, precision=4, separator=', ')}",
-                context.get_time(),
-                x,
-            )
+        arguments = (x, p) if control is None else (x, control, p)
+        value, pivot = function.evaluate(*arguments)
+        if not function.is_finite or pivot[0] < SINGULAR:
+            raise self._failure(function, context.get_time(), *arguments)
         return value
 
-    def _control(self, context: Context, needed: bool) -> FloatArray:
-        return self._control_port.Eval(context) if needed else self._no_control
+    def _failure(
+        self, function: TracedFunction, time: float, state: FloatArray, *others: FloatArray
+    ) -> SimulationError:
+        """Names the input that was not finite, or the function, or else A(x)."""
+        where = f"State: {np.array2string(state, precision=4, separator=', ')}"
+        if function.is_finite:
+            return SingularityError(
+                f"{self.dae.name}: A(x) of Assumption (2) is singular at t = {time:.6g} s, so the "
+                "constraint forces are not determined: the constraints depend on each other "
+                f"there. {where}",
+                time,
+                state,
+            )
+        named = list(zip(self.dae.state_signals, state, strict=True))
+        if "control" in function.input_names:
+            named = [*zip(self.dae.control_signals, others[0], strict=True), *named]
+        bad = [signal.name for signal, value in named if not np.isfinite(value)]
+        reason = (
+            f"its input {', '.join(bad)} is not finite"
+            if bad
+            else "a singular A(x), or a function left its domain"
+        )
+        return NonFiniteError(
+            f"{function.name} is not finite at t = {time:.6g} s: {reason}. {where}", time, state
+        )
+
+    def _formulas(self) -> dict[str, Formula]:
+        dae = self.dae
+        by_state = {"state": dae.state, "parameters": dae.parameter_symbol}
+        identity = TracedFunction(f"{dae.name} state", {"state": dae.state}, {"value": dae.state})
+        residual = TracedFunction(
+            f"{dae.name} residual",
+            by_state,
+            {"value": self.structure.manifold.residual_expression},
+        )
+
+        def checked(function: TracedFunction) -> TracedFormula:
+            return TracedFormula(function, "value", failure=partial(self._failure, function))
+
+        return {
+            "derivative": checked(self.dynamics),
+            "state": TracedFormula(identity, "value"),
+            "constraint_force": checked(self._force),
+            "constraint_residual": TracedFormula(residual, "value"),
+            "controlled_output": checked(self._output),
+        }
+
+    def _control(self, context: Context, needed: bool) -> FloatArray | None:
+        return self._control_port.Eval(context) if needed else None
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         control = self._control(context, self._force_needs_control)
@@ -216,26 +251,3 @@ class DaePlant(ParameterizedSystem):
             ) from error
         state.get_mutable_continuous_state().SetFromVector(x)
         return EventStatus.Succeeded()
-
-
-def _failure(
-    function: TracedFunction,
-    context: Context,
-    state: FloatArray,
-    control: FloatArray,
-    dae: DaeSystem,
-) -> NonFiniteError:
-    """Names the input that was not finite, or else the function."""
-    bad = [s.name for s, v in zip(dae.control_signals, control, strict=True) if not np.isfinite(v)]
-    bad += [s.name for s, v in zip(dae.state_signals, state, strict=True) if not np.isfinite(v)]
-    reason = (
-        f"its input {', '.join(bad)} is not finite"
-        if bad
-        else "a singular A(x), or a function left its domain"
-    )
-    return NonFiniteError(
-        f"{function.name} is not finite at t = {context.get_time():.6g} s: {reason}. State: "
-        f"{np.array2string(state, precision=4, separator=', ')}",
-        context.get_time(),
-        state,
-    )

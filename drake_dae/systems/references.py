@@ -1,6 +1,7 @@
 """References with all the derivatives that a tracking law asks for."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from itertools import pairwise
 from math import comb
 from typing import Any, Protocol
@@ -8,11 +9,12 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.errors import FloatArray, NonFiniteError, ReferenceSignalError
+from drake_dae.systems.autodiff import DifferentiableSystem, Formula
 
 
 class ReferenceSignal(Protocol):
@@ -244,7 +246,7 @@ class TrajectorySignal:
                         )
 
 
-class ReferenceGenerator(LeafSystem):
+class ReferenceGenerator(DifferentiableSystem):
     """References of all outputs, stacked, with their derivatives.
 
     Output port:
@@ -254,6 +256,8 @@ class ReferenceGenerator(LeafSystem):
     Args:
         signals: One below the other; together they cover all outputs.
         degrees: mu_1, ..., mu_p, as `TrackingLaw.degrees`.
+
+    Converts to AutoDiffXd. A time that has derivatives itself asks each signal for one more.
 
     Raises:
         ReferenceSignalError: Signals that cover too few or too many outputs, or that are not
@@ -269,6 +273,7 @@ class ReferenceGenerator(LeafSystem):
             raise ReferenceSignalError(
                 f"the references cover {covered} outputs, the law has {len(degrees)}"
             )
+        self._signals, self._degrees = tuple(signals), tuple(degrees)
         self._evaluate = _stack(signals, degrees)
         self.DeclareVectorOutputPort(
             "reference",
@@ -283,6 +288,31 @@ class ReferenceGenerator(LeafSystem):
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(context.get_time()))
+
+    def _formulas(self) -> dict[str, Formula]:
+        return {"reference": _ReferenceFormula(self._signals, self._degrees)}
+
+
+class _ReferenceFormula:
+    """R(t); its derivative by the time needs one more derivative of each signal."""
+
+    sources = ("time",)
+
+    def __init__(self, signals: Sequence[ReferenceSignal], degrees: Sequence[int]) -> None:
+        self._evaluate = _stack(signals, degrees)
+        self._signals, self._degrees = signals, degrees
+
+    def value(self, time: float, *arguments: FloatArray) -> FloatArray:
+        return self._evaluate(time).copy()
+
+    @cached_property
+    def _higher(self) -> Callable[[float], FloatArray]:
+        return _stack(self._signals, [degree + 1 for degree in self._degrees])
+
+    def slope(self, moving: tuple[int, ...], time: float, *arguments: FloatArray) -> FloatArray:
+        ends = np.cumsum([degree + 2 for degree in self._degrees])
+        parts = [part[1:] for part in np.split(self._higher(time), ends[:-1])]
+        return np.concatenate(parts)[:, None]
 
 
 def _stack(

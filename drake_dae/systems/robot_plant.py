@@ -7,6 +7,7 @@ from pydrake.systems.framework import BasicVector, Context
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.structure import Structure
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.autodiff import Formula, TracedFormula
 from drake_dae.systems.plant import DaePlant
 
 
@@ -41,6 +42,7 @@ class RobotPlant(DaePlant):
             for name, part in stage.ports.items():
                 parts[name] = slice(start + part.start, start + part.stop)
             start += stage.state.numel()
+        self._parts = parts
         for name, part in parts.items():
             self.DeclareVectorOutputPort(
                 name,
@@ -66,3 +68,13 @@ class RobotPlant(DaePlant):
 
     def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._joint_force(self.state(context), self.parameters(context))[0])
+
+    def _formulas(self) -> dict[str, Formula]:
+        state = self.dae.state
+        formulas = super()._formulas()
+        for name, part in self._parts.items():
+            function = TracedFunction(name, {"state": state}, {"value": state[part]})
+            formulas[name] = TracedFormula(function, "value")
+        if self.model.joint_force is not None:
+            formulas["joint_torque"] = TracedFormula(self._joint_force, "joint_torque")
+        return formulas

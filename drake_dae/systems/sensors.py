@@ -1,20 +1,23 @@
 """Measured contact forces."""
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, ContinuousState, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
+from drake_dae.dae.expressions import TracedFunction
 from drake_dae.errors import FloatArray, ModelError
+from drake_dae.systems.autodiff import DifferentiableSystem, Formula, TracedFormula
 
 
-class ForceSensor(LeafSystem):
+class ForceSensor(DifferentiableSystem):
     """A force sensor with state, so that it can stand in a loop with a rigid robot:
 
         time_constant * y' = force - y,    measured_force = y + bias + noise_deviation * noise,
 
     and, if it samples, measured_force is held between samples. With rigid joints the constraint
     force depends on the control in the same instant; a controller that read it directly would close
-    an algebraic loop.
+    an algebraic loop. Without sampling it converts to AutoDiffXd.
 
     Input ports:
         force: Shape (m,), N (N m).
@@ -125,3 +128,26 @@ class ForceSensor(LeafSystem):
             output.SetFromVector(context.get_discrete_state(self._held).value())
         else:
             output.SetFromVector(self._felt(context))
+
+    def _formulas(self) -> dict[str, Formula]:
+        if self.sample_period:
+            raise ModelError(
+                f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has "
+                "no derivative by the time. Give it a time_constant alone"
+            )
+        size = self._force_port.size()
+        force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
+        rate = TracedFunction(
+            "force sensor",
+            {"force": force, "state": felt},
+            {"value": (force - felt) / self.time_constant},
+        )
+        inputs, measured = {"state": felt}, felt
+        if self._noise_port is not None:
+            inputs["noise"] = noise
+            measured = measured + self._deviation * noise
+        output = TracedFunction("measured force", inputs, {"value": measured + self._bias})
+        return {
+            "derivative": TracedFormula(rate, "value"),
+            "measured_force": TracedFormula(output, "value"),
+        }

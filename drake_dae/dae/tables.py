@@ -1,0 +1,76 @@
+"""Tables and paragraphs as plain text and as Markdown."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from textwrap import fill
+
+_WIDTH = 100
+"""Of a paragraph, in characters."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of text: the first `left` ones and those without a head to the left, others right.
+
+    Attributes:
+        head: A title per column.
+        rows: As many texts each.
+        left: How many columns begin at the left.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: int = 1
+
+    def _is_left(self, column: int) -> bool:
+        return column < self.left or not self.head[column]
+
+    def lines(self) -> list[str]:
+        """Columns as wide as they must be."""
+        rows = [self.head, *self.rows]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
+        return [
+            "  ".join(
+                text.ljust(width) if self._is_left(i) else text.rjust(width)
+                for i, (text, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in rows
+        ]
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def to_markdown(self) -> str:
+        """For notebooks and GitHub."""
+        marks = [":--" if self._is_left(i) else "--:" for i in range(len(self.head))]
+        rows = [self.head, marks, *self.rows]
+        return "\n".join("| " + " | ".join(t.replace("|", "\\|") for t in r) + " |" for r in rows)
+
+
+def digits(value: float) -> str:
+    """Four digits; what is only round-off of numbers that people use is 0."""
+    return f"{value:.4g}" if abs(value) > 1e-12 else "0"
+
+
+Part = Table | Sequence[str]
+"""A table, or the lines of a paragraph."""
+
+
+def to_text(parts: Sequence[Part]) -> str:
+    """One below the other; long lines of paragraphs are wrapped."""
+
+    def text(part: Part) -> str:
+        if isinstance(part, Table):
+            return str(part)
+        return "\n".join(
+            fill(line, _WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in part
+        )
+
+    return "\n\n".join(map(text, parts))
+
+
+def to_markdown(parts: Sequence[Part]) -> str:
+    """One below the other."""
+    return "\n\n".join(
+        part.to_markdown() if isinstance(part, Table) else "  \n".join(part) for part in parts
+    )
