@@ -7,7 +7,7 @@ from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.motion import Motion
 from drake_dae.dae.structure import find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system import DaeSystem, Parameter
 from drake_dae.errors import ModelError
 
 
@@ -166,3 +166,38 @@ def test_the_motion_may_be_given_in_fewer_operations():
     for wrong in wrongs:
         with pytest.raises(ModelError, match="'motion' is not"):
             find_structure(with_inertia(arm, motion=wrong))
+
+
+def test_what_is_symmetric_at_the_default_parameters_alone_is_not_taken_as_symmetric():
+    """c = k' has the gradient g^T only for s = 1; the law and the motion hold for s = 2, too."""
+    x, scale = ca.SX.sym("x", 4), Parameter("s", 1.0)
+    place, speed = x[:2], x[2:]
+    system = DaeSystem(
+        state=x,
+        f=ca.vertcat(speed, 0, -9.81),
+        g=ca.vertcat(0, 0, 2 * scale.symbol * place[0], 2 * place[1]),
+        h=ca.vertcat(0, 0, 1, 0),
+        k=ca.dot(place, place) - 1,
+        l=place[0],
+        m=[0],
+        parameters=(scale,),
+        nominal_state=[0.6, -0.8, 0.0, 0.0],
+    )
+    structure = find_structure(system)
+    motion = structure.motion
+    function = TracedFunction(
+        "motion",
+        {"x": x, "u": motion.control, "s": scale.symbol},
+        {"rate": motion.expand(motion.rate)},
+    )
+    rng = np.random.default_rng(0)
+    for factor in (1.0, 2.0):
+        angle, rate, u = rng.normal(size=3)
+        place_now = np.array([np.sin(angle), -np.cos(angle)])
+        speed_now = rate * np.array([np.cos(angle), np.sin(angle)])
+        gradient = 2 * place_now
+        force = gradient * [factor, 1.0]
+        free = np.array([u, -9.81])
+        v = -(2 * speed_now @ speed_now + gradient @ free) / (gradient @ force)
+        found = function(np.concatenate([place_now, speed_now]), [u], [factor])[0]
+        np.testing.assert_allclose(found[2:], free + force * v, rtol=1e-12, atol=1e-12)

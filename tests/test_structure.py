@@ -789,3 +789,17 @@ def test_parameters_take_part_with_their_defaults():
 def test_mass_matrices_must_be_symmetric_and_positive_definite(mass):
     with pytest.raises(ModelError, match="mass_matrix is not symmetric and positive"):
         find_structure(changed(double_integrator(), mass_matrix=ca.SX(np.array(mass))))
+
+
+def test_a_column_of_b_that_is_only_round_off_is_zero():
+    """As 1e-17 in place of 0 is, where a table of sines was typed in."""
+    system = system_of(
+        3,
+        f=lambda x: [0, 0, 0],
+        h=lambda x: [[ca.cos(x[2]), 1e-17], [ca.sin(x[2]), 2e-17], [0, 1]],
+        l=lambda x: [x[0], x[1]],
+        nominal_state=[0.0, 0.0, 0.3],
+    )
+    error = violation(system)
+    assert error.assumption == 5
+    assert "dynamic_extension" in str(error)

@@ -171,8 +171,8 @@ class Samples:
             n_star.append(multiply(fields["m"], beta[-1], 1.0 / columns))
         return beta, h_star, n_star
 
-    def acts(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> Booleans:
-        """Whether the derivatives of functions along fields are not zero.
+    def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
+        """The derivatives of functions along fields; what is nothing but round-off is zero.
 
         Args:
             rows: The derivatives, shape (a, k), whose structure may decide.
@@ -180,17 +180,17 @@ class Samples:
             field: Shape (n, k), at each state.
 
         Returns:
-            Shape (a, samples).
+            Shape (samples, a, k).
         """
         if not rows.nnz():
-            return np.zeros((rows.shape[0], len(self.states)), dtype=bool)
+            return np.zeros((len(self.states), *rows.shape))
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return np.array(
             [
-                multiply(gradient, value, self.scale)[0].any(axis=1)
+                multiply(gradient, value, self.scale)[0]
                 for (gradient,), value in zip(gradients, field, strict=True)
             ]
-        ).T
+        )
 
     def dependent(self, functions: ca.SX) -> bool:
         """Whether the differentials of functions are linearly dependent at every state."""

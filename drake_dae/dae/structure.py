@@ -16,6 +16,9 @@ from drake_dae.dae.samples import Fields, Margin, Samples, show
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
+MANY = 10
+"""So many random states have no zero in common of a function that is not zero."""
+
 
 @dataclass(frozen=True, eq=False)
 class Structure:
@@ -255,8 +258,8 @@ def control_violation(system: DaeSystem, margin: Margin) -> AssumptionError | No
         (4, 5),
         "B(x) of (16) is singular: the controlled outputs "
         f"{', '.join(s.name for s in system.output_signals)} cannot be steered independently. An "
-        "output may repeat a constraint or another output; choose other outputs, or keep away "
-        "from this state",
+        "output may repeat a constraint or another output; choose other outputs, keep away from "
+        "this state, or see whether `dynamic_extension` finds integrators that help",
     )
 
 
@@ -317,8 +320,8 @@ def _constraint_chains(
         by_force = lie_derivative_along(last, system.g, x)
         by_control = lie_derivative_along(last, system.h, x)
         samples = Samples(Manifold(system, chains), fields, guesses, region)
-        force_acts = samples.acts(by_force, last, samples.field("g"))
-        control_acts = samples.acts(by_control, last, samples.field("h"))
+        force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
+        control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
         still, stuck = [], []
         for row, i in enumerate(undecided):
             name, order = system.constraint_output_signals[i].name, len(chains[i])
@@ -379,15 +382,16 @@ def _output_chains(
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
     highest_derivatives = ca.SX(count, 1)
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    acts = np.array([value.any(axis=1) for value, _ in n_star_values]).T
+    numbers = np.array([value for value, _ in n_star_values])
     following = elimination.l_star
     rows = elimination.n_star
     undecided = list(range(count))
     while undecided:
-        still = []
+        acts, still = _acts(numbers), []
         for row, i in enumerate(undecided):
             if acts[row].all():
-                drift[i], control_matrix[i, :] = following[row], rows[row, :]
+                drift[i] = following[row]
+                control_matrix[i, :] = _without_round_off(rows[row, :], numbers[:, row, :])
                 highest_derivatives[i] = moving[row]
             elif acts[row].any():
                 state = samples.states[int(np.argmin(acts[row]))]
@@ -408,8 +412,8 @@ def _output_chains(
         # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
         moving = motion.derivative(moving[[undecided.index(i) for i in still]])
         following, rows = affine(motion.expand(moving), motion.control)
-        acts = samples.acts(rows, last, h_star_values)
-        stuck = []
+        numbers = samples.derivatives(rows, last, h_star_values)
+        acts, stuck = _acts(numbers), []
         for row, i in enumerate(still):
             if acts[row].any():
                 continue
@@ -432,6 +436,24 @@ def _output_chains(
             )
         undecided = still
     return tuple(tuple(chain) for chain in chains), drift, control_matrix, highest_derivatives
+
+
+def _acts(numbers: FloatArray) -> np.typing.NDArray[np.bool_]:
+    """Which rows are not zero where: shape (a, samples), of numbers of shape (samples, a, k)."""
+    return np.asarray(numbers.any(axis=2)).T
+
+
+def _without_round_off(row: ca.SX, numbers: FloatArray) -> ca.SX:
+    """Entries of a row of B(x) that are zero but for round-off at all of many states are zero.
+
+    Scaling would blow a column of nothing else up to the size of the others. Few states could have
+    a zero in common.
+    """
+    result = ca.SX(row)
+    if len(numbers) >= MANY:
+        for j in np.flatnonzero(~numbers.any(axis=0)):
+            result[int(j)] = 0.0
+    return ca.sparsify(result)
 
 
 def _reaches(fields: ca.SX, drift: ca.SX, expression: ca.SX, state: ca.SX) -> bool:
