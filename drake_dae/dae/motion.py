@@ -13,7 +13,7 @@ with c the last derivatives L_f^(r_i - 1) k_i of the constraints. Each order bri
 so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and A is J M^-1 J^T.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import casadi as ca
 import numpy as np
@@ -70,6 +70,9 @@ class Motion:
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
         if _agree(system, gradient, force):
             gradient = force
+        self._matrix = ca.blockcat(
+            mass[self._rows, self._rows], -force, gradient.T, ca.SX(force.shape[1], force.shape[1])
+        )
         self._unknowns, self.constraint_matrix, self.pivot = _solver(
             mass[self._rows, self._rows], force, gradient
         )
@@ -123,10 +126,11 @@ class Motion:
         unknowns = ca.vertcat(symbols[[i for i, moves in enumerate(moved) if moves]], self.control)
         equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - wanted)
         involved = ca.which_depends(equations, unknowns, 1, True)
-        equations = equations[[i for i, involves in enumerate(involved) if involves]]
+        used_rows = [i for i, involves in enumerate(involved) if involves]
+        equations = equations[used_rows]
         if equations.numel() != unknowns.numel():
             return None
-        matrix = ca.sparsify(ca.jacobian(equations, unknowns))
+        matrix = self._slopes(expression, orders, moved)[used_rows, :]
         if ca.depends_on(matrix, unknowns):
             return None
         blocks = []
@@ -148,6 +152,24 @@ class Motion:
             [self.control, pivot],
         )
         return found[0], found[1]
+
+    def _slopes(self, expression: ca.SX, orders: int, moved: Sequence[bool]) -> ca.SX:
+        """The derivatives of the equations of some orders, and of an expression, by what moves."""
+        rows = [*self._equations[:orders], expression]
+        blocks = []
+        for k, row in enumerate(rows):
+            columns = []
+            for j in range(orders):
+                size = self._symbols[j + 1].numel()
+                which = [i for i in range(size) if moved[j * size + i]]
+                if j == k:  # Known, in fewer operations.
+                    columns.append(self._matrix[:, which])
+                elif j < k:
+                    columns.append(ca.jacobian(row, self._symbols[j + 1][which]))
+                else:
+                    columns.append(ca.SX(row.numel(), len(which)))
+            blocks.append(ca.horzcat(*columns, ca.jacobian(row, self.control)))
+        return ca.sparsify(ca.vertcat(*blocks))
 
     def unknowns(self) -> ca.SX:
         """State and all unknowns that exist up to now, below each other."""
