@@ -8,10 +8,11 @@ numbers in the documentation are those of that paper.
 
 from importlib.metadata import version
 
-from drake_dae.dae.analysis import Analysis, analyze
+from drake_dae.dae.analysis import analyze
 from drake_dae.dae.extension import Extension, dynamic_extension, extend
 from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
 from drake_dae.dae.normal_form import NormalForm
+from drake_dae.dae.report import Analysis
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem, Parameter, Signal
 from drake_dae.dae.tracking import TrackingLaw

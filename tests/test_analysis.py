@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from problems import PROBLEMS, Problem, changed, double_integrator
 
-from drake_dae.dae.analysis import Analysis, Finding, analyze
+from drake_dae.dae.analysis import analyze
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.region import ConsistentRegion, Region
+from drake_dae.dae.report import Analysis, Finding
 from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics import Verdict
