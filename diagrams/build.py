@@ -15,8 +15,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from drake_dae.dae import gains as designs
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import Structure, find_structure
-from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams import scenario as forms
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerT
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import FloatArray, InconsistentStateError, ModelError, WiringError
 from drake_dae.robots.multibody import MultibodyExpressions

@@ -10,7 +10,7 @@ import numpy as np
 from drake_dae.dae.analysis import analyze
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.report import Analysis
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.tables import Part, Table, digits, to_markdown, to_text
 from drake_dae.diagrams.build import build
 from drake_dae.diagrams.scenario import Scenario

@@ -13,8 +13,9 @@ from drake_dae.dae.extension import Extension, dynamic_extension, extend
 from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
 from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.report import Analysis
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure import Structure, find_structure
-from drake_dae.dae.system import DaeSystem, Parameter, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.build import build

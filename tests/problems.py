@@ -13,7 +13,8 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 
 Array = np.ndarray

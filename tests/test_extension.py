@@ -8,8 +8,9 @@ from scipy.integrate import solve_ivp
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.extension import Extension, dynamic_extension, extend
 from drake_dae.dae.gains import poles
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import find_structure
-from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import AssumptionError, ModelError
 

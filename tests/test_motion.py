@@ -6,8 +6,9 @@ from problems import PROBLEMS, Problem, changed
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.motion import Motion
+from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import find_structure
-from drake_dae.dae.system import DaeSystem, Parameter
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
 

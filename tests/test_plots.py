@@ -5,7 +5,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from drake_dae import Record
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.simulation.plots import (
     PLOTS,
     plot_controls,

@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, T
 from pydrake.systems.primitives import LogVectorOutput
 
 from drake_dae import Record, build, load_scenario, simulate
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.simulation.record import Recorded

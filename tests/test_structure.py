@@ -14,8 +14,9 @@ from problems import (
 
 from drake_dae.dae import structure
 from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import examine_structure, find_structure
-from drake_dae.dae.system import DaeSystem, Parameter
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 
 

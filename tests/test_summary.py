@@ -6,7 +6,7 @@ import pytest
 from arms import arm
 
 from drake_dae import ExpressionOutput, Record, RobotModel
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links import LinkExpressions
 from drake_dae.simulation.record import Recorded

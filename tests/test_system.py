@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from problems import double_integrator
 
-from drake_dae.dae.system import DaeSystem, Parameter, Signal, signals
+from drake_dae.dae.signals import Parameter, Signal, signals
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
 

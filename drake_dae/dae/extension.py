@@ -23,8 +23,9 @@ from drake_dae.dae.expressions import Factorization, TracedFunction
 from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import SINGULAR, Fields, Samples, multiply, show, traced
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import Structure, examine_structure, find_structure
-from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
 

@@ -9,8 +9,9 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.dae.samples import SINGULAR, Margin
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import Structure
-from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tables import Part, Table, digits, to_markdown, to_text
 from drake_dae.dae.zero_dynamics import ComplexArray, PinnedMotion, Stability, Verdict
 from drake_dae.errors import FloatArray

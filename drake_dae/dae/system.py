@@ -11,83 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.dae.expressions import PositiveDefiniteFactorization
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, numbers
 from drake_dae.errors import FloatArray, ModelError
-
-
-@dataclass(frozen=True)
-class Signal:
-    """A scalar of a vector signal.
-
-    Attributes:
-        name: Unique in its vector.
-        unit: SI unit as text, "" for a pure number.
-    """
-
-    name: str
-    unit: str = ""
-
-    def derivative(self, order: int) -> "Signal":
-        """Its time derivative: x -> x', x'', ..., with the unit to match."""
-        if order == 0:
-            return self
-        per_time = "/s" if order == 1 else f"/s^{order}"
-        return Signal(self.name + "'" * order, (self.unit or "1") + per_time)
-
-
-@dataclass(frozen=True, eq=False)
-class Parameter:
-    """A number, or a vector of numbers, that a study changes without tracing again.
-
-    Attributes:
-        name: Unique in its system, for example "link1.mass".
-        value: The default, shape (k,); a float is taken as shape (1,).
-        unit: SI unit as text.
-        positive: Whether only positive numbers make sense, as for a mass.
-        symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
-            not given.
-
-    Raises:
-        ModelError: A value that is not finite, or a symbol that does not fit it.
-    """
-
-    name: str
-    value: FloatArray
-    unit: str = ""
-    positive: bool = False
-    symbol: ca.SX = field(default=None)
-
-    def __post_init__(self) -> None:
-        value = np.atleast_1d(_numbers(f"parameter '{self.name}'", self.value))
-        if value.ndim != 1 or not np.all(np.isfinite(value)):
-            raise ModelError(
-                f"parameter '{self.name}' must be finite and one-dimensional, got {self.value!r}"
-            )
-        value.setflags(write=False)
-        object.__setattr__(self, "value", value)
-        self.check(value)
-        if self.symbol is None:
-            object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
-        elif not _is_symbol(self.symbol) or self.symbol.shape != (value.size, 1):
-            raise ModelError(
-                f"the symbol of parameter '{self.name}' must be a CasADi SX column of "
-                f"{value.size} symbols, as its value has; got {self.symbol}"
-            )
-
-    def check(self, value: FloatArray) -> None:
-        """Refuses numbers that make no sense.
-
-        Raises:
-            ModelError: One is not finite, or not positive where it must be.
-        """
-        if not np.all(np.isfinite(value)):
-            raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
-        if self.positive and not np.all(value > 0.0):
-            raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
-
-
-def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
-    """Signals that share a unit."""
-    return tuple(Signal(name, unit) for name in names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +72,7 @@ class DaeSystem:
     motion: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
 
     def __post_init__(self) -> None:
-        if not (_is_symbol(self.state) and self.state.numel()):
+        if not (is_symbol(self.state) and self.state.numel()):
             raise ModelError(
                 f"{self.name}: 'state' must be a CasADi SX column of symbols, "
                 f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
@@ -220,7 +145,7 @@ class DaeSystem:
             put(key, given)
         nominal = np.zeros(n)
         if self.nominal_state is not None:
-            nominal = _numbers(f"{self.name}: nominal_state", self.nominal_state)
+            nominal = numbers(f"{self.name}: nominal_state", self.nominal_state)
         if nominal.shape != (n,) or not np.all(np.isfinite(nominal)):
             raise ModelError(
                 f"{self.name}: nominal_state must be finite with shape ({n},), "
@@ -268,7 +193,7 @@ class DaeSystem:
         named = tuple(s if isinstance(s, Signal) else Signal(s) for s in state)
         x = ca.vertcat(ca.SX(0, 1), *[ca.SX.sym(s.name) for s in named])
         defined = tuple(
-            Parameter(name, _numbers(f"parameter '{name}'", value))
+            Parameter(name, numbers(f"parameter '{name}'", value))
             for name, value in (parameters or {}).items()
         )
         arguments = [x]
@@ -438,19 +363,6 @@ def _unfit(system: DaeSystem, expression: ca.SX) -> str | None:
                 )
         moving[function.instruction_output(i)[0]] = moves
     return None
-
-
-def _is_symbol(value: Any) -> bool:
-    return isinstance(value, ca.SX) and value.is_valid_input()
-
-
-def _numbers(what: str, value: Any) -> FloatArray:
-    try:
-        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
-            raise TypeError
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{what} must be real numbers, got {value!r}") from error
 
 
 def _unique(names: Sequence[str], kind: str, owner: str) -> None:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.system import Parameter, Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import FloatArray, ModelError
 from drake_dae.robots.links import Links
 

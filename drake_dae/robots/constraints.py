@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_dae.dae.system import Parameter, Signal, signals
+from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.joints import constant_pose
 from drake_dae.robots.links import Links

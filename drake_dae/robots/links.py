@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.system import Parameter, Signal, signals
+from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import FloatArray, ModelError
 
 

@@ -24,7 +24,7 @@ from pydrake.multibody.tree import (
 )
 
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.system import Parameter, Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import FloatArray, ModelError
 from drake_dae.robots.joints import (
     check_joint,

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import casadi as ca
 
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints import PointOnSurface, check_axes
 from drake_dae.robots.links import Links

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.errors import FloatArray
 from drake_dae.simulation.record import Record
 

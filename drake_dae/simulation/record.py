@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import VectorLogSink
 
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.errors import FloatArray, ModelError
 
 

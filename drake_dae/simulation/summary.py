@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from drake_dae.dae.system import Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.tables import Table
 from drake_dae.errors import FloatArray
 from drake_dae.robots.constraints import PointOnSurface

@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 from pydrake.symbolic import Expression, ExpressionKind, Variable
 
-from drake_dae.dae.system import DaeSystem, Parameter, Signal
+from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
 _FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {

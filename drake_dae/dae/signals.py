@@ -1,0 +1,105 @@
+"""Names, units and numbers of the scalars that a system is made of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.errors import FloatArray, ModelError
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A scalar of a vector signal.
+
+    Attributes:
+        name: Unique in its vector.
+        unit: SI unit as text, "" for a pure number.
+    """
+
+    name: str
+    unit: str = ""
+
+    def derivative(self, order: int) -> "Signal":
+        """Its time derivative: x -> x', x'', ..., with the unit to match."""
+        if order == 0:
+            return self
+        per_time = "/s" if order == 1 else f"/s^{order}"
+        return Signal(self.name + "'" * order, (self.unit or "1") + per_time)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A number, or a vector of numbers, that a study changes without tracing again.
+
+    Attributes:
+        name: Unique in its system, for example "link1.mass".
+        value: The default, shape (k,); a float is taken as shape (1,).
+        unit: SI unit as text.
+        positive: Whether only positive numbers make sense, as for a mass.
+        symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
+            not given.
+
+    Raises:
+        ModelError: A value that is not finite, or a symbol that does not fit it.
+    """
+
+    name: str
+    value: FloatArray
+    unit: str = ""
+    positive: bool = False
+    symbol: ca.SX = field(default=None)
+
+    def __post_init__(self) -> None:
+        value = np.atleast_1d(numbers(f"parameter '{self.name}'", self.value))
+        if value.ndim != 1 or not np.all(np.isfinite(value)):
+            raise ModelError(
+                f"parameter '{self.name}' must be finite and one-dimensional, got {self.value!r}"
+            )
+        value.setflags(write=False)
+        object.__setattr__(self, "value", value)
+        self.check(value)
+        if self.symbol is None:
+            object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
+        elif not is_symbol(self.symbol) or self.symbol.shape != (value.size, 1):
+            raise ModelError(
+                f"the symbol of parameter '{self.name}' must be a CasADi SX column of "
+                f"{value.size} symbols, as its value has; got {self.symbol}"
+            )
+
+    def check(self, value: FloatArray) -> None:
+        """Refuses numbers that make no sense.
+
+        Raises:
+            ModelError: One is not finite, or not positive where it must be.
+        """
+        if not np.all(np.isfinite(value)):
+            raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
+        if self.positive and not np.all(value > 0.0):
+            raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
+
+
+def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
+    """Signals that share a unit."""
+    return tuple(Signal(name, unit) for name in names)
+
+
+def is_symbol(value: Any) -> bool:
+    """Whether it is a CasADi SX matrix of symbols."""
+    return isinstance(value, ca.SX) and value.is_valid_input()
+
+
+def numbers(what: str, value: Any) -> FloatArray:
+    """Real numbers as a new array.
+
+    Raises:
+        ModelError: What is something else.
+    """
+    try:
+        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
+            raise TypeError
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{what} must be real numbers, got {value!r}") from error
