@@ -153,7 +153,7 @@ def redundant() -> DaeSystem:
 def test_2_redundant_constraints():
     analysis = analyze(redundant())
     assert findings(analysis) == [YES, NO, YES, OPEN, OPEN]
-    assert (analysis.constraint_degrees, analysis.index) == ((2, 2), 3)
+    assert (analysis.constraint_degrees, analysis.index) == ((2, 2), None)
     assert (analysis.output_degrees, analysis.structure) == (None, None)
     assert "Remove a redundant constraint" in analysis.problems[0]
     assert analysis.assumptions[1].margin.relative < 1e-12
@@ -351,8 +351,8 @@ def test_a_region_without_consistent_states(region):
         ({"states": [[0.48, -0.64, 0, 0]], "region": {}}, "give a region or states, not both"),
         ({"times": [0, 1]}, "a reference needs times"),
         ({"reference": lambda t: np.zeros(3)}, "a reference needs times"),
-        ({"count": -1}, "count must be a whole number from 0, got -1"),
-        ({"count": 2.5}, r"count must be a whole number from 0, got 2\.5"),
+        ({"count": -1}, "count must be a whole number from 1, got -1"),
+        ({"count": 2.5}, r"count must be a whole number from 1, got 2\.5"),
     ],
 )
 def test_arguments_that_make_no_sense(options, message):
@@ -370,6 +370,84 @@ def test_given_states():
     least = min(problem.known(x).control_matrix.item() for x in states)
     assert analysis.assumptions[4].margin.singular_value == pytest.approx(least, rel=1e-10)
     assert analysis.where == "4 consistent states as given"
+
+
+def test_a_zero_at_the_given_state_alone_is_no_degree():
+    """Ball and beam: the control acts on derivative 3 of the position, but not at rest."""
+    beam = DaeSystem.from_functions(
+        ["r", "vr", "th", "w"],
+        f=lambda x: [x[1], x[0] * x[3] ** 2 - 9.81 * ca.sin(x[2]), x[3], 0],
+        h=lambda x: [0, 0, 0, 1],
+        l=lambda x: [x[0]],
+    )
+    analysis = analyze(beam, states=[[0.0, 0.0, 0.0, 0.0]])
+    assert findings(analysis)[3] == NO
+    assert "derivative 3" in analysis.assumptions[3].reason
+    assert analysis.output_degrees is None
+
+
+def test_a_region_for_one_state_leaves_the_others_near_the_nominal_one():
+    """The pendulum's B vanishes at x = 1, far from where states are drawn."""
+    pendulum = PROBLEMS["pendulum"]().system
+    assert not analyze(pendulum).problems
+    assert not analyze(pendulum, region={"vx": (-1.0, 1.0)}).problems
+
+
+def test_consistency_does_not_depend_on_units():
+    """A pendulum of a micrometre that is 30 % off N*, and one of 1e9 m that is on it."""
+
+    def pendulum(length: float) -> DaeSystem:
+        return DaeSystem.from_functions(
+            ["x", "y", "vx", "vy"],
+            f=lambda s: [s[2], s[3], 0, -9.81],
+            g=lambda s: [0, 0, 2 * s[0], 2 * s[1]],
+            h=lambda s: [0, 0, 1, 0],
+            k=lambda s: [s[0] ** 2 + s[1] ** 2 - length**2],
+            l=lambda s: [s[0]],
+            m=lambda s: [[0]],
+            nominal_state=[0, -length, 0, 0],
+        )
+
+    with pytest.raises(InconsistentStateError, match=r"states\[0\] is not consistent"):
+        analyze(pendulum(1e-6), states=[[0.0, -1.3e-6, 0.0, 0.0]])
+    on = [1e9 * np.sin(0.3), -1e9 * np.cos(0.3), 0.0, 0.0]
+    assert analyze(pendulum(1e9), states=[on]).index == 3
+
+
+def test_redundant_constraints_have_no_index():
+    """k = (x - 1, 2 x - 2): the dimension of N* is 2, and not n - r_1 - r_2 = 0."""
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy"],
+        f=lambda s: [s[2], s[3], 0, 0],
+        g=lambda s: [[0, 0], [0, 0], [1, 2], [0, 0]],
+        h=lambda s: [0, 0, 0, 1],
+        k=lambda s: [s[0] - 1, 2 * s[0] - 2],
+        l=lambda s: [s[1]],
+        m=lambda s: [[0, 0]],
+        nominal_state=[1, 0, 0, 0],
+    )
+    analysis = analyze(system)
+    assert findings(analysis)[1] == NO
+    assert analysis.constraint_degrees == (2, 2)
+    assert analysis.index is None and analysis.manifold_dimension is None
+    assert "index ?, N* of dimension ?" in str(analysis)
+
+
+def test_a_mass_matrix_must_be_positive_definite_at_every_state():
+    x = ca.SX.sym("x", 2)
+    system = DaeSystem(
+        state=x,
+        f=[0, 0],
+        g=[],
+        h=[[1, 0], [0, 1]],
+        k=[],
+        l=[x[0], x[1]],
+        m=[],
+        mass_matrix=ca.diag(ca.vertcat(1, 1 - 4 * x[0])),
+    )
+    assert not analyze(system).problems
+    with pytest.raises(ModelError, match="not symmetric and positive definite at x ="):
+        analyze(system, region={"x0": (-1.0, 1.0)})
 
 
 def test_given_states_must_be_consistent():

@@ -106,7 +106,9 @@ def test_spread_and_count():
     deviation = structure.states[1:].std(axis=0)
     # 200 normal numbers: their deviation is known to 5%.
     np.testing.assert_allclose(deviation, [0.0, 0.0, 10.0, 0.001], rtol=0.25)
-    assert find_structure(system, count=0).states.shape == (1, 4)
+    assert find_structure(system, count=1).states.shape == (2, 4)
+    with pytest.raises(ModelError, match="count must be a whole number from 1, got 0"):
+        find_structure(system, count=0)
     for wrong in ([0.1, 0.2], [[0.1]], np.nan):
         with pytest.raises(ModelError, match=r"spread must be a number or have shape \(4,\)"):
             find_structure(system, spread=wrong)
@@ -713,7 +715,7 @@ def test_functions_that_are_not_finite_at_the_nominal_state(fields, message):
 
 def test_a_constraint_that_is_not_finite_at_the_nominal_state():
     with pytest.raises(InconsistentStateError, match="y0 is not finite at the given state"):
-        find_structure(redundant(lambda x: [ca.sqrt(x[0] - 1) - 1, x[2]]), count=0)
+        find_structure(redundant(lambda x: [ca.sqrt(x[0] - 1) - 1, x[2]]), spread=0.0)
 
 
 def test_samples_outside_the_domain_are_left_out():

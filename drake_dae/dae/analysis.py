@@ -9,16 +9,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.manifold import CONSISTENT, Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.region import Region
 from drake_dae.dae.report import Analysis, Assumption, Finding, count_of
-from drake_dae.dae.samples import Margin, Samples
+from drake_dae.dae.samples import Fields, Margin, Samples
 from drake_dae.dae.structure import (
     Constrained,
     Structure,
     check_system,
     constraint_violation,
     control_violation,
+    default_spread,
     examine_constraints,
     examine_outputs,
 )
@@ -35,8 +36,8 @@ STATEMENTS = (
 )
 """Assumptions (1) to (5) in a line each."""
 
-_SPREAD = 0.1
-"""Of states that no region bounds, around the nominal one, as in `find_structure`."""
+_NEIGHBOURS = 5
+"""Beside states that are given, where the first of them may have a zero that others have not."""
 
 
 def analyze(
@@ -62,7 +63,8 @@ def analyze(
     Args:
         system: (1)-(3).
         region: State name -> (lowest, highest); other states are drawn around the nominal one.
-        states: Consistent states to examine instead, shape (k, n).
+        states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
+            few others close to the first: what is zero at one state alone is not zero.
         reference: t -> R(t), output-major as for `TrackingLaw`; the margins are also taken along
             the motion that it commands.
         times: In s, increasing, shape (k,); where on the reference.
@@ -84,16 +86,24 @@ def analyze(
         raise ModelError(f"{system.name}: give a region or states, not both")
     if (reference is None) != (times is None):
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise ModelError(f"{system.name}: count must be a whole number from 0, got {count!r}")
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
     box = None if region is None else _box(system, region)
     random = np.random.default_rng(seed)
-    guesses = _guesses(system, box, count, random) if states is None else _given(system, states)
+    if states is None:
+        given, guesses = 0, _guesses(system, box, count, random)
+    else:
+        guesses = _given(system, states)
+        given = len(guesses)
+        around = default_spread(guesses[0]) * random.standard_normal(
+            (_NEIGHBOURS, guesses.shape[1])
+        )
+        guesses = np.vstack([guesses, guesses[0] + 0.1 * around])
     try:
         check_system(system)
         constrained = examine_constraints(system, guesses, box)
     except AssumptionError as error:
-        where = _where(len(guesses), "state", region, states)
+        where = _where(len(guesses), len(guesses), "state", region, given)
         return Analysis(system, where, guesses, _assumptions((), [error]))
     except InconsistentStateError as error:
         if region is None:
@@ -105,9 +115,11 @@ def analyze(
         ) from error
     samples = constrained.samples
     if states is not None:
-        _check_consistent(samples.manifold, guesses, samples.states)
-    where = _where(len(samples.states), "consistent state", region, states)
-    analysis, dynamics = _examined(constrained, where, search=states is None)
+        # Degrees are decided around them, too; margins are theirs alone.
+        samples = Samples(samples.manifold, Fields(system.explicit), guesses[:given])
+        _check_consistent(samples.manifold, guesses[:given], samples.states)
+    where = _where(len(samples.states), len(guesses), "consistent state", region, given)
+    analysis, dynamics = _examined(constrained, samples, where, search=states is None)
     if reference is None or times is None or dynamics is None:
         return analysis
     motion = dynamics.motion(reference, times, samples.states[0] if start is None else start)
@@ -115,10 +127,10 @@ def analyze(
 
 
 def _examined(
-    constrained: Constrained, where: str, search: bool
+    constrained: Constrained, samples: Samples, where: str, search: bool
 ) -> tuple[Analysis, ZeroDynamics | None]:
-    """From the constraints on."""
-    samples, elimination = constrained.samples, constrained.elimination
+    """From the constraints on, with margins at given samples."""
+    elimination = constrained.elimination
     system = samples.system
     known: dict[str, Any] = {"constraint_degrees": constrained.degrees}
     margins: dict[int, Margin] = {}
@@ -134,8 +146,8 @@ def _examined(
 
     if constrained.margin is not None:
         matrix = elimination.constraint_matrix
-        margin = samples.margin(matrix, search=True) if search else constrained.margin
-        judge(margin, constraint_violation(system, margin), 2)
+        margin = samples.margin(matrix, search)
+        judge(margin, constraint_violation(system, constrained.degrees, margin), 2)
         regular = samples.is_regular(matrix)
     if regular:
         try:
@@ -146,7 +158,7 @@ def _examined(
             matrix = structure.control_matrix
             satisfied |= {4, 5}
             margin = samples.margin(matrix, search)
-            judge(margin, control_violation(system, margin), 5)
+            judge(margin, control_violation(system, structure.output_degrees, margin), 5)
             known |= {
                 "output_degrees": structure.output_degrees,
                 "output_order": structure.output_order,
@@ -218,7 +230,7 @@ def _guesses(
 ) -> FloatArray:
     """The nominal state first, then random ones."""
     nominal = system.nominal_state
-    drawn = nominal + _SPREAD * random.standard_normal((count, nominal.size))
+    drawn = nominal + default_spread(nominal) * random.standard_normal((count, nominal.size))
     if box is None:
         return np.vstack([nominal, drawn])
     named = np.isfinite(box.low)
@@ -249,16 +261,17 @@ def _check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) 
     """That each given state was taken but for round-off."""
     name = manifold.system.name
     for number, state in enumerate(given):
-        residual = manifold.residual(state)
-        worst = int(np.argmax(np.abs(residual))) if residual.size else 0
-        if residual.size and not np.abs(residual[worst]) <= CONSISTENT:
+        if not manifold.is_consistent(state):
+            residual = manifold.residual(state)
+            worst = int(np.argmax(np.abs(residual)))
             raise InconsistentStateError(
                 f"{name}: states[{number}] is not consistent: "
                 f"{manifold.residual_signals[worst].name} = {residual[worst]:.3g}; project it, for "
                 "example with `find_structure(system).manifold.project`",
                 residual,
             )
-        if not np.any(np.all(np.isclose(taken, state, rtol=0.0, atol=1e-4), axis=1)):
+        near = 1e-4 * np.maximum(np.abs(state), np.abs(taken).max(axis=0))
+        if not np.any(np.all(np.abs(taken - state) <= near, axis=1)):
             raise ModelError(
                 f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
                 "finite there"
@@ -266,15 +279,17 @@ def _check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) 
 
 
 def _where(
-    count: int,
+    kept: int,
+    drawn: int,
     noun: str,
     region: Mapping[str, tuple[float, float]] | None,
-    states: ArrayLike | None,
+    given: int,
 ) -> str:
-    place = "as given"
-    if states is None:
-        place = f"with {_bounds(region)}" if region else "around the nominal one"
-    return f"{count_of(count, noun)} {place}"
+    if given:
+        return f"{count_of(given, noun)} as given"
+    place = f"with {_bounds(region)}" if region else "around the nominal one"
+    missing = f"; {drawn - kept} more were outside the domain or off N*" if drawn > kept else ""
+    return f"{count_of(kept, noun)} {place}{missing}"
 
 
 def _bounds(region: Mapping[str, tuple[float, float]]) -> str:

@@ -24,7 +24,12 @@ from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import SINGULAR, Fields, Samples, multiply, show, traced
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.structure import (
+    Structure,
+    default_spread,
+    examine_structure,
+    find_structure,
+)
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
@@ -128,7 +133,7 @@ def dynamic_extension(
     *,
     nominal_control: Mapping[str, float] | None = None,
     max_integrators: int | None = None,
-    spread: ArrayLike = 0.1,
+    spread: ArrayLike | None = None,
 ) -> Extension:
     """Finds integrators that make B(x) regular, by the dynamic extension algorithm.
 
@@ -200,8 +205,10 @@ class _Chain:
         offset, matrix: u of the original system is offset(x) + matrix(x) w.
     """
 
-    def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike) -> None:
+    def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike | None) -> None:
         self.system = system
+        if spread is None:
+            spread = default_spread(system.nominal_state)
         deviation = np.asarray(spread, dtype=float)
         if deviation.shape not in ((), (system.num_states,)):
             raise ModelError(

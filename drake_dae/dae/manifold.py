@@ -12,7 +12,11 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import FloatArray, InconsistentStateError
 
 CONSISTENT = 1e-8
-"""A state whose residual is at most this is taken as consistent and mended silently."""
+"""A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
+size; or, where gradients depend on each other, if its residual is at most this."""
+
+FLOOR = 1e-12
+"""A distance from N* that is round-off of states that are zero."""
 
 ROUND_OFF = 1e-12
 """A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
@@ -69,6 +73,19 @@ class Manifold:
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """The constraint outputs and their derivatives, shape (sum r_i,), constraint-major."""
         return self._newton(state, self._defaults if parameters is None else parameters)[0]
+
+    def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
+        """Whether a state is on N* up to round-off: Newton's step to it is short, in any unit.
+
+        Args:
+            state: Shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+        """
+        p = self._defaults if parameters is None else parameters
+        _, _, (norm, reach) = self._newton(state, p)
+        if isfinite(reach):
+            return bool(reach <= CONSISTENT * float(np.linalg.norm(state)) + FLOOR)
+        return bool(norm <= CONSISTENT)
 
     def project(
         self, state: ArrayLike, parameters: ArrayLike | None = None, iterations: int = 100

@@ -83,13 +83,19 @@ class Analysis:
     @property
     def index(self) -> int | None:
         """max r_i + 1, the index of the DAE; 0 without constraints."""
-        degrees = self.constraint_degrees
+        degrees = self._degrees_of_manifold
         return None if degrees is None else max(degrees, default=-1) + 1
+
+    @property
+    def _degrees_of_manifold(self) -> tuple[int, ...] | None:
+        """r_1, ..., r_m, unless Assumption (2) fails, so that they do not add up."""
+        violated = self.assumptions[1].finding is Finding.VIOLATED
+        return None if violated else self.constraint_degrees
 
     @property
     def manifold_dimension(self) -> int | None:
         """dim N* = n - sum r_i, Theorem 1.1."""
-        degrees = self.constraint_degrees
+        degrees = self._degrees_of_manifold
         return None if degrees is None else self.system.num_states - sum(degrees)
 
     @property

@@ -205,8 +205,8 @@ class Samples:
 
         Args:
             matrix: Shape (k, l), k <= l.
-            search: Also go downhill from the worst states, in the region, or if there is none in
-                the box that the states span.
+            search: Also go downhill from the worst states, in the box that the states span and the
+                region.
         """
         scaled = _ScaledMatrix(self, matrix)
         candidates = list(self.states)
@@ -214,8 +214,14 @@ class Samples:
             crossings = (self._crossing(scaled, there) for there in self.states[1:])
             candidates += [state for state in crossings if state is not None]
         if search:
-            box = Region(self.states.min(axis=0), self.states.max(axis=0))
-            consistent = ConsistentRegion(self.manifold, self._consistent.region or box)
+            low, high = self.states.min(axis=0), self.states.max(axis=0)
+            given = self._consistent.region
+            if given is not None:
+                # The edge of what is not named may lie a little beyond the random states.
+                more = 0.5 * (high - low)
+                low = np.where(np.isfinite(given.low), given.low, low - more)
+                high = np.where(np.isfinite(given.high), given.high, high + more)
+            consistent = ConsistentRegion(self.manifold, Region(low, high))
             starts = sorted(candidates, key=scaled.distance)[:3]
             candidates += [consistent.descend(scaled.slope, start) for start in starts]
         state = min(candidates, key=scaled.distance)

@@ -12,7 +12,8 @@ from drake_dae.dae.lie import lie_derivative, lie_derivative_along
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.motion import Motion
 from drake_dae.dae.region import Region
-from drake_dae.dae.samples import Fields, Margin, Samples, show
+from drake_dae.dae.samples import Fields, Margin, Samples, show, traced
+from drake_dae.dae.signals import numbers
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
@@ -74,7 +75,7 @@ class Structure:
 
 
 def find_structure(
-    system: DaeSystem, *, spread: ArrayLike = 0.1, count: int = 12, seed: int = 0
+    system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> Structure:
     """Finds relative degrees, A(x), B(x) and checks Assumptions (1)-(5).
 
@@ -84,8 +85,8 @@ def find_structure(
     Args:
         system: (1)-(3).
         spread: Standard deviation of the drawn states around the nominal one, a number for all
-            or shape (n,).
-        count: How many states are drawn.
+            or shape (n,); see `default_spread` if None.
+        count: How many states are drawn, at least 1.
         seed: Of the random numbers.
 
     Raises:
@@ -105,7 +106,7 @@ def find_structure(
 
 
 def examine_structure(
-    system: DaeSystem, *, spread: ArrayLike = 0.1, count: int = 12, seed: int = 0
+    system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> tuple[Structure, AssumptionError | None]:
     """As `find_structure`, but complete also where B(x) is singular.
 
@@ -118,7 +119,11 @@ def examine_structure(
         InconsistentStateError, ModelError: As `find_structure`.
     """
     check_system(system)
-    deviation = np.asarray(spread, dtype=float)
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
+    if spread is None:
+        spread = default_spread(system.nominal_state)
+    deviation = numbers(f"{system.name}: spread", spread)
     if deviation.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviation)):
         raise ModelError(
             f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
@@ -129,11 +134,22 @@ def examine_structure(
         [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
     )
     constrained = examine_constraints(system, guesses)
-    violation = constraint_violation(system, constrained.margin)
+    violation = constraint_violation(system, constrained.degrees, constrained.margin)
     if violation:
         raise violation
     structure = examine_outputs(constrained)
-    return structure, control_violation(system, structure.control_margin)
+    degrees = structure.output_degrees
+    return structure, control_violation(system, degrees, structure.control_margin)
+
+
+def default_spread(nominal: FloatArray) -> FloatArray:
+    """How far states are drawn from the nominal one, shape (n,): 0.1, in other units than usual.
+
+    That is a tenth of the nominal value where this is above 1, or below 1e-3 and not round-off.
+    """
+    size = np.abs(nominal)
+    small = (size < 1e-3) & (size > 1e-12 * size.max())
+    return 0.1 * np.where((size > 1.0) | small, size, 1.0)
 
 
 def check_system(system: DaeSystem) -> None:
@@ -145,7 +161,7 @@ def check_system(system: DaeSystem) -> None:
     """
     if system.num_controls == 0:
         raise ModelError(f"{system.name}: no control inputs, so there is nothing to steer")
-    _check_mass_matrix(system)
+    _check_mass_matrix(system, system.nominal_state[None])
     if system.num_constraints > system.num_states:
         raise AssumptionError(
             f"m = {system.num_constraints} constraints on n = {system.num_states} states depend "
@@ -196,6 +212,7 @@ def examine_constraints(
     fields = Fields(system.explicit)
     chains = _constraint_chains(system.explicit, fields, guesses, region)
     samples = Samples(Manifold(system, chains), fields, guesses, region)
+    _check_mass_matrix(system, samples.states)
     motion = Motion(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(motion)
     margin = samples.margin(elimination.constraint_matrix) if chains else None
@@ -239,22 +256,28 @@ def examine_outputs(constrained: Constrained) -> Structure:
     )
 
 
-def constraint_violation(system: DaeSystem, margin: Margin | None) -> AssumptionError | None:
+def constraint_violation(
+    system: DaeSystem, degrees: Sequence[int], margin: Margin | None
+) -> AssumptionError | None:
     """How a singular A(x) violates Assumption (1) or (2)."""
+    signals = zip(system.constraint_output_signals, degrees, strict=True)
     return _rank_violation(
         margin,
-        [f"constraint '{s.name}'" for s in system.constraint_output_signals],
+        [("constraint inputs act", degree, f"constraint '{s.name}'") for s, degree in signals],
         (1, 2),
         "A(x) of (2) loses rank: the constraints are redundant or their forces cannot act "
         "independently. Remove a redundant constraint, or keep away from this state",
     )
 
 
-def control_violation(system: DaeSystem, margin: Margin) -> AssumptionError | None:
+def control_violation(
+    system: DaeSystem, degrees: Sequence[int], margin: Margin
+) -> AssumptionError | None:
     """How a singular B(x) violates Assumption (4) or (5)."""
+    signals = zip(system.output_signals, degrees, strict=True)
     return _rank_violation(
         margin,
-        [f"output '{s.name}'" for s in system.output_signals],
+        [("control acts", degree, f"output '{s.name}'") for s, degree in signals],
         (4, 5),
         "B(x) of (16) is singular: the controlled outputs "
         f"{', '.join(s.name for s in system.output_signals)} cannot be steered independently. An "
@@ -264,23 +287,27 @@ def control_violation(system: DaeSystem, margin: Margin) -> AssumptionError | No
 
 
 def _rank_violation(
-    margin: Margin | None, rows: Sequence[str], assumptions: tuple[int, int], message: str
+    margin: Margin | None,
+    rows: Sequence[tuple[str, int, str]],
+    assumptions: tuple[int, int],
+    message: str,
 ) -> AssumptionError | None:
     """What a singular matrix violates.
 
     Args:
         margin: Of the matrix.
-        rows: What its rows belong to.
+        rows: What acts on which derivative of what.
         assumptions: The number that is violated if a whole row vanishes, and if not.
         message: Of the second.
     """
     if margin is None or not margin.is_singular:
         return None
     if margin.vanishing_row is not None:
+        acts, order, what = rows[margin.vanishing_row]
         return AssumptionError(
-            f"the relative degree of {rows[margin.vanishing_row]} is not defined at x = "
-            f"{show(margin.state)}: the inputs act on that derivative around this state, but not "
-            "there. Keep away from this state, or choose another function",
+            f"the relative degree of {what} is not defined at x = {show(margin.state)}: the "
+            f"{acts} on its derivative {order} around this state, but not there. Keep away from "
+            "this state, or choose another function",
             assumptions[0],
             margin.state,
         )
@@ -292,20 +319,25 @@ def _rank_violation(
     )
 
 
-def _check_mass_matrix(system: DaeSystem) -> None:
-    """Its factorization LDL^T reads one triangle, and would not notice."""
-    symbols = [system.state, system.parameter_symbol]
-    function = ca.Function("mass", symbols, [ca.densify(system.mass_matrix)])
-    mass = function(system.nominal_state, system.parameter_values).full()
-    length = np.sqrt(np.abs(np.diag(mass)))
-    if np.all(np.isfinite(mass)) and np.all(length > 0.0):
-        mass = mass / length / length[:, None]
-        if np.allclose(mass, mass.T, rtol=0.0, atol=1e-9) and np.linalg.eigvalsh(mass)[0] > 1e-12:
-            return
-    raise ModelError(
-        f"{system.name}: mass_matrix is not symmetric and positive definite at the nominal state "
-        f"x = {show(system.nominal_state)}"
-    )
+def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
+    """Its factorization LDL^T reads one triangle, and would not notice.
+
+    Raises:
+        ModelError: It is not symmetric and positive definite at a state.
+    """
+    function = traced(system, mass=ca.densify(system.mass_matrix))
+    for state in states:
+        mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
+        length = np.sqrt(np.abs(np.diag(mass)))
+        if np.all(np.isfinite(mass)) and np.all(length > 0.0):
+            scaled = mass / length / length[:, None]
+            symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+            if symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
+                continue
+        raise ModelError(
+            f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
+            f"{show(state)}"
+        )
 
 
 def _constraint_chains(
@@ -382,16 +414,16 @@ def _output_chains(
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
     highest_derivatives = ca.SX(count, 1)
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    numbers = np.array([value for value, _ in n_star_values])
+    slopes = np.array([value for value, _ in n_star_values])
     following = elimination.l_star
     rows = elimination.n_star
     undecided = list(range(count))
     while undecided:
-        acts, still = _acts(numbers), []
+        acts, still = _acts(slopes), []
         for row, i in enumerate(undecided):
             if acts[row].all():
                 drift[i] = following[row]
-                control_matrix[i, :] = _without_round_off(rows[row, :], numbers[:, row, :])
+                control_matrix[i, :] = _without_round_off(rows[row, :], slopes[:, row, :])
                 highest_derivatives[i] = moving[row]
             elif acts[row].any():
                 state = samples.states[int(np.argmin(acts[row]))]
@@ -412,8 +444,8 @@ def _output_chains(
         # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
         moving = motion.derivative(moving[[undecided.index(i) for i in still]])
         following, rows = affine(motion.expand(moving), motion.control)
-        numbers = samples.derivatives(rows, last, h_star_values)
-        acts, stuck = _acts(numbers), []
+        slopes = samples.derivatives(rows, last, h_star_values)
+        acts, stuck = _acts(slopes), []
         for row, i in enumerate(still):
             if acts[row].any():
                 continue

@@ -14,9 +14,8 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.manifold import CONSISTENT
 from drake_dae.dae.structure import Structure, find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import (
     FloatArray,
     InconsistentStateError,
@@ -64,6 +63,8 @@ class DaePlant(ParameterizedSystem):
     """
 
     def __init__(self, system: DaeSystem | Structure, project: bool = True) -> None:
+        if not isinstance(system, Structure):
+            check_is_system(system, "DaePlant")
         structure = system if isinstance(system, Structure) else find_structure(system)
         super().__init__(structure.system, structure.system.parameter_values)
         self.structure = structure
@@ -223,13 +224,14 @@ class DaePlant(ParameterizedSystem):
 
     def _check_start(self, context: Context) -> EventStatus:
         manifold = self.structure.manifold
-        residual = manifold.residual(self.state(context), self.parameters(context))
-        if np.max(np.abs(residual), initial=0.0) <= CONSISTENT:
+        state, parameters = self.state(context), self.parameters(context)
+        if manifold.is_consistent(state, parameters):
             return EventStatus.DidNothing()
+        residual = manifold.residual(state, parameters)
         table = ", ".join(
             f"{signal.name} = {value:.3g} {signal.unit}"
             for signal, value in zip(manifold.residual_signals, residual, strict=True)
-            if not abs(value) <= CONSISTENT
+            if not abs(value) <= 1e-3 * np.max(np.abs(residual))
         )
         raise InconsistentStateError(
             f"{self.dae.name}: the start state is not on the constraint: {table}. Call "

@@ -7,7 +7,6 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, ValueProducer
 
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.manifold import CONSISTENT
 from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.samples import show
 from drake_dae.dae.structure import Structure
@@ -136,8 +135,8 @@ class StateRealization(ParameterizedSystem):
         x = np.array(state, dtype=float)
         p = self.parameters(context)
         manifold = self.normal_form.structure.manifold
-        residual = manifold.residual(x, p)
-        if not np.max(np.abs(residual), initial=0.0) <= CONSISTENT:
+        if not manifold.is_consistent(x, p):
+            residual = manifold.residual(x, p)
             raise InconsistentStateError(
                 f"{self.dae.name}: the state is not on the constraint: the largest of its "
                 f"residuals is {np.max(np.abs(residual)):.3g}. Start from "
