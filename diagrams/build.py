@@ -70,7 +70,14 @@ def build(
     with _at("start.positions"):
         guess = links.default_positions.copy()
         for name, value in scenario.start.positions.items():
-            guess[_index(name, links.position_signals, "joint position")] = value
+            index = _index(name, links.position_signals, "joint position")
+            low, high = (limits[index] for limits in links.position_limits)
+            if not low <= value <= high:
+                unit = links.position_signals[index].unit
+                raise ScenarioError(
+                    f"{name} = {value:g} {unit} is outside its limits, {low:g} to {high:g} {unit}"
+                )
+            guess[index] = value
     stages = []
     for index, form in enumerate(scenario.actuation):
         with _at(f"actuation.{index}"):

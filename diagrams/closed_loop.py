@@ -12,7 +12,14 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.errors import FloatArray, InconsistentStateError, ModelError, WiringError
+from drake_dae.dae.zero_dynamics import first_outputs
+from drake_dae.errors import (
+    DrakeDaeError,
+    FloatArray,
+    InconsistentStateError,
+    ModelError,
+    WiringError,
+)
 from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.simulation.meshcat import (
     FRAME_RATE,
@@ -60,6 +67,9 @@ class ClosedLoop:
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
     meshcat: Meshcat | None
     sensor: ForceSensor | None
+
+    def __repr__(self) -> str:
+        return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.loggers)})"
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Chooses the noise of the sensor; without a call it is the same in every run.
@@ -133,7 +143,11 @@ def make_closed_loop(
     # The plant, its reference and its controller.
     plant = builder.AddSystem(system)
     reference = builder.AddSystem(ReferenceGenerator(references, law.degrees))
-    controller = builder.AddSystem(TrackingController(law))
+    try:
+        outputs = first_outputs(law.structure, reference.reference(0.0))
+    except DrakeDaeError:
+        outputs = None  # It begins later.
+    controller = builder.AddSystem(TrackingController(law, outputs))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))

@@ -1,7 +1,7 @@
 """What a scenario asks for, before it is simulated: analysis, needed forces, limits."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_dae.dae.analysis import analyze
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.report import Analysis
+from drake_dae.dae.report import Analysis, count_of
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tables import Part, Table, digits, to_markdown, to_text
 from drake_dae.diagrams.build import build
@@ -20,7 +20,13 @@ from drake_dae.simulation.summary import Limits
 from drake_dae.systems.robot_plant import RobotPlant
 
 SAMPLES = 1001
-"""At how many times along the reference."""
+"""At how many times along the reference, at least."""
+
+MOST_SAMPLES = 20_000
+"""At how many times along a reference that varies fast, at most."""
+
+_STRAIGHT = 0.01
+"""How far a reference is from a straight line between two times, of the range that it covers."""
 
 _SLACK = 1e-9
 """Of joint limits, in their unit: a start on the limit is not beyond it."""
@@ -81,6 +87,8 @@ class Preview:
             with rigid joints, where that is u.
         constraint_forces: Of the constraints.
         joints: Positions and velocities of the joints that have limits.
+        is_resolved: Whether the times follow the reference; if not, it varies faster than they do,
+            and the values between them are not known.
     """
 
     analysis: Analysis
@@ -89,6 +97,7 @@ class Preview:
     joint_forces: tuple[Course, ...] = ()
     constraint_forces: tuple[Course, ...] = ()
     joints: tuple[Course, ...] = ()
+    is_resolved: bool = True
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -118,6 +127,10 @@ class Preview:
                 )
         return tuple(found)
 
+    def __repr__(self) -> str:
+        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Preview('{self.analysis.system.name}': {found})"
+
     def __str__(self) -> str:
         return to_text(self._parts())
 
@@ -130,6 +143,7 @@ class Preview:
         return {
             "analysis": self.analysis.to_dict(),
             "duration": self.duration,
+            "resolved": self.is_resolved,
             **{
                 key: [course.to_dict() for course in getattr(self, key)]
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
@@ -148,7 +162,7 @@ class Preview:
                     [
                         *_name(course),
                         digits(abs(course.peak[0])),
-                        f"{course.peak[1]:.4g} s",
+                        _when(course, course.peak[1]),
                         f"{course.high:.4g}" if np.isfinite(course.high) else "none",
                         "" if course.beyond_time is None else "over its limit",
                     ]
@@ -160,9 +174,9 @@ class Preview:
                 [
                     *_name(course),
                     digits(course.least),
-                    f"{course.least_time:.4g} s",
+                    _when(course, course.least_time),
                     digits(course.largest),
-                    f"{course.largest_time:.4g} s",
+                    _when(course, course.largest_time),
                     "" if course.beyond_time is None else "pulls: a real contact would open",
                 ]
                 for course in self.constraint_forces
@@ -181,6 +195,15 @@ class Preview:
                 for course in self.joints
             ]
             parts.append(Table(["joint", "unit", "least", "largest", "limits", ""], rows, left=2))
+        motion = self.analysis.motion
+        if motion is not None and motion.times.size:
+            text = f"Started without errors, and examined at {motion.times.size} times."
+            if not self.is_resolved:
+                text += (
+                    " The reference varies too fast for these: what lies between them is not "
+                    "known. A shorter duration takes them closer together."
+                )
+            parts.append([text])
         problems = self.problems
         parts.append([f"PROBLEM  {problem}" for problem in problems] or ["no problem found"])
         return parts
@@ -207,13 +230,51 @@ def preview(scenario: Scenario) -> Preview:
     if not isinstance(plant, RobotPlant):
         raise ModelError("a scenario describes a robot")
     begin = scenario.integrator.start_time
+    times, is_resolved = sample_times(loop.reference.reference, begin, begin + scenario.duration)
     analysis = analyze(
         plant.dae,
         reference=loop.reference.reference,
-        times=np.linspace(begin, begin + scenario.duration, SAMPLES),
+        times=times,
         start=plant.state(plant.GetMyContextFromRoot(context)),
     )
-    return _with_courses(analysis, scenario.duration, plant.model)
+    return replace(_with_courses(analysis, scenario.duration, plant.model), is_resolved=is_resolved)
+
+
+def sample_times(
+    reference: Callable[[float], FloatArray], begin: float, end: float
+) -> tuple[FloatArray, bool]:
+    """Times between which a reference is nearly straight.
+
+    Even times alone would see a sinusoid stand still whose period fits between them. Each interval
+    is tried at a random place, until a whole round finds nothing new.
+
+    Args:
+        reference: t -> R(t).
+        begin, end: In s.
+
+    Returns:
+        Between SAMPLES and MOST_SAMPLES increasing times in s, and whether these are enough.
+    """
+    random = np.random.default_rng(0)
+    times = np.linspace(begin, end, SAMPLES)
+    values = np.array([reference(time) for time in times])
+    while True:
+        share = random.uniform(0.3, 0.7, times.size - 1)
+        tried = times[:-1] + share * np.diff(times)
+        found = np.array([reference(time) for time in tried])
+        known = np.concatenate([values, found])
+        # Beside what is round-off of a constant.
+        allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
+        off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
+        new = np.flatnonzero(np.any(off > allowed, axis=1))
+        room = MOST_SAMPLES - times.size
+        is_resolved = new.size <= room
+        if not is_resolved:
+            new = np.sort(random.choice(new, room, replace=False))
+        times = np.insert(times, new + 1, tried[new])
+        values = np.insert(values, new + 1, found[new], axis=0)
+        if not (new.size and is_resolved):
+            return times, is_resolved
 
 
 def _with_courses(analysis: Analysis, duration: float, model: RobotModel) -> Preview:
@@ -277,6 +338,12 @@ def _course(
         high,
         float(times[np.argmax(beyond)]) if beyond.any() else None,
     )
+
+
+def _when(course: Course, time: float) -> str:
+    """Nothing for a constant, whose extremes are round-off."""
+    size = max(abs(course.least), abs(course.largest))
+    return f"{time:.4g} s" if course.largest - course.least > 1e-9 * size else ""
 
 
 def _name(course: Course) -> list[str]:

@@ -86,7 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
         "error",
     )
-    examine.add_argument("--json", action="store_true", help="print JSON")
+    examine.add_argument(
+        "--json", action="store_true", help='print JSON; for an error, its text under "error"'
+    )
     options = parser.parse_args(arguments)
     # Drake tells where each Meshcat listens, also the one that only records.
     logging.getLogger("drake").setLevel(logging.WARNING)
@@ -98,7 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _simulate(options)
     except DrakeDaeError as error:
         # Texts of Drake and YAML may have several lines.
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        text = " ".join(str(error).split())
+        print(f"error: {text}", file=sys.stderr)
+        if options.command == "analyze" and options.json:
+            print(json.dumps({"error": text}))
         return 1
     except BrokenPipeError:
         # The reader of our output, such as head, has enough; Python would complain on exit.

@@ -110,6 +110,8 @@ def linearize(model: RobotModel, structure: Structure) -> float:
     )
     found = np.sort_complex(np.linalg.eigvals(linear.A()))
     print("eigenvalues of the closed loop:", np.array2string(found, precision=6))
+    off_wall = sum(structure.constraint_degrees)
+    print(f"{off_wall} of them are zero, sum r_i: the directions off N*, in which nothing drives")
     expected = [-(1.0 + gain) / lag, -5.0, -3.0, 0.0, 0.0]
     return float(np.max(np.abs(found - expected)))
 
@@ -171,4 +173,7 @@ def replay(plant: RobotPlant, control: PiecewisePolynomial, start: np.ndarray) -
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    if not folder.is_dir():
+        sys.exit(f"no folder '{folder}'; the picture goes into a folder that is there")
+    main(folder)

@@ -65,18 +65,21 @@ def main(folder: Path) -> float:
     print(f"degrees: r = {law.structure.constraint_degrees}, mu = {law.degrees}")
     print(f"errors off the solutions of (72), (73) by at most {off:.1e} (claim: 1e-7)")
     state = record["state"]
-    figure, axes = plt.subplots(2, 1, sharex=True, layout="constrained")
+    figure, axes = plt.subplots(2, 1, sharex=True, figsize=(8, 5), layout="constrained")
     axes[0].plot(record.time, 1e3 * (state[:, 14:21] - state[:, :7]))
     axes[0].set_ylabel("deflection q2 - q1 [mrad]")
-    axes[0].legend([f"joint {i + 1}" for i in range(7)], ncols=4)
+    axes[0].legend([f"joint {i + 1}" for i in range(7)], loc="center left", bbox_to_anchor=(1, 0.5))
     axes[1].plot(record.time, record["desired_output"][:, 6], "--", label="desired")
     axes[1].plot(record.time, record["constraint_force"], label="simulated")
     axes[1].set(xlabel="time [s]", ylabel="contact force [N]")
-    axes[1].legend()
+    axes[1].legend(loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(folder / "flexible_joints.png", dpi=120)
     plt.close(figure)
     return off
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    if not folder.is_dir():
+        sys.exit(f"no folder '{folder}'; the picture goes into a folder that is there")
+    main(folder)

@@ -91,4 +91,7 @@ def main(folder: Path) -> tuple[float, float, float]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    if not folder.is_dir():
+        sys.exit(f"no folder '{folder}'; the picture goes into a folder that is there")
+    main(folder)

@@ -64,6 +64,7 @@ def main(folder: Path) -> tuple[float, float]:
     figure, axis = plt.subplots(layout="constrained")
     axis.plot(*record["desired_output"][:, :2].T, "--", *record["controlled_output"][:, :2].T)
     axis.set(xlabel="y [m]", ylabel="z [m]", aspect="equal", title="tool on the wall")
+    axis.locator_params(axis="x", nbins=5)  # Equal axes are narrow.
     axis.legend(["desired", "simulated"])
     figure.savefig(folder / "urdf_arm.png", dpi=120)
     plt.close(figure)
@@ -71,4 +72,7 @@ def main(folder: Path) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+    if not folder.is_dir():
+        sys.exit(f"no folder '{folder}'; the picture goes into a folder that is there")
+    main(folder)

@@ -239,3 +239,18 @@ def test_the_default_state_is_at_rest(kind):
     rate = plant.EvalTimeDerivatives(context).CopyToVector()[:4]
     # Condition numbers of about 1e3 on forces of about 1e2.
     assert np.max(np.abs(rate)) < 1e-7
+
+
+def test_velocities_that_are_no_derivatives_are_refused():
+    """q' = 2 v: a spring between positions would not do the work that it stores."""
+    links = LinkExpressions(
+        q=ca.SX.sym("q"),
+        v=ca.SX.sym("v"),
+        mass_matrix=ca.SX(3.0),
+        bias=ca.SX(0.0),
+        velocity_map=ca.SX(2.0),
+    )
+    with pytest.raises(ModelError, match="derivatives of positions, q_i' = v_i"):
+        RobotModel(
+            links, [], [JointPositions(["q0"])], actuation=[FlexibleJoints(8.0, inertia=1.0)]
+        )

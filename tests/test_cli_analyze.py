@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 from drake_dae import build, load_scenario, simulate
 from drake_dae.cli import main
+from drake_dae.diagrams import preview as preview_module
 from drake_dae.diagrams.preview import preview
 from drake_dae.diagrams.scenario import find_scenario, shipped_scenarios
 from drake_dae.simulation.summary import Limits
@@ -145,6 +146,56 @@ def test_a_contact_that_would_have_to_pull(capsys):
     assert re.search(r"^wall\.force +N +-3 .* pulls: a real contact would open$", text, re.M)
 
 
+@pytest.mark.parametrize("periods", [10, 200, 1000])
+def test_times_follow_a_reference_that_even_times_would_not_see(periods):
+    """1001 even times over 1000 periods see sin(2 pi t) as 0, and half as many as a beat."""
+    wanted = lambda t: np.array([4.0 + 5.0 * np.sin(2 * np.pi * t), 0.3])  # noqa: E731
+    times, is_resolved = preview_module.sample_times(wanted, 0.0, float(periods))
+    assert is_resolved
+    assert (times[0], times[-1]) == (0.0, periods)
+    assert preview_module.SAMPLES <= times.size <= preview_module.MOST_SAMPLES
+    assert np.all(np.diff(times) > 0.0)
+    values = np.array([wanted(t)[0] for t in times])
+    # A chord is off by 1 % of the range, 0.1, at a random place of it: 0.16 at the worst.
+    assert values.min() == pytest.approx(-1.0, abs=0.16)
+    assert values.max() == pytest.approx(9.0, abs=0.16)
+    # Long ones are about turning points of the curvature, or passed by chance.
+    assert np.quantile(np.diff(times), 0.9) < 0.15
+
+
+def test_times_that_do_not_suffice_are_told():
+    wanted = lambda t: np.array([np.sin(1e4 * t)])  # noqa: E731
+    times, is_resolved = preview_module.sample_times(wanted, 0.0, 100.0)
+    assert not is_resolved
+    assert times.size == preview_module.MOST_SAMPLES
+    values = np.array([wanted(t)[0] for t in times])
+    assert np.ptp(values) > 1.99
+    analysis = preview(scenario("two_link_wall", "duration=0.1")).analysis
+    told = preview_module.Preview(analysis, 0.1, is_resolved=False)
+    assert "The reference varies too fast" in str(told)
+    assert told.to_dict()["resolved"] is False
+
+
+def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
+    """2 + 5 sin 20 pi t over 10 s at 101 even times, all of them at its zeros."""
+    monkeypatch.setattr(preview_module, "SAMPLES", 101)
+    fast = ("references.1.offset=2", "references.1.frequencies=[62.83185307179586]")
+    arguments = [word for setting in fast for word in ("--set", setting)]
+    code, text = analyze(capsys, "two_link_wall", *arguments, "--set", "duration=10")
+    assert code == 2
+    found = re.search(r"PROBLEM  wall\.force pulls from (\S+) s on, most with (\S+) N", text)
+    assert float(found[2]) == pytest.approx(3.0, abs=0.16)
+    assert float(found[1]) == pytest.approx((np.pi + np.arcsin(0.4)) / (20 * np.pi), abs=0.01)
+
+
+def test_extremes_of_a_constant_have_no_time(capsys):
+    settings = ["--set", "references.1=!Constant {values: [15]}", "--set", "duration=2"]
+    _, text = analyze(capsys, "two_link_wall", *settings)
+    row = [line.split() for line in text.splitlines() if line.startswith("wall.force")][-1]
+    assert row == ["wall.force", "N", "15", "15"]
+    assert "Started without errors, and examined at 1001 times." in text
+
+
 def test_a_pin_may_pull():
     told = preview(scenario("five_bar", "references.2.offset=-15"))
     assert course(told.constraint_forces, "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
@@ -214,6 +265,28 @@ def test_errors(arguments, message, capsys):
     (line,) = captured.err.splitlines()
     assert line.startswith("error: ")
     assert message in line
+
+
+def test_an_error_as_json(capsys):
+    assert main(["analyze", "two_link_wall", "--json", "--set", "start.positions.joint2=9"]) == 1
+    captured = capsys.readouterr()
+    text = "start.positions: joint2 = 9 rad is outside its limits, "
+    assert json.loads(captured.out)["error"].startswith(text)
+    assert captured.err.startswith(f"error: {text}")
+
+
+def test_objects_are_one_line_at_the_prompt():
+    case = scenario("two_link_wall", "duration=0.1")
+    assert repr(preview(case)) == "Preview('two_link_arm': no problem found)"
+    loop, _ = build(case)
+    assert repr(loop).startswith("ClosedLoop('two_link_arm', logs state, constraint_force, ")
+
+
+def test_states_have_units(capsys):
+    _, text = analyze(capsys, "two_link_wall")
+    assert re.search(
+        r"^B\(x\) is nearest to singular at joint1=\S+ rad, joint2=\S+ rad\.$", text, re.M
+    )
 
 
 def test_help_tells_the_exit_codes(capsys):

@@ -49,6 +49,13 @@ def test_example(name, tmp_path, capsys):
     assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
+def test_a_folder_that_is_not_there(tmp_path):
+    command = [sys.executable, EXAMPLES / "textbook_robot.py", tmp_path / "none"]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (found.returncode, found.stdout) == (1, "")
+    assert re.fullmatch(r"no folder '.*none'; the picture goes into .*\n", found.stderr)
+
+
 def test_an_example_runs_by_itself(tmp_path):
     subprocess.run(
         [sys.executable, EXAMPLES / "textbook_robot.py", tmp_path], check=True, timeout=60

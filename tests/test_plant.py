@@ -229,3 +229,8 @@ def test_parameters_that_make_no_sense_are_refused():
         with pytest.raises(ModelError, match=message):
             plant.set_parameter(context, "link2.mass", value)
     assert plant.get_parameter(context, "link2.mass") == 6.0
+
+
+def test_what_is_no_system_is_refused():
+    with pytest.raises(ModelError, match="DaePlant needs a DaeSystem, got NoneType"):
+        DaePlant(None)

@@ -382,3 +382,16 @@ def test_wrong_inputs():
         minimal.set_state(context, [0.5, 0.0])
     with pytest.raises(ModelError, match="does not convert to AutoDiffXd"):
         minimal.ToAutoDiffXd()
+
+
+def test_a_system_is_as_good_as_its_normal_form():
+    known = realization("pendulum")
+    same = StateRealization(known.dae)
+    contexts = []
+    for plant in (known, same):
+        context = plant.CreateDefaultContext()
+        plant.GetInputPort("control").FixValue(context, [0.7])
+        contexts.append(plant.EvalTimeDerivatives(context).CopyToVector())
+    np.testing.assert_array_equal(*contexts)
+    with pytest.raises(ModelError, match="StateRealization needs a DaeSystem, got NoneType"):
+        StateRealization(None)

@@ -1,5 +1,7 @@
 """References: values and derivatives by other routes, smoothness, and refusals."""
 
+import math
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -173,3 +175,50 @@ def test_high_orders_do_not_cancel(order):
 def test_more_refusals(make, message):
     with pytest.raises(ReferenceSignalError, match=message):
         make()
+
+
+NOT_SMOOTH = {
+    "fabs": lambda t: 0.3 * ca.fabs(t - 1),
+    "a comparison": lambda t: ca.if_else(t < 1, 0, 0.3),
+    "if_else": lambda t: ca.if_else(t, 0, 0.3),
+    "floor": lambda t: ca.sin(ca.floor(t)),
+}
+
+
+@pytest.mark.parametrize("what", NOT_SMOOTH)
+def test_kinks_and_steps_are_refused_where_derivatives_are_needed(what):
+    """CasADi would take the derivatives of one side, and the error would leave its prediction."""
+    signal = ExpressionSignal(NOT_SMOOTH[what])
+    message = rf"^row 0 of the reference is not smooth: it takes {what} of the time\. .* needs 1 d"
+    with pytest.raises(ReferenceSignalError, match=message):
+        ReferenceGenerator([constant(0.0), signal], [0, 1])
+    # A force that is met at once may jump.
+    generator = ReferenceGenerator([signal], [0])
+    assert np.isfinite(generator.reference(0.5)).all()
+
+
+def test_a_signal_of_which_one_row_is_not_smooth():
+    signal = ExpressionSignal(lambda t: [ca.sin(t), ca.fabs(t)])
+    assert ReferenceGenerator([signal], [2, 0]).reference(-1.0)[3] == 1.0
+    with pytest.raises(ReferenceSignalError, match=r"^row 1 of the reference is not smooth"):
+        ReferenceGenerator([signal], [0, 2])
+
+
+def test_the_function_of_the_real_numbers_is_no_reference():
+    signal = ExpressionSignal(lambda t: math.sin(t))
+    with pytest.raises(ReferenceSignalError, match=r"not finite, nan; .* use casadi\.sin"):
+        ReferenceGenerator([signal], [2])
+
+
+@pytest.mark.parametrize("value", [None, "a", [None], {}])
+def test_what_is_no_expression_is_refused(value):
+    with pytest.raises(ReferenceSignalError, match="must be an expression of the time"):
+        ExpressionSignal(lambda t: value)
+
+
+def test_what_is_no_signal_is_refused():
+    with pytest.raises(ReferenceSignalError, match="constant: values must be numbers, got 'a'"):
+        constant("a")
+    message = r"references\[1\] must be a signal such as constant\(0\.3\), got 0\.5$"
+    with pytest.raises(ReferenceSignalError, match=message):
+        ReferenceGenerator([constant(0.3), 0.5], [0, 0])

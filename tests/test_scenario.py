@@ -756,6 +756,10 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("plant_parameters={link9.mass: [1]}", ["plant_parameters: ", "link9.mass", "link2.mass"]),
         # The start.
         ("start.positions.joint9=1", ["start.positions: ", "'joint9'", "there are joint1, joint2"]),
+        (
+            "start.positions.joint1=9",
+            ["start.positions: joint1 = 9 rad is outside its limits, -3.1416 to 3.1416 rad"],
+        ),
         ("start.errors.tool.x=1", ["start.errors: ", "'tool.x'", "there are tool.z"]),
         ("start.errors.wall.force=1", ["start.errors: ", "'wall.force'"]),
         ("start.errors.tool.z=5", ["start: ", "tool.z = 5.3 m", "reach"]),

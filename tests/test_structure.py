@@ -806,3 +806,22 @@ def test_a_column_of_b_that_is_only_round_off_is_zero():
     error = violation(system)
     assert error.assumption == 5
     assert "dynamic_extension" in str(error)
+
+
+def test_b_keeps_what_is_zero_at_the_default_parameters_alone():
+    coupling = Parameter("c", 0.0)
+    x = ca.SX.sym("x", 2)
+    system = DaeSystem(
+        state=x,
+        f=-x,
+        g=[],
+        h=[[1, coupling.symbol], [0, 1]],
+        k=[],
+        l=[x[0], x[1]],
+        m=[],
+        parameters=(coupling,),
+    )
+    function = TracedFunction(
+        "B", {"x": x, "c": coupling.symbol}, {"B": find_structure(system).control_matrix}
+    )
+    np.testing.assert_array_equal(function([0.1, 0.2], [0.5])[0], [[1.0, 0.5], [0.0, 1.0]])

@@ -220,7 +220,7 @@ def test_a_multibody_plant_of_expressions():
         (lambda a: a + Variable("w"), r"k cannot hold .*: the variable w is neither a state nor"),
         (lambda a: Variable("b", Variable.Type.BOOLEAN), r"the variable b is neither"),
         (lambda a: "x", r"k cannot hold x: it is no expression of pydrake.symbolic, but str"),
-        (lambda a: np.nan, r"pendulum: k holds a constant that is not finite"),
+        (lambda a: np.nan, r"pendulum: k, entry .* holds a constant that is not finite"),
         (lambda a: [a, a], r"pendulum: g has shape"),
     ],
 )
@@ -231,6 +231,8 @@ def test_refusals_name_the_function_and_the_expression(make, message):
 
 def test_refused_variables():
     x = Variable("x")
+    with pytest.raises(ModelError, match=r"states must be a list of Variables, got Variable"):
+        from_symbolic(x, f=[x], h=[1.0], l=[x])
     for states, parameters, message in (
         ([x, x], {}, "the variable x stands twice"),
         ([x], {x: 1.0}, "the variable x stands twice"),

@@ -1,4 +1,6 @@
+import math
 from dataclasses import FrozenInstanceError, replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -6,7 +8,7 @@ import pytest
 from problems import double_integrator
 
 from drake_dae.dae.signals import Parameter, Signal, signals
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import ModelError
 
 
@@ -169,7 +171,7 @@ WRONG_SHAPES = {
     "f": (lambda x: [x[1], 0, 0], r"f has shape \(3, 1\), expected \(2, 1\)"),
     "g": (lambda x: [[1, 0], [0, 1]], r"g has shape \(2, 2\), expected \(2, 0\)"),
     "h": (lambda x: [0, 1, 0], r"h has shape \(3, 1\), expected \(2, 1\)"),
-    "k": (lambda x: [[x[0], 1], [x[1], 1]], r"expected \(\d+, \d\)"),
+    "k": (lambda x: x[0], "k is given, so g and m are needed; g is missing, with shape .2, 1"),
     "l": (lambda x: x, r"l has shape \(2, 1\), expected \(1, 1\).*as many controlled outputs"),
     "m": (lambda x: [1, 2], r"m has shape \(2, 1\), expected \(1, 0\)"),
 }
@@ -182,6 +184,52 @@ def test_wrong_shapes_are_refused_by_name(key):
         double_integrator(**{key: function})
 
 
+def test_only_g_beside_k_is_refused():
+    message = r"k is given, so g and m are needed; m is missing, with shape \(1, 1\)"
+    with pytest.raises(ModelError, match=message):
+        double_integrator(k=lambda x: x[0], g=lambda x: [0, 1])
+    with pytest.raises(ModelError, match=r"k has shape \(2, 2\), expected \(4, 1\)|g has shape"):
+        constrained(k=lambda x: [[x[0], 1], [x[1], 1]])
+
+
+@pytest.mark.parametrize("state", [None, 2.0, "xv", [3], [], 0, -1])
+def test_states_that_are_none_are_refused(state):
+    fields = {"f": lambda x: x, "h": lambda x: x, "l": lambda x: x}
+    with pytest.raises(ModelError, match=r"the states must be a list|at least one state"):
+        DaeSystem.from_functions(state, **fields)
+
+
+def test_labels_that_are_none_are_refused():
+    with pytest.raises(ModelError, match=r"no field 'nominal'; did you mean 'nominal_state'\?"):
+        double_integrator(nominal=[0, 0])
+    with pytest.raises(ModelError, match=r"no field 'state_signals'"):
+        double_integrator(state_signals=["a", "b"])
+    with pytest.raises(ModelError, match="name of a system must be text, got None"):
+        double_integrator(name=None)
+    for signals_given in ([3], "z"):
+        with pytest.raises(ModelError, match="output_signals must be a list of names or Signals"):
+            double_integrator(output_signals=signals_given)
+
+
+def test_a_parameter_that_is_not_there():
+    with pytest.raises(ModelError, match=r"function f failed.*no parameter 'kk'; there are a, k$"):
+        double_integrator(f=lambda x, p: [x[1], -p.kk], parameters={"a": 1.0, "k": 1.0})
+
+
+def test_a_system_is_one_line_at_the_prompt():
+    assert repr(constrained(name="slider")) == "DaeSystem('slider', n=4, m=1, p=2)"
+
+
+def test_what_has_a_system_is_no_system():
+    system = double_integrator()
+    check_is_system(system, "a test")
+    with pytest.raises(ModelError, match=r"a test needs a DaeSystem, got NoneType$"):
+        check_is_system(None, "a test")
+    for name in ("dae", "system"):
+        with pytest.raises(ModelError, match=rf"got SimpleNamespace; pass its \.{name}$"):
+            check_is_system(SimpleNamespace(**{name: system}), "a test")
+
+
 def test_too_many_and_too_few_outputs_are_refused():
     with pytest.raises(ModelError, match=r"l has shape \(2, 1\), expected \(1, 1\)"):
         double_integrator(l=lambda x: [x[0], x[1]])
@@ -192,18 +240,33 @@ def test_too_many_and_too_few_outputs_are_refused():
 BAD_VALUES = {
     "an MX": (lambda x: ca.MX.sym("a", 2), "casadi.* MX|CasADi MX"),
     "a list of MX": (lambda x: [ca.MX.sym("a"), 0], "f must be a CasADi SX expression"),
-    "NaN": (lambda x: [x[1], np.nan], "f holds a constant that is not finite"),
-    "infinity": (lambda x: [x[1], ca.inf], "f holds a constant that is not finite"),
+    "NaN": (lambda x: [x[1], np.nan], r"f, .* holds a constant that is not finite, nan; math.sin"),
+    "infinity": (lambda x: [x[1], ca.inf], r"f, .* holds a constant that is not finite, inf$"),
     "NaN in a product": (
         lambda x: [x[1], np.nan * x[0] + 1],
-        r"f holds a constant that is not finite, nan, in entry \[1, 0\] of shape \(2, 1\)",
+        r"f, entry \[1, 0\] of shape \(2, 1\), holds a constant that is not finite, nan",
     ),
     "text": (lambda x: "x1", "f must be a CasADi SX expression.* got str"),
     "nothing": (lambda x: None, "function f returned nothing"),
     "rows of two lengths": (lambda x: [[1, 2], [3]], "lists of one length"),
     "an unknown symbol": (lambda x: [x[1], ca.SX.sym("mass")], "f depends on mass, which is nei"),
     "a failing function": (lambda x: [x[1], x[7]], "function f failed on a CasADi column of 2"),
-    "a wrong signature": (lambda x, p: [x[1], 0], "function f failed"),
+    "a wrong signature": (
+        lambda x, p: [x[1], 0],
+        r"missing 1 required positional argument: 'p'. It is called with the state x alone",
+    ),
+    "a place that is not there": (lambda x: [x[5], 0], "out of bounds with supplied length of 2$"),
+    "no function": ([1, 2], r"f must be a function of the state, got list"),
+    "a condition": (lambda x: [x[1], 1 if x[0] > 0 else 2], "Conditions are not smooth"),
+    "Python's max": (lambda x: [x[1], max(x[0], 0)], "Conditions are not smooth"),
+    "a function of others": (
+        lambda x: [x[1], ca.sin("x")],
+        r"(?s)function f failed.*Use CasADi's own functions",
+    ),
+    "a function of the real number": (
+        lambda x: [x[1], math.sin(x[0])],
+        r"f, entry \[1, 0\] .* nan; math.sin of a symbol is nan, use casadi.sin",
+    ),
 }
 
 
@@ -223,10 +286,10 @@ def test_constants_that_are_not_finite_are_named_with_function_and_shape(key):
     rows, columns = expression.shape
     with pytest.raises(ModelError) as caught:
         replace(base, **{key: expression})
-    assert f"{key} holds a constant that is not finite, inf, in entry [{row}, {column}] of" in str(
-        caught.value
+    assert str(caught.value) == (
+        f"system: {key}, entry [{row}, {column}] of shape ({rows}, {columns}), holds a constant "
+        "that is not finite, inf"
     )
-    assert f"of shape ({rows}, {columns})" in str(caught.value)
 
 
 NOT_SMOOTH = {
@@ -253,10 +316,11 @@ def test_functions_that_are_not_smooth_are_refused(key, what):
     expression[-1] += ca.sin(NOT_SMOOTH[what](base.state[2] + 1) + 3)
     with pytest.raises(ModelError) as caught:
         replace(base, **{key: expression})
-    assert f"system: {key} is not smooth: it takes " in str(caught.value)
-    assert f"takes {what} of the state" in str(caught.value)
     shape = getattr(base, key).shape
-    assert f"in entry [{shape[0] - 1}, {shape[1] - 1}] of shape {shape}" in str(caught.value)
+    assert str(caught.value).startswith(
+        f"system: {key}, entry [{shape[0] - 1}, {shape[1] - 1}] of shape {shape}, is not smooth: "
+        f"it takes {what} of the state. "
+    )
 
 
 def test_kinks_in_parameters_alone_are_no_kinks():
@@ -311,8 +375,6 @@ def test_states_must_be_a_column_of_different_symbols():
         DaeSystem(state=ca.vertcat(x, x), f=[x, x], **{**rest, "h": [0, 1]})
     with pytest.raises(ModelError, match="stands twice"):
         DaeSystem(state=x, f=x, parameters=(Parameter("x", 1.0, symbol=x),), **rest)
-    with pytest.raises(ModelError, match="'state' must be"):
-        DaeSystem.from_functions([], f=lambda x: [], h=lambda x: [], l=lambda x: [])
     with pytest.raises(ModelError, match="state_signals names must be unique, twice: q"):
         DaeSystem.from_functions(["q", "q"], f=lambda x: x, h=lambda x: x, l=lambda x: x[0])
 

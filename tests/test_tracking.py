@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -284,6 +286,16 @@ def test_measured_force_takes_the_place_of_the_models():
     np.testing.assert_allclose(
         closed_form.control_matrix @ changed[1], [0.0, -3.0 * 0.5], rtol=1e-12, atol=1e-13
     )
+
+
+def test_what_is_no_system_or_no_design_is_refused():
+    system = pendulum().system
+    with pytest.raises(
+        ModelError, match=r"needs a DaeSystem, got SimpleNamespace; pass its \.dae$"
+    ):
+        TrackingLaw(SimpleNamespace(dae=system), poles(-1.0))
+    with pytest.raises(GainError, match=r"gains must be a design such as poles\(-4\.0\), got None"):
+        TrackingLaw(system, None)
 
 
 def test_measured_force_needs_an_output_that_is_a_force():

@@ -1,6 +1,7 @@
 """Pinned motions and zero dynamics against closed forms, pencils and other integrators."""
 
 import re
+import warnings
 from collections.abc import Callable
 
 import casadi as ca
@@ -20,13 +21,20 @@ from problems import (
 )
 from scipy.integrate import solve_ivp
 
-import drake_dae.dae.zero_dynamics as module
+import drake_dae.dae.pinned_motion as module
+from drake_dae import DaePlant, analyze, constant, make_closed_loop
 from drake_dae.dae.gains import poles
-from drake_dae.dae.structure import find_structure
+from drake_dae.dae.pinned_motion import PinnedMotion
+from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics import PinnedMotion, Verdict, ZeroDynamics
-from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
+from drake_dae.dae.zero_dynamics import Verdict, ZeroDynamics
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+    NonFiniteError,
+    NonMinimumPhaseWarning,
+)
 from drake_dae.robots.actuation import FlexibleJoints
 
 Array = np.ndarray
@@ -1008,3 +1016,89 @@ def test_an_equilibrium_without_zero_dynamics():
     rest = dynamics.equilibrium([1.2, 0.5], [0.2, 1.0, 0.3, 0.3])
     np.testing.assert_allclose(rest[2:], 0.0, atol=1e-14)
     assert dynamics.eigenvalues(rest).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("columns", "where"),
+    [
+        (lambda x: [[1, 1], [1, 1]], ""),
+        # x1 passes 0 among the states around (0, 0.05).
+        (lambda x: [[x[1], 0], [0, 1]], r"x = \[.*, *-?[0-9.]+e-"),
+    ],
+)
+def test_a_singular_b_leaves_undecided_what_has_no_zero_dynamics(columns, where):
+    """Two outputs that move alike, and one that is not moved where x1 = 0: n = mu_1 + mu_2."""
+    system = DaeSystem.from_functions(
+        2, f=lambda x: [0, 0], h=columns, l=lambda x: [x[0], x[1]], nominal_state=[0.0, 0.05]
+    )
+    structure, violation = examine_structure(system)
+    assert violation is not None
+    dynamics = ZeroDynamics(structure)
+    assert dynamics.dimension == 0
+    stability = dynamics.stability()
+    assert (stability.verdict, stability.state) == (Verdict.UNDECIDED, None)
+    assert re.search(r"B\(x\) of \(16\) is singular at " + where, stability.reason)
+
+
+def slider() -> DaeSystem:
+    """On a floor that pushes with v, and beside it xi' = xi (v - 40); z = (place, v)."""
+    return DaeSystem.from_functions(
+        ["x", "y", "vx", "vy", "xi"],
+        f=lambda s: [s[2], s[3], 0, -9.81, -40 * s[4]],
+        g=lambda s: [0, 0, 0, 1, s[4]],
+        h=lambda s: [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
+        k=lambda s: [s[1]],
+        l=lambda s: [s[0], 0],
+        m=lambda s: [[0], [1]],
+        name="slider",
+    )
+
+
+@pytest.mark.parametrize(("force", "rate"), [(20.0, -20.0), (80.0, 40.0)])
+def test_the_force_that_is_asked_for_decides(force, rate):
+    """The force is met at once, so that no state tells it: the eigenvalue is v - 40."""
+    system = slider()
+    structure = find_structure(system)
+    dynamics = ZeroDynamics(structure)
+    outputs = [0.0, force]
+    rest = dynamics.equilibrium(outputs)
+    assert dynamics.eigenvalues(rest, outputs=outputs) == pytest.approx([rate], rel=1e-9)
+    verdict = dynamics.stability(outputs=outputs).verdict
+    assert verdict is (Verdict.UNSTABLE if rate > 0 else Verdict.STABLE)
+    told = analyze(
+        system, reference=lambda t: np.array([0.0, 0.0, 0.0, force]), times=np.linspace(0, 0.1, 5)
+    )
+    assert told.zero_dynamics.verdict is verdict
+    law = TrackingLaw(system, poles(-3.0), structure)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        make_closed_loop(DaePlant(structure), law, [constant(outputs)])
+    assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "nominal"),
+    [(lambda x: -(x**2), 0.1), (lambda x: ca.cos(x) - 1, 0.3), (lambda x: 0 * x, 0.2)],
+)
+def test_an_equilibrium_that_is_found_slowly_decides_nothing(rate, nominal):
+    """Its eigenvalue is 0, and Newton's method ends where it is only near 0."""
+    system = DaeSystem.from_functions(
+        ["y", "xi"],
+        f=lambda x: [0, rate(x[1])],
+        h=lambda x: [1, 0],
+        l=lambda x: [x[0]],
+        nominal_state=[0.0, nominal],
+    )
+    assert ZeroDynamics(find_structure(system)).stability().verdict is Verdict.UNDECIDED
+
+
+def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
+    """The zero is s = 0 exactly; what is left of it after cancellation is round-off."""
+    a = [[0, 0, 0], [1, 0, 0], [0, 0, 1]]
+    system = DaeSystem.from_functions(
+        3,
+        f=lambda x: ca.mtimes(ca.DM(a), x),
+        h=lambda x: [[-2, 0], [2, 0], [0, 1]],
+        l=lambda x: [2 * x[0], x[1] - 2 * x[2]],
+    )
+    assert ZeroDynamics(find_structure(system)).stability().verdict is Verdict.UNDECIDED

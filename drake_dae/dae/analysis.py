@@ -1,6 +1,9 @@
 """Examines one system and reports what the theory says about it: `analyze`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Container, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
@@ -13,6 +16,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.region import Region
 from drake_dae.dae.report import Analysis, Assumption, Finding, count_of
 from drake_dae.dae.samples import Fields, Margin, Samples
+from drake_dae.dae.signals import numbers
 from drake_dae.dae.structure import (
     Constrained,
     Structure,
@@ -23,9 +27,15 @@ from drake_dae.dae.structure import (
     examine_constraints,
     examine_outputs,
 )
-from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.zero_dynamics import ZeroDynamics
-from drake_dae.errors import AssumptionError, FloatArray, InconsistentStateError, ModelError
+from drake_dae.dae.system import DaeSystem, check_is_system
+from drake_dae.dae.zero_dynamics import ZeroDynamics, first_outputs
+from drake_dae.errors import (
+    AssumptionError,
+    FloatArray,
+    InconsistentStateError,
+    ModelError,
+    NonFiniteError,
+)
 
 STATEMENTS = (
     "v acts on y_i first in derivative r_i",
@@ -66,7 +76,7 @@ def analyze(
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
             few others close to the first: what is zero at one state alone is not zero.
         reference: t -> R(t), output-major as for `TrackingLaw`; the margins are also taken along
-            the motion that it commands.
+            the motion that it commands, and the zero dynamics judged at its first outputs.
         times: In s, increasing, shape (k,); where on the reference.
         start: State near which the motion along the reference starts, shape (n,); the first
             examined state if None.
@@ -79,15 +89,24 @@ def analyze(
     Raises:
         InconsistentStateError: No consistent state in the region or around the nominal state, or
             given states that are not consistent.
-        ModelError: Arguments that make no sense; a system without controls, with a function that
+        ModelError: Arguments that make no sense, such as a reference whose derivatives are not
+            those of its values; a system without controls, with a function that
             is not finite, or a mass matrix that is not symmetric and positive definite.
     """
+    check_is_system(system, "analyze")
     if region is not None and states is not None:
         raise ModelError(f"{system.name}: give a region or states, not both")
     if (reference is None) != (times is None):
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ModelError(f"{system.name}: seed must be a whole number from 0, got {seed!r}")
+    if not (reference is None or callable(reference)):
+        raise ModelError(
+            f"{system.name}: reference must be a function of the time that returns R(t), got "
+            f"{reference!r}"
+        )
     box = None if region is None else _box(system, region)
     random = np.random.default_rng(seed)
     if states is None:
@@ -122,7 +141,14 @@ def analyze(
     analysis, dynamics = _examined(constrained, samples, where, search=states is None)
     if reference is None or times is None or dynamics is None:
         return analysis
+    with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion tells when.
+        _check_reference(dynamics.structure, reference, times)
     motion = dynamics.motion(reference, times, samples.states[0] if start is None else start)
+    if motion.times.size:
+        # Outputs with mu_i = 0 are not told by the state: judged as the reference begins.
+        outputs = first_outputs(dynamics.structure, reference(float(motion.times[0])))
+        stability = dynamics.stability(motion.states[0], outputs=outputs)
+        analysis = replace(analysis, zero_dynamics=stability)
     return replace(analysis, motion=motion)
 
 
@@ -146,7 +172,8 @@ def _examined(
 
     if constrained.margin is not None:
         matrix = elimination.constraint_matrix
-        margin = samples.margin(matrix, search)
+        margin = samples.margin(matrix, search=search)
+        constrained = replace(constrained, margin=margin)
         judge(margin, constraint_violation(system, constrained.degrees, margin), 2)
         regular = samples.is_regular(matrix)
     if regular:
@@ -157,14 +184,15 @@ def _examined(
         else:
             matrix = structure.control_matrix
             satisfied |= {4, 5}
-            margin = samples.margin(matrix, search)
+            margin = samples.margin(matrix, structure.round_off, search)
+            structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(system, structure.output_degrees, margin), 5)
             known |= {
                 "output_degrees": structure.output_degrees,
                 "output_order": structure.output_order,
                 "independence": _independence(structure, samples),
             }
-            if samples.is_regular(matrix):
+            if samples.is_regular(matrix, structure.round_off):
                 dynamics = ZeroDynamics(structure)
                 stability = dynamics.stability(samples.states[0])
                 known |= {"zero_dynamics": stability, "structure": structure}
@@ -202,7 +230,68 @@ def _independence(structure: Structure, samples: Samples) -> Margin | None:
     return samples.margin(ca.jacobian(functions, structure.system.state))
 
 
+def _check_reference(
+    structure: Structure, reference: Callable[[float], FloatArray], times: ArrayLike
+) -> None:
+    """That each entry of R(t) that says so is the derivative of the one before.
+
+    Against central differences with two steps: where these do not agree, as at a kink of the
+    highest derivative, nothing is said.
+    """
+    system, grid = structure.system, numbers(f"{structure.system.name}: times", times).reshape(-1)
+    degrees = structure.output_degrees
+    size = sum(degree + 1 for degree in degrees)
+
+    def value(time: float) -> FloatArray:
+        given = reference(time)
+        found = None if given is None else numbers(f"{system.name}: reference({time:g})", given)
+        if found is None or found.size != size:
+            raise ModelError(
+                f"{system.name}: the reference must have size {size} (each output and its "
+                f"derivatives up to its degree {degrees}), got "
+                f"{'None' if found is None else found.size}"
+            )
+        return found.reshape(-1)
+
+    if not grid.size or not np.all(np.isfinite(grid)):
+        return
+    value(float(grid[0]))
+    length = float(grid[-1] - grid[0])
+    step = 1e-6 * length
+    if step <= 1e-9 * np.max(np.abs(grid)):
+        return
+    # Not at round fractions, where references have their breaks.
+    tried = grid[0] + length * (0.05 + 0.9 * (np.arange(1, 10) * 0.6180339887 % 1.0))
+    values = np.array([value(time) for time in tried])
+    slopes, coarse = (
+        np.array([(value(t + h) - value(t - h)) / (2 * h) for t in tried]) for h in (step, 2 * step)
+    )
+    start = 0
+    for signal, degree in zip(system.output_signals, degrees, strict=True):
+        for order in range(degree):
+            i = start + order
+            told, found = values[:, i + 1], slopes[:, i]
+            scale = max(np.abs(told).max(), np.abs(found).max())
+            round_off = 1e-13 * np.abs(values[:, i]).max() / step
+            unsure = 4.0 * np.abs(found - coarse[:, i])
+            excess = np.abs(told - found) - 1e-3 * scale - round_off - unsure
+            worst = int(np.argmax(excess))
+            if excess[worst] > 0.0:
+                raise ModelError(
+                    f"{system.name}: the reference contradicts itself: it tells "
+                    f"{signal.derivative(order + 1).name} = {told[worst]:.4g} at t = "
+                    f"{tried[worst]:.4g} s, but {signal.derivative(order).name} changes by "
+                    f"{found[worst]:.4g} per second. Give the derivatives of r, output by output: "
+                    "r_1, r_1', ..., r_2, ..."
+                )
+        start += degree + 1
+
+
 def _box(system: DaeSystem, region: Mapping[str, tuple[float, float]]) -> Region:
+    if not isinstance(region, Mapping):
+        raise ModelError(
+            f"{system.name}: region must be state name -> (lowest, highest), got {region!r}"
+        )
     low, high = np.full(system.num_states, -np.inf), np.full(system.num_states, np.inf)
     names = [signal.name for signal in system.state_signals]
     for name, bounds in region.items():

@@ -23,18 +23,18 @@ from drake_dae.dae.expressions import Factorization, TracedFunction
 from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import SINGULAR, Fields, Samples, multiply, show, traced
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Signal, numbers
 from drake_dae.dae.structure import (
     Structure,
     default_spread,
     examine_structure,
     find_structure,
 )
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Extension:
     """A system with integrators before its controls, whose B(x) is regular.
 
@@ -57,6 +57,9 @@ class Extension:
     integrators: Mapping[str, int]
     control_offset: ca.SX
     control_matrix: ca.SX
+
+    def __repr__(self) -> str:
+        return f"Extension({self.system!r}, integrators={dict(self.integrators)})"
 
     def original_control(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
@@ -160,6 +163,7 @@ def dynamic_extension(
             isolated states only, or more than max_integrators are needed.
         ModelError, InconsistentStateError: As `find_structure`.
     """
+    check_is_system(system, "dynamic_extension")
     limit = system.num_states if max_integrators is None else max_integrators
     chain = _Chain(system, _nominal_control(system, nominal_control), spread)
     while True:
@@ -176,8 +180,8 @@ def dynamic_extension(
             chain.integrate(*choice)
         if sum(chain.integrators.values()) > limit:
             raise AssumptionError(
-                f"more than max_integrators = {limit} are needed for a regular B(x) of (16): "
-                f"{_in_words(chain.integrators)}. Allow more, or choose other outputs",
+                f"more than max_integrators = {limit} are needed for a regular B(x) of (16), so "
+                f"far {_in_words(chain.integrators)}. Allow more, or choose other outputs",
                 5,
             )
     return Extension(
@@ -427,7 +431,11 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
             raise
         remedy = "Keep away from this state"
         if chain.integrators:
-            remedy += f", or give another nominal_control: {_in_words(chain.integrators)}"
+            given = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
+            remedy += (
+                f", or give another nominal_control, for example nominal_control={{{given}}}; "
+                f"integrators: {_in_words(chain.integrators)}"
+            )
         raise AssumptionError(
             f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
             f"singular at isolated states, which more integrators do not mend. {remedy}",
@@ -437,15 +445,15 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
 
 
 def _in_words(integrators: Mapping[str, int]) -> str:
-    parts = ", ".join(f"{count} before {name}" for name, count in integrators.items())
-    return f"there are integrators, {parts}"
+    return ", ".join(f"{count} before {name}" for name, count in integrators.items())
 
 
 def _nominal_control(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
     """Shape (p,)."""
     values = values or {}
     _check_names(system, values, "nominal_control")
-    nominal = np.array([float(values.get(s.name, 0.0)) for s in system.control_signals])
+    given = [values.get(s.name, 0.0) for s in system.control_signals]
+    nominal = numbers(f"{system.name}: nominal_control", given)
     if not np.all(np.isfinite(nominal)):
         raise ModelError(f"{system.name}: nominal_control must be finite, got {dict(values)}")
     return nominal

@@ -261,8 +261,9 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
         if not (np.all(np.isfinite(one)) and np.all(np.isfinite(other))):
             continue  # Out of the domain of one of the functions.
         finite += 1
-        size = np.max(np.abs(one), initial=0.0) + np.max(np.abs(other), initial=0.0)
-        if not np.allclose(one, other, rtol=1e-9, atol=1e-11 * size):
+        # By columns: constraints may have very different units.
+        size = np.abs(one).max(axis=0, initial=0.0) + np.abs(other).max(axis=0, initial=0.0)
+        if not np.all(np.abs(one - other) <= 1e-9 * np.abs(other) + 1e-11 * size):
             return False
     return finite > 0
 

@@ -1,24 +1,20 @@
 """The normal form: constraint chains, output chains, and what completes them.       (20)-(27)"""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dgetrf, dgetrs
 
+from drake_dae.dae.completion import check_completion, choose_completion
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.manifold import CONSISTENT
-from drake_dae.dae.samples import Fields, Margin, Samples, show, traced
-from drake_dae.dae.structure import Structure
-from drake_dae.dae.system import Signal
+from drake_dae.dae.manifold import ROUND_OFF
+from drake_dae.dae.newton import Linearization, newton
+from drake_dae.dae.samples import Fields, Samples, show
+from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
-
-CONVERGED = 1e-9
-"""A Newton step of this size, relative to the state, leaves its square: round-off."""
-
-TRANSVERSAL = 0.05
-"""Single states complete the chains if the sine of their smallest angle is above this."""
 
 
 class NormalForm:
@@ -36,7 +32,7 @@ class NormalForm:
     The paper allows any completion; L_h* xi = 0 is not required.
 
     Args:
-        structure: Of the system.
+        structure: Of the system, or the system.
         completion: xi as expressions of the state (and parameters), shape (d, 1) with
             d = n - sum r_i - sum mu_i. Chosen if None: states that complete the chains well at
             all of `structure.states`; if none do, linear combinations of states.
@@ -54,7 +50,9 @@ class NormalForm:
             each other and of the chains; or B(x) is singular.
     """
 
-    def __init__(self, structure: Structure, completion: ca.SX | None = None) -> None:
+    def __init__(self, structure: Structure | DaeSystem, completion: ca.SX | None = None) -> None:
+        if not isinstance(structure, Structure):
+            structure = find_structure(structure)
         self.structure = structure
         self.system = structure.system
         system, residual = self.system, structure.manifold.residual_expression
@@ -67,9 +65,9 @@ class NormalForm:
         chains = ca.vertcat(residual, *[e for chain in structure.output_chains for e in chain])
         samples = Samples(structure.manifold, Fields(system.explicit), structure.states)
         if completion is None:
-            found = _choose(structure, chains, samples)
+            found = choose_completion(structure, chains, samples)
         else:
-            found = _given(structure, chains, samples, completion)
+            found = check_completion(structure, chains, samples, completion)
         self.completion, self.completion_signals, self.margin = found
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
@@ -168,36 +166,19 @@ class NormalForm:
     def _newton(
         self, state: FloatArray, target: FloatArray, parameters: FloatArray
     ) -> FloatArray | None:
-        """Damped by the natural monotonicity test (Deuflhard, 2004, section 3.3).
+        """The state with given coordinates, sought from another one in units of its size."""
+        # Powers of 2, so that nothing is rounded.
+        scale = np.exp2(np.ceil(np.log2(np.maximum(self._scale, np.abs(state)))))
 
-        It compares Newton steps in the state, so that the units of the coordinates do not matter.
-        """
-        x = state
-        scale = np.maximum(self._scale, np.abs(x))
-        for _ in range(50):
-            values, jacobian = self._at(x, parameters)
-            solve = _solver(jacobian, scale)
-            if solve is None:
-                return None
-            step = solve(target - values)
-            size = np.abs(step).max()
-            if size <= CONVERGED:
-                return x + scale * step
-            length = 1.0
-            while True:
-                trial = x + length * scale * step
-                simplified = solve(target - self._coordinates(trial, parameters)[0])
-                rest = np.abs(simplified).max()
-                if rest <= (1.0 - length / 4.0) * size:
-                    break
-                length /= 2.0
-                if length < 1e-2:
-                    # Round-off, if the Jacobian is ill-conditioned.
-                    return x if size <= CONSISTENT else None
-            x = trial
-            if rest <= CONVERGED:
-                return x + scale * simplified
-        return None
+        def left(z: FloatArray) -> FloatArray:
+            return target - self._coordinates.evaluate(scale * z, parameters)[0]
+
+        def linearize(z: FloatArray) -> Linearization | None:
+            solve = _solver(self._at(scale * z, parameters)[1] * scale)
+            return None if solve is None else (lambda z: solve(left(z)), True)
+
+        found, converged = newton(state / scale, linearize)
+        return scale * found if converged else None
 
     def _out_of_reach(
         self,
@@ -207,13 +188,15 @@ class NormalForm:
         first: FloatArray,
         parameters: FloatArray,
     ) -> InconsistentStateError:
-        """Names the coordinate along which the Jacobian is weakest where the search ended."""
+        """Names the coordinate that the weak directions of the Jacobian keep from its target."""
         values, jacobian = self._at(state, parameters)
         left = target - values
         rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale
         rows[rows == 0.0] = 1.0
         weak, sizes, _ = np.linalg.svd(jacobian * columns / rows[:, None])
-        worst = int(np.argmax(np.abs(weak[:, -1] * left / rows)))
+        weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
+        kept = weakest @ (weakest.T @ (left / rows))
+        worst = int(np.argmax(np.abs(kept * left / rows)))
         message = (
             f"{self.system.name}: no way from the guess to the given coordinates: "
             f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "
@@ -254,127 +237,8 @@ class NormalForm:
         return array
 
 
-Completion = tuple[ca.SX, tuple[Signal, ...], Margin]
-"""xi, its signals, and the margin of the Jacobian of Phi."""
-
-
-def _given(structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX) -> Completion:
-    """A completion that somebody chose, or why it is none."""
-    system, count = structure.system, structure.zero_dynamics_dimension
-    if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
-        got = f"shape {xi.shape}" if isinstance(xi, ca.SX) else type(xi).__name__
-        raise ModelError(
-            f"{system.name}: the completion must be a CasADi SX column of {count} expressions, "
-            f"n - sum r_i - sum mu_i; got {got}"
-        )
-    known = ca.vertcat(system.state, system.parameter_symbol)
-    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(known, s)]
-    if unknown:
-        raise ModelError(
-            f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "
-            "state nor a parameter"
-        )
-    signals = tuple(
-        next(
-            (
-                signal
-                for j, signal in enumerate(system.state_signals)
-                if ca.is_equal(xi[i], system.state[j])
-            ),
-            Signal(f"xi{i}"),
-        )
-        for i in range(count)
-    )
-    gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
-    margin = samples.margin(gradient)
-    if not margin.is_singular:
-        return xi, signals, margin
-    if not count:
-        raise ModelError(
-            f"{system.name}: the differentials of the chains are dependent to round-off at x = "
-            f"{show(margin.state)}: A(x) of (2) or B(x) of (16) is close to singular there"
-        )
-    (matrix,) = traced(system, gradient=gradient)(margin.state, system.parameter_values)
-    # How far each differential is from the span of those before it.
-    rows = _unit_rows(matrix.reshape(system.num_states, -1) * samples.scale)
-    distances = np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]
-    worst = int(np.argmin(distances))
-    raise ModelError(
-        f"{system.name}: the completion '{signals[worst].name}' = "
-        f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "
-        f"completion at x = {show(margin.state)}; choose a function whose differential is not in "
-        "the span of theirs, there and around"
-    )
-
-
-def _choose(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
-    """Single states whose differentials complete those of the chains, or else linear combinations.
-
-    They complete them where they are regular on the null spaces of the chains' differentials.
-    """
-    system, count = structure.system, structure.zero_dynamics_dimension
-    if not count:
-        return _given(structure, chains, samples, ca.SX(0, 1))
-    gradients = samples.values(gradient=ca.jacobian(chains, system.state))
-    spaces = np.array(
-        [np.linalg.svd(_unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]
-    )
-    for matrix in _candidates(spaces):
-        matrix = matrix / samples.scale
-        # Rounded, so that ties go to the first state on every machine.
-        largest = np.argmax(np.round(_unit_rows(np.abs(matrix)), 6), axis=1)
-        leading = matrix[np.arange(count), largest]
-        factors = np.vectorize(lambda c: float(f"{c:.3g}"))(matrix / leading[:, None])
-        xi = ca.mtimes(ca.sparsify(ca.SX(factors)), system.state)
-        margin = samples.margin(ca.jacobian(ca.vertcat(chains, xi), system.state))
-        if not margin.is_singular:
-            return xi, tuple(_combination(row, system.state_signals) for row in factors), margin
-    raise ModelError(
-        f"{system.name}: no linear combinations of states complete the chains (20) at all states "
-        f"around the nominal one; give a completion of {count} expressions"
-    )
-
-
-def _candidates(spaces: FloatArray) -> Iterator[FloatArray]:
-    """Combinations of states, shape (d, n), that are regular on all spaces, shape (k, n, d)."""
-    count = spaces.shape[2]
-    single = _pivots(spaces)
-    if np.linalg.svd(spaces[:, single], compute_uv=False).min() > TRANSVERSAL:
-        yield np.eye(spaces.shape[1])[single]
-    # The space that is nearest to all of them, in the basis that is the identity on its pivots.
-    mean = np.linalg.eigh(np.einsum("kid,kjd->ij", spaces, spaces))[1][:, -count:]
-    basis = np.linalg.solve(mean[_pivots(mean[None])].T, mean.T)
-    yield np.where(np.abs(basis) > 0.02, basis, 0.0)
-
-
-def _pivots(spaces: FloatArray) -> list[int]:
-    """States whose rows are far from dependent in all spaces: one QR with pivoting for all."""
-    rest, chosen = spaces.copy(), []
-    for _ in range(spaces.shape[2]):
-        # Rounded, as above.
-        chosen.append(int(np.argmax(np.round(np.linalg.norm(rest, axis=2).min(axis=0), 6))))
-        direction = _unit_rows(rest[:, chosen[-1]])
-        rest -= np.einsum("kid,kd,ke->kie", rest, direction, direction)
-    return sorted(chosen)
-
-
-def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
-    """Named as it reads: "x0 - 0.5 x1"."""
-    terms = [(c, signal) for c, signal in zip(factors, signals, strict=True) if c]
-    units = {signal.unit for _, signal in terms}
-    sign = {1.0: "", -1.0: "-"}
-    name = " + ".join(sign.get(c, f"{c:.3g} ") + signal.name for c, signal in terms)
-    return Signal(name.replace("+ -", "- "), units.pop() if len(units) == 1 else "")
-
-
-def _unit_rows(matrix: FloatArray) -> FloatArray:
-    length = np.linalg.norm(matrix, axis=-1, keepdims=True)
-    return matrix / np.where(length > 0.0, length, 1.0)
-
-
-def _solver(jacobian: FloatArray, scale: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
-    """right -> Newton step in units of the scale; None if the Jacobian is singular, not finite."""
-    matrix = jacobian * scale
+def _solver(matrix: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
+    """b -> M^-1 b; None if M is singular, or not finite."""
     rows = np.abs(matrix).max(axis=1)
     if not (rows.min() > 0.0 and rows.max() < np.inf):
         return None

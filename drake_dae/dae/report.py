@@ -8,12 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.samples import SINGULAR, Margin
+from drake_dae.dae.pinned_motion import PinnedMotion
+from drake_dae.dae.samples import SINGULAR, Margin, traced
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tables import Part, Table, digits, to_markdown, to_text
-from drake_dae.dae.zero_dynamics import ComplexArray, PinnedMotion, Stability, Verdict
+from drake_dae.dae.zero_dynamics import ComplexArray, Stability, Verdict
 from drake_dae.errors import FloatArray
 
 
@@ -24,6 +25,7 @@ class Finding(StrEnum):
     VIOLATED = "violated"
     UNDECIDED = "undecided"
     NOT_EXAMINED = "not examined"
+    FAILS = "does not hold"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +110,8 @@ class Analysis:
     def problems(self) -> tuple[str, ...]:
         """What is violated, one text each; empty if nothing is."""
         found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
-        if self.independence is not None and self.independence.is_singular:
+        # Where an assumption fails, the theorem may as well, and says nothing new.
+        if not found and self.independence is not None and self.independence.is_singular:
             found.append(
                 "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
                 f"depend on each other at {self._named(self.independence.state)}"
@@ -118,6 +121,10 @@ class Analysis:
         if self.motion is not None and self.motion.failure:
             found.append(self.motion.failure)
         return tuple(found)
+
+    def __repr__(self) -> str:
+        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Analysis('{self.system.name}': {found})"
 
     def __str__(self) -> str:
         return to_text([*self.parts(), *([problem] for problem in self.problems)])
@@ -221,14 +228,19 @@ class Analysis:
         return parts
 
     def _findings(self) -> Table:
+        free = "" if self.system.num_constraints else ": m = 0"
         rows = [
-            [f"({a.number})  {a.statement}", str(a.finding), *_figures(a.margin)]
+            [
+                f"({a.number})  {a.statement}{free if a.number <= 3 else ''}",
+                str(a.finding),
+                *_figures(a.margin),
+            ]
             for a in self.assumptions
         ]
         chains, zero = Finding.NOT_EXAMINED, Finding.NOT_EXAMINED
         if self.output_degrees is not None:
             singular = self.independence is not None and self.independence.is_singular
-            chains = Finding.VIOLATED if singular else Finding.SATISFIED
+            chains = Finding.FAILS if singular else Finding.SATISFIED
         if self.zero_dynamics is not None:
             zero = _FINDINGS[self.zero_dynamics.verdict]
         none = ": there are none" if self.zero_dynamics_dimension == 0 else ""
@@ -264,19 +276,26 @@ class Analysis:
         """Where A(x) or B(x) is nearest to singular, in the states that it depends on."""
         letter, system = "A" if number == 2 else "B", self.system
         used = ca.which_depends(ca.vec(matrix), system.state, 1, False)
-        places = [
-            f"{signal.name}={digits(value)}"
-            for signal, value, needed in zip(system.state_signals, margin.state, used, strict=True)
-            if needed
-        ]
-        if not places:
+        if not any(used):
             return f"{letter}(x) is the same at all states."
-        return f"{letter}(x) is nearest to singular at {', '.join(places)}."
+        value = traced(system, value=matrix)
+        values = np.array(
+            [
+                value(state, system.parameter_values)[0]
+                for state in np.vstack([self.states, margin.state])
+            ]
+        )
+        if np.all(np.ptp(values, axis=0) <= 1e-9 * np.abs(values).max()):
+            return f"{letter}(x) is the same at all examined states."
+        return f"{letter}(x) is nearest to singular at {self._named(margin.state, used)}."
 
-    def _named(self, state: FloatArray) -> str:
-        """A state as name=value, ..."""
-        pairs = zip(self.system.state_signals, state, strict=True)
-        return ", ".join(f"{signal.name}={digits(value)}" for signal, value in pairs)
+    def _named(self, state: FloatArray, chosen: Sequence[bool] | None = None) -> str:
+        """A state, or what is chosen of it, as name=value with unit, ..."""
+        return ", ".join(
+            f"{signal.name}={digits(value)} {signal.unit}".rstrip()
+            for i, (signal, value) in enumerate(zip(self.system.state_signals, state, strict=True))
+            if chosen is None or chosen[i]
+        )
 
 
 _FINDINGS = {

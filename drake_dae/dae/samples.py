@@ -197,7 +197,9 @@ class Samples:
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return all(are_dependent(gradient) for (gradient,) in gradients)
 
-    def margin(self, matrix: ca.SX, search: bool = False) -> Margin:
+    def margin(
+        self, matrix: ca.SX, round_off: Booleans | None = None, search: bool = False
+    ) -> Margin:
         """The smallest singular values of a matrix at the states and at what lies between.
 
         The determinant of a square matrix that changes its sign on the way from the first state is
@@ -205,10 +207,11 @@ class Samples:
 
         Args:
             matrix: Shape (k, l), k <= l.
+            round_off: Which entries are taken as zero; none if None.
             search: Also go downhill from the worst states, in the box that the states span and the
                 region.
         """
-        scaled = _ScaledMatrix(self, matrix)
+        scaled = _ScaledMatrix(self, _masked(matrix, round_off))
         candidates = list(self.states)
         if matrix.is_square():
             crossings = (self._crossing(scaled, there) for there in self.states[1:])
@@ -233,9 +236,9 @@ class Samples:
             vanishing_row=int(np.argmin(length)) if length.min() < SINGULAR else None,
         )
 
-    def is_regular(self, matrix: ca.SX) -> bool:
-        """Whether a square matrix is regular at every state."""
-        scaled = _ScaledMatrix(self, matrix)
+    def is_regular(self, matrix: ca.SX, round_off: Booleans | None = None) -> bool:
+        """Whether a square matrix is regular at every state; as for `margin`."""
+        scaled = _ScaledMatrix(self, _masked(matrix, round_off))
         return all(scaled.distance(state) >= SINGULAR for state in self.states)
 
     def _crossing(
@@ -309,6 +312,13 @@ def traced(system: DaeSystem, **expressions: ca.SX) -> TracedFunction:
     """A function of the state and of all parameters."""
     inputs = {"x": system.state, "p": system.parameter_symbol}
     return TracedFunction(system.name, inputs, expressions, often=False)
+
+
+def _masked(matrix: ca.SX, zero: Booleans | None) -> ca.SX:
+    result = ca.SX(matrix)
+    for i, j in np.argwhere(zero) if zero is not None else ():
+        result[int(i), int(j)] = 0.0
+    return ca.sparsify(result)
 
 
 def largest(matrix: FloatArray) -> FloatArray:

@@ -12,16 +12,16 @@ from drake_dae.dae.lie import lie_derivative, lie_derivative_along
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.motion import Motion
 from drake_dae.dae.region import Region
-from drake_dae.dae.samples import Fields, Margin, Samples, show, traced
+from drake_dae.dae.samples import Booleans, Fields, Margin, Samples, show, traced
 from drake_dae.dae.signals import numbers
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
 MANY = 10
 """So many random states have no zero in common of a function that is not zero."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Structure:
     """The structure that the paper assumes, found for one system.
 
@@ -38,6 +38,8 @@ class Structure:
         highest_derivatives: z_i^(mu_i) in terms of the unknowns of `motion`, shape (p, 1).
         drift: a_1(x), a_2(x) of (28): L_f*^mu_i l*_i, shape (p, 1).
         control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p).
+        round_off: Which entries of B(x) are zero but for round-off at all of many states, shape
+            (p, p). A column of nothing else would be scaled up to the size of the others.
         states: The consistent states at which numbers were decided, shape (samples, n).
         constraint_margin: Margin of A(x), Assumption (2); None without constraints.
         control_margin: Margin of B(x), Assumption (5).
@@ -54,9 +56,14 @@ class Structure:
     highest_derivatives: ca.SX
     drift: ca.SX
     control_matrix: ca.SX
+    round_off: Booleans
     states: FloatArray
     constraint_margin: Margin | None
     control_margin: Margin
+
+    def __repr__(self) -> str:
+        degrees = f"r={self.constraint_degrees}, mu={self.output_degrees}"
+        return f"Structure({self.system.name!r}, {degrees}, index={self.index})"
 
     @property
     def index(self) -> int:
@@ -118,6 +125,7 @@ def examine_structure(
             output that has no degree.
         InconsistentStateError, ModelError: As `find_structure`.
     """
+    check_is_system(system, "find_structure")
     check_system(system)
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
@@ -145,11 +153,12 @@ def examine_structure(
 def default_spread(nominal: FloatArray) -> FloatArray:
     """How far states are drawn from the nominal one, shape (n,): 0.1, in other units than usual.
 
-    That is a tenth of the nominal value where this is above 1, or below 1e-3 and not round-off.
+    That is a hundredth of the nominal value where this is above 10, and a tenth where it is below
+    1e-3 and not round-off.
     """
     size = np.abs(nominal)
     small = (size < 1e-3) & (size > 1e-12 * size.max())
-    return 0.1 * np.where((size > 1.0) | small, size, 1.0)
+    return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
 
 
 def check_system(system: DaeSystem) -> None:
@@ -229,7 +238,7 @@ def examine_outputs(constrained: Constrained) -> Structure:
     """
     samples, motion, elimination = constrained.samples, constrained.motion, constrained.elimination
     system = motion.system
-    output_chains, drift, control_matrix, highest_derivatives = _output_chains(
+    output_chains, drift, control_matrix, highest_derivatives, round_off = _output_chains(
         motion, elimination, samples
     )
     degrees = tuple(len(chain) for chain in output_chains)
@@ -252,7 +261,8 @@ def examine_outputs(constrained: Constrained) -> Structure:
         highest_derivatives=highest_derivatives,
         states=samples.states,
         constraint_margin=constrained.margin,
-        control_margin=samples.margin(control_matrix),
+        round_off=round_off,
+        control_margin=samples.margin(control_matrix, round_off),
     )
 
 
@@ -402,8 +412,11 @@ def _constraint_chains(
 
 def _output_chains(
     motion: Motion, elimination: Elimination, samples: Samples
-) -> tuple[tuple[tuple[ca.SX, ...], ...], ca.SX, ca.SX, ca.SX]:
-    """l*_i, ..., L_f*^(mu_i - 1) l*_i by Assumption (4), a(x) of (28) and B(x) of (16)."""
+) -> tuple[tuple[tuple[ca.SX, ...], ...], ca.SX, ca.SX, ca.SX, Booleans]:
+    """l*_i, ..., L_f*^(mu_i - 1) l*_i by Assumption (4), a(x) of (28) and B(x) of (16).
+
+    Also z_i^(mu_i) along the motion, and which entries of B(x) are but round-off.
+    """
     system = motion.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     count = system.num_controls
@@ -413,6 +426,7 @@ def _output_chains(
     )
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
     highest_derivatives = ca.SX(count, 1)
+    round_off = np.zeros((count, count), dtype=bool)
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
     following = elimination.l_star
@@ -423,7 +437,8 @@ def _output_chains(
         for row, i in enumerate(undecided):
             if acts[row].all():
                 drift[i] = following[row]
-                control_matrix[i, :] = _without_round_off(rows[row, :], slopes[:, row, :])
+                control_matrix[i, :] = rows[row, :]
+                round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
                 highest_derivatives[i] = moving[row]
             elif acts[row].any():
                 state = samples.states[int(np.argmin(acts[row]))]
@@ -467,25 +482,18 @@ def _output_chains(
                 5,
             )
         undecided = still
-    return tuple(tuple(chain) for chain in chains), drift, control_matrix, highest_derivatives
+    return (
+        tuple(tuple(chain) for chain in chains),
+        drift,
+        control_matrix,
+        highest_derivatives,
+        round_off,
+    )
 
 
-def _acts(numbers: FloatArray) -> np.typing.NDArray[np.bool_]:
+def _acts(numbers: FloatArray) -> Booleans:
     """Which rows are not zero where: shape (a, samples), of numbers of shape (samples, a, k)."""
     return np.asarray(numbers.any(axis=2)).T
-
-
-def _without_round_off(row: ca.SX, numbers: FloatArray) -> ca.SX:
-    """Entries of a row of B(x) that are zero but for round-off at all of many states are zero.
-
-    Scaling would blow a column of nothing else up to the size of the others. Few states could have
-    a zero in common.
-    """
-    result = ca.SX(row)
-    if len(numbers) >= MANY:
-        for j in np.flatnonzero(~numbers.any(axis=0)):
-            result[int(j)] = 0.0
-    return ca.sparsify(result)
 
 
 def _reaches(fields: ca.SX, drift: ca.SX, expression: ca.SX, state: ca.SX) -> bool:

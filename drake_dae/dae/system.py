@@ -1,8 +1,10 @@
 """The system class of the paper: x' = f + g v + h u, 0 = k(x), z = l + m v.      (1)-(3)"""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
 from functools import cached_property
+from inspect import signature
 from types import SimpleNamespace
 from typing import Any, Self
 
@@ -72,6 +74,8 @@ class DaeSystem:
     motion: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise ModelError(f"the name of a system must be text, got {self.name!r}")
         if not (is_symbol(self.state) and self.state.numel()):
             raise ModelError(
                 f"{self.name}: 'state' must be a CasADi SX column of symbols, "
@@ -115,6 +119,11 @@ class DaeSystem:
                     if key in "lm"
                     else ""
                 )
+                if value.numel() == 0 and constraints and key in "gm":
+                    raise ModelError(
+                        f"{self.name}: k is given, so g and m are needed; {key} is missing, with "
+                        f"shape {shape}"
+                    )
                 raise ModelError(
                     f"{self.name}: {key} has shape {value.shape}, expected {shape} for "
                     f"n = {n} states, m = {constraints} constraints, p = {controls} controls{hint}"
@@ -135,10 +144,8 @@ class DaeSystem:
             ("output_signals", controls, "z"),
         )
         for key, count, letter in sizes:
-            given = tuple(
-                Signal(signal) if isinstance(signal, str) else signal
-                for signal in getattr(self, key) or [f"{letter}{i}" for i in range(count)]
-            )
+            made_up = [f"{letter}{i}" for i in range(count)]
+            given = _signals(f"{self.name}: {key}", getattr(self, key) or made_up)
             if len(given) != count:
                 raise ModelError(f"{self.name}: {key} has {len(given)} entries, expected {count}")
             _unique([s.name for s in given], key, self.name)
@@ -153,6 +160,10 @@ class DaeSystem:
             )
         nominal.setflags(write=False)
         put("nominal_state", nominal)
+
+    def __repr__(self) -> str:
+        counts = (self.num_states, self.num_constraints, self.num_controls)
+        return f"DaeSystem('{self.name}', n={counts[0]}, m={counts[1]}, p={counts[2]})"
 
     @classmethod
     def from_functions(
@@ -172,7 +183,8 @@ class DaeSystem:
 
         Each function is called once with a CasADi column x, and, if there are `parameters`, with
         a namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns
-        an expression, or a list (of lists for a matrix, row by row).
+        an expression, or a list (of lists for a matrix, row by row). Functions of CasADi are meant,
+        casadi.sin; numpy.sin works too, but CasADi warns of it, and math.sin does not.
 
         Args:
             state: Names (or Signals) of the states, or their number n.
@@ -183,6 +195,14 @@ class DaeSystem:
         Raises:
             ModelError: As the class, or a function that fails.
         """
+        owner = labels.get("name", "system")
+        own = {"state", "parameters", "state_signals", *"fghklm"}
+        known = [item.name for item in fields(cls) if item.name not in own]
+        for label in labels:
+            if label not in known:
+                near = get_close_matches(label, known, n=1)
+                hint = f"did you mean '{near[0]}'? " if near else ""
+                raise ModelError(f"{owner}: no field '{label}'; {hint}fields: {', '.join(known)}")
         bad = [name for name in parameters or {} if not name.isidentifier()]
         if bad:
             raise ModelError(
@@ -190,7 +210,9 @@ class DaeSystem:
             )
         if isinstance(state, int):
             state = [f"x{i}" for i in range(state)]
-        named = tuple(s if isinstance(s, Signal) else Signal(s) for s in state)
+        named = _signals(f"{owner}: the states", state)
+        if not named:
+            raise ModelError(f"{owner}: a system needs at least one state")
         x = ca.vertcat(ca.SX(0, 1), *[ca.SX.sym(s.name) for s in named])
         defined = tuple(
             Parameter(name, numbers(f"parameter '{name}'", value))
@@ -203,16 +225,21 @@ class DaeSystem:
         def call(letter: str, function: Callable[..., Any] | None) -> ca.SX:
             if function is None:
                 return ca.SX(0, 0)
+            if not callable(function):
+                raise ModelError(
+                    f"{owner}: {letter} must be a function of the state, got "
+                    f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
+                )
             try:
                 value = function(*arguments)
             except Exception as error:
                 raise ModelError(
-                    f"function {letter} failed on a CasADi column of {x.numel()} states: {error}. "
-                    "Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"
+                    f"{owner}: function {letter} failed on a CasADi column of {x.numel()} states: "
+                    f"{_explained(error, function, arguments)}"
                 ) from error
             if value is None:
-                raise ModelError(f"function {letter} returned nothing")
-            return _expression(letter, value, labels.get("name", "system"))
+                raise ModelError(f"{owner}: function {letter} returned nothing")
+            return _expression(letter, value, owner)
 
         drift, control = call("f", f), call("h", h)
         if control.shape[0] == 1 and x.numel() != 1:
@@ -287,6 +314,52 @@ class DaeSystem:
         raise ModelError(f"{self.name} has no parameter '{name}'; it has {names}")
 
 
+def check_is_system(value: Any, owner: str) -> None:
+    """Refuses what is no DaeSystem.
+
+    Raises:
+        ModelError: With the attribute that was meant, if there is one.
+    """
+    if isinstance(value, DaeSystem):
+        return
+    meant = [name for name in ("dae", "system") if isinstance(getattr(value, name, 0), DaeSystem)]
+    hint = f"; pass its .{meant[0]}" if meant else ""
+    raise ModelError(f"{owner} needs a DaeSystem, got {type(value).__name__}{hint}")
+
+
+def _signals(what: str, given: Any) -> tuple[Signal, ...]:
+    """Signals, or names of signals without unit."""
+    items = [given] if isinstance(given, str) or not isinstance(given, Sequence) else given
+    bad = [item for item in items if not isinstance(item, (Signal, str))]
+    if items is not given or bad:
+        raise ModelError(f"{what} must be a list of names or Signals, got {(bad or items)[0]!r}")
+    return tuple(Signal(item) if isinstance(item, str) else item for item in items)
+
+
+def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
+    """What a function's own error means here."""
+    text = str(error)
+    try:
+        signature(function).bind(*arguments)
+    except TypeError:
+        called = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
+        return f"{text}. It is called with {called}"
+    except ValueError:
+        pass  # Of built-in functions nothing is known.
+    if "truth value" in text:
+        return (
+            "it asks whether a condition on the state is true, as in if, max or min. Conditions "
+            "are not smooth, and the theory differentiates: write the side on which the state "
+            "stays, or a smooth function"
+        )
+    if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
+        return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"
+    text = text.removeprefix("...").split(": ", 1)[-1] if text.startswith(".../casadi") else text
+    if isinstance(error, NotImplementedError):
+        text += ". Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"
+    return text
+
+
 def _expression(key: str, value: Any, owner: str) -> ca.SX:
     """An SX matrix from an SX, a number, an array, or a (nested) list of these."""
     if isinstance(value, ca.MX):
@@ -325,22 +398,33 @@ _KINKS = {
 def _check_operations(system: DaeSystem, keys: Sequence[str]) -> None:
     """Refuses what evaluates without complaint, but makes no sense in (1)-(3)."""
     expressions = [getattr(system, key) for key in keys]
-    if _unfit(system, ca.veccat(*expressions)) is None:
+    x, p = system.state, system.parameter_symbol
+    if flaw(ca.veccat(*expressions), x, p, "the state") is None:
         return
     for key, expression in zip(keys, expressions, strict=True):
         for row, column in zip(*expression.sparsity().get_triplet(), strict=True):
-            message = _unfit(system, expression[row, column])
+            message = flaw(expression[row, column], x, p, "the state")
             if message:
                 raise ModelError(
-                    f"{system.name}: {key} {message}, in entry [{row}, {column}] of shape "
-                    f"{expression.shape}"
+                    f"{system.name}: {key}, entry [{row}, {column}] of shape {expression.shape}, "
+                    f"{message}"
                 )
 
 
-def _unfit(system: DaeSystem, expression: ca.SX) -> str | None:
-    """A constant that is not finite, or an operation on the state that is not smooth."""
-    function = ca.Function("f", [system.state, system.parameter_symbol], [expression])
-    moving: dict[int, bool] = {}  # Whether what stands in a place of the work vector has x in it.
+def flaw(expression: ca.SX, variable: ca.SX, other: ca.SX, name: str) -> str | None:
+    """A constant that is not finite, or an operation on a variable that is not smooth.
+
+    Args:
+        expression: Of the variable and of others.
+        variable: Symbols, in which it shall be smooth.
+        other: All other symbols, below each other.
+        name: Of the variable.
+
+    Returns:
+        What to say of the expression; None if all is well.
+    """
+    function = ca.Function("f", [variable, other], [expression])
+    moving: dict[int, bool] = {}  # Whether what stands in a place of the work vector varies.
     for i in range(function.n_instructions()):
         operation = function.instruction_id(i)
         if operation == ca.OP_OUTPUT:
@@ -350,16 +434,17 @@ def _unfit(system: DaeSystem, expression: ca.SX) -> str | None:
         if operation == ca.OP_CONST:
             value = function.instruction_constant(i)
             if not np.isfinite(value):
-                return f"holds a constant that is not finite, {value}"
+                hint = "; math.sin of a symbol is nan, use casadi.sin" if np.isnan(value) else ""
+                return f"holds a constant that is not finite, {value}{hint}"
         elif operation == ca.OP_INPUT:
             moves = inputs[0] == 0
         else:
             moves = any(moving[place] for place in inputs)
             if moves and operation in _KINKS:
                 return (
-                    f"is not smooth: it takes {_KINKS[operation]} of the state. Lie derivatives "
-                    "would be those of one side without notice; write the side on which the state "
-                    "stays, or a smooth function such as tanh(x / e) or sqrt(x**2 + e**2)"
+                    f"is not smooth: it takes {_KINKS[operation]} of {name}. Derivatives would be "
+                    "those of one side without notice; write the one side that is needed, or a "
+                    "smooth function such as tanh(x / e) or sqrt(x**2 + e**2)"
                 )
         moving[function.instruction_output(i)[0]] = moves
     return None

@@ -1,5 +1,7 @@
 """The tracking law, with or without measured force.            (28), (29), (59), (71), (81)"""
 
+from __future__ import annotations
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -7,7 +9,7 @@ from numpy.typing import ArrayLike
 from drake_dae.dae.expressions import Factorization, TracedFunction
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.structure import Structure, find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import FloatArray, GainError, ModelError
 
 
@@ -42,8 +44,8 @@ class TrackingLaw:
     Raises:
         AssumptionError: The system violates an assumption of the theory.
         GainError: The gains do not fit, or are not Hurwitz.
-        ModelError: The structure is that of another system; or measured force, and no output is
-            a constraint input.
+        ModelError: No DaeSystem; the structure is that of another system; or measured force, and
+            no output is a constraint input.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class TrackingLaw:
         measured_force: bool = False,
         force_gain: ArrayLike = 0.0,
     ) -> None:
+        check_is_system(system, "TrackingLaw")
         self.system = system
         self.structure = structure or find_structure(system)
         if self.structure.system is not system:
@@ -63,6 +66,8 @@ class TrackingLaw:
             )
         degrees = self.structure.output_degrees
         names = tuple(signal.name for signal in system.output_signals)
+        if not (isinstance(gains, FeedbackGains) or callable(gains)):
+            raise GainError(f"gains must be a design such as poles(-4.0), got {gains!r}")
         self.gains = gains if isinstance(gains, FeedbackGains) else gains(names, degrees)
         if (self.gains.names, self.gains.degrees) != (names, degrees):
             raise GainError(

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.system import DaeSystem, Signal
+from drake_dae.dae.newton import Linearization, newton, shortest_steps
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
 from drake_dae.robots.actuation import ActuationChain, Stage, chain
 from drake_dae.robots.constraints import Constraint
@@ -153,28 +155,25 @@ class RobotModel:
                 f"expected ({count},) and ({self.links.q.numel()},)"
             )
         values = self.dae.parameter_values if parameters is None else parameters
-        length, best = 1.0, np.inf
-        step = np.zeros(q.size)
-        for _ in range(100):
-            phi, h_1, jacobian = self._configuration(q + length * step, values)
-            residual = np.concatenate([phi, h_1[:count] - wanted])
-            if residual.size == 0:
-                return q
-            jacobian = jacobian.reshape(phi.size + h_1.size, -1)[: residual.size]
-            size = float(np.max(np.abs(residual), initial=0.0))
-            if size < best:
-                q, best = q + length * step, size
-                step = -np.linalg.lstsq(jacobian, residual)[0]
-                length = 1.0
-            elif best < 1e-10:
-                return q
-            else:
-                length /= 2.0
+
+        def residual(q: FloatArray) -> FloatArray:
+            phi, h_1, _ = self._configuration(q, values)
+            return np.concatenate([phi, h_1[:count] - wanted])
+
+        def linearize(q: FloatArray) -> Linearization | None:
+            jacobian = self._configuration(q, values)[2].reshape(-1, q.size)
+            return shortest_steps(jacobian[: self.dae.num_constraints + count], residual)
+
+        found, _ = newton(q, linearize)
+        left = residual(found)
+        size = float(np.max(np.abs(left), initial=0.0))
+        if size < 1e-10:
+            return found
         raise InconsistentStateError(
             f"{self.name}: no configuration near the guess satisfies the constraints with "
-            f"outputs {np.array2string(wanted, precision=4)}; {best:.2g} is left. They may be out "
+            f"outputs {np.array2string(wanted, precision=4)}; {size:.2g} is left. They may be out "
             "of reach",
-            residual,
+            left,
         )
 
     def rest_state(
@@ -233,6 +232,14 @@ class RobotModel:
             raise ModelError(
                 f"{self.name}: actuation stages need one actuator per actuated joint, so "
                 "orthonormal columns of the actuation matrix"
+            )
+        rates = ca.mtimes(ca.SX(ca.sparsify(ca.DM(select.T))), self.links.velocity_map)
+        if actuation and not ca.is_equal(
+            ca.sparsify(rates), ca.SX(ca.sparsify(ca.DM(select.T))), 9
+        ):
+            raise ModelError(
+                f"{self.name}: actuation stages need the actuated velocities to be derivatives of "
+                "positions, q_i' = v_i: choose such coordinates where N(q) is not the identity"
             )
         transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
         position = ca.mtimes(transposed, self.links.q)

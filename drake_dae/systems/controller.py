@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.dae.tracking import TrackingLaw
@@ -33,17 +34,22 @@ class TrackingController(ParameterizedSystem):
     Both outputs feed through from all inputs. The context holds the model's parameters and then
     the gains K (its nonzeros, column by column) as one numeric parameter. Converts to AutoDiffXd.
 
+    Args:
+        law: The law.
+        outputs: At which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
+
     Warns:
-        NonMinimumPhaseWarning: The zero dynamics (35) are unstable about the nominal equilibrium.
+        NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
         SingularityError, NonFiniteError: During a simulation, with time and state.
     """
 
-    def __init__(self, law: TrackingLaw) -> None:
+    def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
         super().__init__(law.system, law.parameter_values())
         if law.structure.zero_dynamics_dimension:
-            stability = ZeroDynamics(law.structure).stability(law.structure.states[0])
+            dynamics = ZeroDynamics(law.structure)
+            stability = dynamics.stability(law.structure.states[0], outputs=outputs)
             if stability.verdict is Verdict.UNSTABLE:
                 warnings.warn(
                     f"{law.system.name}: {stability.reason}. The outputs follow the reference "

@@ -9,7 +9,8 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState, Val
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.samples import show
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import (
     FloatArray,
     InconsistentStateError,
@@ -50,16 +51,21 @@ class StateRealization(ParameterizedSystem):
     the same coordinates, x continues the last one. `set_state` chooses the branch.
 
     Args:
-        normal_form: Of the system, or its structure, for a completion that is chosen.
+        normal_form: Of the system; or the system, or its structure, for a completion that is
+            chosen.
 
     Raises:
+        AssumptionError: The system violates an assumption of the theory.
         ModelError: The structure has no normal form.
         SimulationError: During a simulation, with time and last state: there is no x, since the
             motion came to an end of the coordinates.
         SingularityError, NonFiniteError: During a simulation, with time and state.
     """
 
-    def __init__(self, normal_form: NormalForm | Structure) -> None:
+    def __init__(self, normal_form: NormalForm | Structure | DaeSystem) -> None:
+        if not isinstance(normal_form, (NormalForm, Structure)):
+            check_is_system(normal_form, "StateRealization")
+            normal_form = find_structure(normal_form)
         if isinstance(normal_form, Structure):
             normal_form = NormalForm(normal_form)
         structure = normal_form.structure

@@ -13,6 +13,7 @@ from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.system import flaw
 from drake_dae.errors import FloatArray, NonFiniteError, ReferenceSignalError
 from drake_dae.systems.autodiff import DifferentiableSystem, Formula
 
@@ -43,15 +44,23 @@ class ExpressionSignal:
 
     Args:
         function: Of a CasADi scalar t in s; returns an expression, or a list of these.
+
+    Raises:
+        ReferenceSignalError: What it returns is no such expression; at preparation, for an output
+            with mu_i >= 1: a constant that is not finite, or an operation on time that is not
+            smooth, such as fabs.
     """
 
     def __init__(self, function: Callable[[ca.SX], Any]) -> None:
         self._time = ca.SX.sym("t")
         value = function(self._time)
         items = value if isinstance(value, (list, tuple)) else [value]
-        self.expression = ca.vertcat(*items)
-        if not isinstance(self.expression, ca.SX):
-            self.expression = ca.SX(self.expression)
+        try:
+            self.expression = ca.SX(ca.vertcat(*items))
+        except (NotImplementedError, RuntimeError) as error:
+            raise ReferenceSignalError(
+                f"a reference must be an expression of the time or a list of these, got {value!r}"
+            ) from error
         unknown = [s.name() for s in ca.symvar(self.expression) if not ca.is_equal(s, self._time)]
         if unknown or self.expression.shape[1] != 1:
             raise ReferenceSignalError(
@@ -65,6 +74,7 @@ class ExpressionSignal:
 
     def derivative_expressions(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
         """r_1, r_1', ..., r_1^(mu_1), r_2, ... at a symbolic time."""
+        self._check(degrees)
         rows = []
         for i, degree in enumerate(degrees):
             rows.append(self.expression[i])
@@ -72,14 +82,31 @@ class ExpressionSignal:
                 rows.append(ca.jacobian(rows[-1], self._time))
         return ca.substitute(ca.vertcat(*rows), self._time, time)
 
+    def _check(self, degrees: Sequence[int]) -> None:
+        """Refuses what lacks derivatives up to the degrees."""
+        for i, degree in enumerate(degrees):
+            message = flaw(self.expression[i], self._time, ca.SX(0, 1), "the time")
+            if degree and message:
+                raise ReferenceSignalError(
+                    f"row {i} of the reference {message}. The law needs {degree} derivatives of "
+                    "it; a move from rest to rest is point_to_point"
+                )
+
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         rows = self.derivative_expressions(degrees, self._time)
         return _at_time(TracedFunction("reference", {"time": self._time}, {"R": rows}))
 
 
 def constant(values: ArrayLike) -> ExpressionSignal:
-    """Stays at given values, shape (k,)."""
-    numbers = np.atleast_1d(np.asarray(values, dtype=float))
+    """Stays at given values, shape (k,).
+
+    Raises:
+        ReferenceSignalError: They are not finite numbers.
+    """
+    try:
+        numbers = np.atleast_1d(np.asarray(values, dtype=float))
+    except (TypeError, ValueError):
+        raise ReferenceSignalError(f"constant: values must be numbers, got {values!r}") from None
     return ExpressionSignal(lambda t: list(numbers))
 
 
@@ -128,13 +155,12 @@ class _Move(ExpressionSignal):
         super().__init__(function)
         self._order = order
 
-    def derivative_expressions(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+    def _check(self, degrees: Sequence[int]) -> None:
         if max(degrees) > self._order:
             raise ReferenceSignalError(
                 f"point_to_point has {self._order} continuous derivatives, the law needs "
                 f"{max(degrees)}: pass order={max(degrees)} or more"
             )
-        return super().derivative_expressions(degrees, time)
 
 
 def point_to_point(
@@ -268,6 +294,11 @@ class ReferenceGenerator(DifferentiableSystem):
     def __init__(self, signals: Sequence[ReferenceSignal], degrees: Sequence[int]) -> None:
         super().__init__()
         self.set_name("reference")
+        for index, signal in enumerate(signals):
+            if not (hasattr(signal, "size") and hasattr(signal, "derivatives")):
+                raise ReferenceSignalError(
+                    f"references[{index}] must be a signal such as constant(0.3), got {signal!r}"
+                )
         covered = sum(signal.size for signal in signals)
         if covered != len(degrees):
             raise ReferenceSignalError(

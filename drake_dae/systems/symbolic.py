@@ -75,6 +75,8 @@ def from_symbolic(
             function.
     """
     owner = labels.get("name", "system")
+    if isinstance(state, Variable):
+        raise ModelError(f"{owner}: the states must be a list of Variables, got {state!r}")
     defaults = dict(parameters or {})
     symbols: dict[int, ca.SX] = {}
     for variable in [*state, *defaults]:

@@ -1,0 +1,147 @@
+"""What completes the constraint chains and the output chains: xi = Psi_2(x).         (22)"""
+
+from collections.abc import Iterator, Sequence
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae.samples import Margin, Samples, show, traced
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.structure import Structure
+from drake_dae.errors import FloatArray, ModelError
+
+TRANSVERSAL = 0.05
+"""Single states complete the chains if the sine of their smallest angle is above this."""
+
+Completion = tuple[ca.SX, tuple[Signal, ...], Margin]
+"""xi, its signals, and the margin of the Jacobian of Phi."""
+
+
+def check_completion(
+    structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
+) -> Completion:
+    """A completion that somebody chose.
+
+    Args:
+        structure: Of the system.
+        chains: y and zeta of (20), (21).
+        samples: Where the Jacobian of Phi must be regular.
+        xi: The completion, shape (d, 1).
+
+    Raises:
+        ModelError: Why it is none.
+    """
+    system, count = structure.system, structure.zero_dynamics_dimension
+    if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
+        got = f"shape {xi.shape}" if isinstance(xi, ca.SX) else type(xi).__name__
+        raise ModelError(
+            f"{system.name}: the completion must be a CasADi SX column of {count} expressions, "
+            f"n - sum r_i - sum mu_i; got {got}"
+        )
+    known = ca.vertcat(system.state, system.parameter_symbol)
+    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(known, s)]
+    if unknown:
+        raise ModelError(
+            f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "
+            "state nor a parameter"
+        )
+    signals = tuple(
+        next(
+            (
+                signal
+                for j, signal in enumerate(system.state_signals)
+                if ca.is_equal(xi[i], system.state[j])
+            ),
+            Signal(f"xi{i}"),
+        )
+        for i in range(count)
+    )
+    gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
+    margin = samples.margin(gradient)
+    if not margin.is_singular:
+        return xi, signals, margin
+    if not count:
+        raise ModelError(
+            f"{system.name}: the differentials of the chains are dependent to round-off at x = "
+            f"{show(margin.state)}: A(x) of (2) or B(x) of (16) is close to singular there"
+        )
+    (matrix,) = traced(system, gradient=gradient)(margin.state, system.parameter_values)
+    # How far each differential is from the span of those before it.
+    rows = _unit_rows(matrix.reshape(system.num_states, -1) * samples.scale)
+    distances = np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]
+    worst = int(np.argmin(distances))
+    raise ModelError(
+        f"{system.name}: the completion '{signals[worst].name}' = "
+        f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "
+        f"completion at x = {show(margin.state)}; choose a function whose differential is not in "
+        "the span of theirs, there and around"
+    )
+
+
+def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
+    """Single states whose differentials complete those of the chains, or else linear combinations.
+
+    They complete them where they are regular on the null spaces of the chains' differentials.
+    The arguments are those of `check_completion`.
+
+    Raises:
+        ModelError: Nothing linear completes the chains at all samples.
+    """
+    system, count = structure.system, structure.zero_dynamics_dimension
+    if not count:
+        return check_completion(structure, chains, samples, ca.SX(0, 1))
+    gradients = samples.values(gradient=ca.jacobian(chains, system.state))
+    spaces = np.array(
+        [np.linalg.svd(_unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]
+    )
+    for matrix in _candidates(spaces):
+        matrix = matrix / samples.scale
+        # Rounded, so that ties go to the first state on every machine.
+        largest = np.argmax(np.round(_unit_rows(np.abs(matrix)), 6), axis=1)
+        leading = matrix[np.arange(count), largest]
+        factors = np.vectorize(lambda c: float(f"{c:.3g}"))(matrix / leading[:, None])
+        xi = ca.mtimes(ca.sparsify(ca.SX(factors)), system.state)
+        margin = samples.margin(ca.jacobian(ca.vertcat(chains, xi), system.state))
+        if not margin.is_singular:
+            return xi, tuple(_combination(row, system.state_signals) for row in factors), margin
+    raise ModelError(
+        f"{system.name}: no linear combinations of states complete the chains (20) at all states "
+        f"around the nominal one; give a completion of {count} expressions"
+    )
+
+
+def _candidates(spaces: FloatArray) -> Iterator[FloatArray]:
+    """Combinations of states, shape (d, n), that are regular on all spaces, shape (k, n, d)."""
+    count = spaces.shape[2]
+    single = _pivots(spaces)
+    if np.linalg.svd(spaces[:, single], compute_uv=False).min() > TRANSVERSAL:
+        yield np.eye(spaces.shape[1])[single]
+    # The space that is nearest to all of them, in the basis that is the identity on its pivots.
+    mean = np.linalg.eigh(np.einsum("kid,kjd->ij", spaces, spaces))[1][:, -count:]
+    basis = np.linalg.solve(mean[_pivots(mean[None])].T, mean.T)
+    yield np.where(np.abs(basis) > 0.02, basis, 0.0)
+
+
+def _pivots(spaces: FloatArray) -> list[int]:
+    """States whose rows are far from dependent in all spaces: one QR with pivoting for all."""
+    rest, chosen = spaces.copy(), []
+    for _ in range(spaces.shape[2]):
+        # Rounded, as above.
+        chosen.append(int(np.argmax(np.round(np.linalg.norm(rest, axis=2).min(axis=0), 6))))
+        direction = _unit_rows(rest[:, chosen[-1]])
+        rest -= np.einsum("kid,kd,ke->kie", rest, direction, direction)
+    return sorted(chosen)
+
+
+def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
+    """Named as it reads: "x0 - 0.5 x1"."""
+    terms = [(c, signal) for c, signal in zip(factors, signals, strict=True) if c]
+    units = {signal.unit for _, signal in terms}
+    sign = {1.0: "", -1.0: "-"}
+    name = " + ".join(sign.get(c, f"{c:.3g} ") + signal.name for c, signal in terms)
+    return Signal(name.replace("+ -", "- "), units.pop() if len(units) == 1 else "")
+
+
+def _unit_rows(matrix: FloatArray) -> FloatArray:
+    length = np.linalg.norm(matrix, axis=-1, keepdims=True)
+    return matrix / np.where(length > 0.0, length, 1.0)
