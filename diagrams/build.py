@@ -108,6 +108,7 @@ def build(
             scene_graph=scene_graph,
             meshcat=meshcat,
             live=live,
+            start_time=scenario.integrator.start_time,
         )
 
     # At rest, where the references begin, plus the errors.

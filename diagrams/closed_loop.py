@@ -37,9 +37,6 @@ from drake_dae.systems.references import ReferenceGenerator, ReferenceSignal
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
 
-EXPORTED = ("state", "constraint_force", "constraint_residual", "controlled_output")
-"""Output ports of the plant that the diagram exports and logs under their own names."""
-
 _ON_REQUEST = 1e9
 """A publish period so long that only a forced publish draws."""
 
@@ -115,6 +112,7 @@ def make_closed_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     live: bool = True,
+    start_time: float = 0.0,
 ) -> ClosedLoop:
     """Wires plant, reference generator and controller, with loggers and a view.
 
@@ -130,13 +128,21 @@ def make_closed_loop(
             scene_graph; None draws nothing.
         live: Draw while simulating, `FRAME_RATE` times a second; this shortens the integrator's
             steps. False draws only in `make_animation`.
+        start_time: When a run begins, in s: the zero dynamics are judged at the references then.
 
     A loop that draws nothing and samples nothing converts to AutoDiffXd, for Drake's Linearize.
+
+    Warns:
+        NonMinimumPhaseWarning: As `TrackingController`.
 
     Raises:
         WiringError: A law or a sensor of sizes that are not the plant's; measured force that would
             close an algebraic loop, or a sampled loop that diverges; or a sensor that no law uses.
     """
+    if not isinstance(system, DaePlant):
+        raise WiringError(
+            f"make_closed_loop needs a DaePlant or RobotPlant, got {type(system).__name__}"
+        )
     _check_sizes(system, law, sensor)
     builder = DiagramBuilder()
 
@@ -144,9 +150,9 @@ def make_closed_loop(
     plant = builder.AddSystem(system)
     reference = builder.AddSystem(ReferenceGenerator(references, law.degrees))
     try:
-        outputs = first_outputs(law.structure, reference.reference(0.0))
+        outputs = first_outputs(law.structure, reference.reference(start_time))
     except DrakeDaeError:
-        outputs = None  # It begins later.
+        outputs = None  # A trajectory that begins later.
     controller = builder.AddSystem(TrackingController(law, outputs))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -26,7 +27,7 @@ from drake_dae.diagrams.scenario import (
     save_scenario,
     shipped_scenarios,
 )
-from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.errors import DrakeDaeError, NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation.meshcat import start_meshcat
 from drake_dae.simulation.plots import PLOTS, save_plots
 from drake_dae.simulation.simulate import RunStatistics, simulate
@@ -96,8 +97,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.command == "list":
             return _list()
         if options.command == "analyze":
-            return _analyze(options)
-        return _simulate(options)
+            with _warnings(NonMinimumPhaseWarning):  # The report tells it.
+                return _analyze(options)
+        with _warnings():
+            return _simulate(options)
     except DrakeDaeError as error:
         # Texts of Drake and YAML may have several lines.
         text = " ".join(str(error).split())
@@ -123,6 +126,16 @@ def _list() -> int:
     for name, path in paths.items():
         print(f"{name.ljust(width)}  {load_scenario(path).description}")
     return 0
+
+
+@contextmanager
+def _warnings(*ignored: type[Warning]) -> Iterator[None]:
+    """Prints warnings as errors are printed, without the line of code; some are ignored."""
+    with warnings.catch_warnings():
+        for category in ignored:
+            warnings.simplefilter("ignore", category)
+        warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+        yield
 
 
 def _analyze(options: argparse.Namespace) -> int:

@@ -1,9 +1,9 @@
-"""The same task with four actuations: springs, motors, servos, motors behind springs.
+"""The same task with five actuations: none, springs, motors, servos, motors behind springs.
 
 The two-link arm follows a line on a wall while it presses with 20 + 5 sin(2t) N; it starts with a
-position error of 2 cm and a force error of 5 N. Beside them rigid joints, where the force is no
-state and meets its reference at once. Motors and servos have the same degrees, and so, with the
-same poles, the same errors.
+position error of 2 cm and a force error of 5 N. With rigid joints the force is no state and meets
+its reference at once. Motors and servos have the same degrees, and so, with the same poles, the
+same errors.
 
 Claim: each error is the one that its design (60), (72)-(73), (82)-(83) predicts, to 1e-7.
 """

@@ -1,7 +1,7 @@
 """Drake's own tools on an arm in contact: Linearize and DirectCollocation, with exact gradients.
 
 Claims: the linearized force and position loop has the assigned poles, the pole -(1 + G) / T of its
-force sensor, and two zeros, for the drift off the wall that is neither driven nor damped. A motion
+force sensor, and two zeros, for the directions off N*, in which nothing drives or damps. A motion
 along the wall that DirectCollocation planned with least effort ends, replayed open loop, within
 0.1 mm of its goal.
 """

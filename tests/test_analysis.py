@@ -396,6 +396,23 @@ def test_a_region_for_one_state_leaves_the_others_near_the_nominal_one():
     assert not analyze(pendulum, region={"vx": (-1.0, 1.0)}).problems
 
 
+def test_a_region_is_covered_whatever_the_constraints_move():
+    """A point on a circle: B = -y vanishes at (-1, 0) and (1, 0)."""
+    circle = DaeSystem.from_functions(
+        ["x", "y"],
+        f=lambda s: [0, 0],
+        g=lambda s: [2 * s[0], 2 * s[1]],
+        h=lambda s: [-s[1], s[0]],
+        k=lambda s: [s[0] ** 2 + s[1] ** 2 - 1],
+        l=lambda s: [s[0]],
+        m=lambda s: [[0]],
+        nominal_state=[0.6, 0.8],
+    )
+    analysis = analyze(circle, region={"x": (-1.1, 1.1)})
+    assert np.ptp(analysis.states[:, 0]) > 1.8
+    assert NO in findings(analysis)
+
+
 def test_consistency_does_not_depend_on_units():
     """A pendulum of a micrometre that is 30 % off N*, and one of 1e9 m that is on it."""
 

@@ -169,6 +169,24 @@ def test_the_motion_may_be_given_in_fewer_operations():
             find_structure(with_inertia(arm, motion=wrong))
 
 
+def test_a_motion_of_small_states_is_taken():
+    """sqrt(y) near 1e-5: states drawn by 0.1 would be outside of its domain."""
+    y = ca.SX.sym("y", 3)
+    system = DaeSystem(
+        state=y,
+        f=-ca.sqrt(y),
+        g=[],
+        h=ca.SX.eye(3),
+        k=[],
+        l=y,
+        m=[],
+        mass_matrix=2 * ca.SX.eye(3),
+        nominal_state=[1e-5] * 3,
+        motion=lambda x, v: (2 * x + ca.sqrt(y), ca.SX(0, 1)),
+    )
+    assert find_structure(system).output_degrees == (1, 1, 1)
+
+
 def test_what_is_symmetric_at_the_default_parameters_alone_is_not_taken_as_symmetric():
     """c = k' has the gradient g^T only for s = 1; the law and the motion hold for s = 2, too."""
     x, scale = ca.SX.sym("x", 4), Parameter("s", 1.0)

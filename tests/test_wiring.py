@@ -8,6 +8,7 @@ from drake_dae import (
     DcMotors,
     ForceSensor,
     RobotPlant,
+    StateRealization,
     TrackingLaw,
     build,
     constant,
@@ -183,3 +184,10 @@ def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
 def test_a_gain_without_effect_is_refused():
     with pytest.raises(ScenarioError, match=r"force or gains: .*degree 2 and takes the measured"):
         build(scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}"))
+
+
+def test_a_state_realization_is_no_plant_for_the_closed_loop():
+    chosen = law("two_link")
+    realization = StateRealization(chosen.structure)
+    with pytest.raises(WiringError, match="needs a DaePlant or RobotPlant, got StateRealization"):
+        make_closed_loop(realization, chosen, [constant([0.2, 20.0])])

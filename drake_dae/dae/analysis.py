@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.region import Region
 from drake_dae.dae.report import Analysis, Assumption, Finding, count_of
-from drake_dae.dae.samples import Fields, Margin, Samples
+from drake_dae.dae.samples import Fields, Margin, Samples, default_spread
 from drake_dae.dae.signals import numbers
 from drake_dae.dae.structure import (
     Constrained,
@@ -23,7 +23,6 @@ from drake_dae.dae.structure import (
     check_system,
     constraint_violation,
     control_violation,
-    default_spread,
     examine_constraints,
     examine_outputs,
 )
@@ -79,7 +78,7 @@ def analyze(
             the motion that it commands, and the zero dynamics judged at its first outputs.
         times: In s, increasing, shape (k,); where on the reference.
         start: State near which the motion along the reference starts, shape (n,); the first
-            examined state if None.
+            examined state if None; only with a reference.
         count: How many random states are drawn.
         seed: Of the random numbers.
 
@@ -123,7 +122,7 @@ def analyze(
         constrained = examine_constraints(system, guesses, box)
     except AssumptionError as error:
         where = _where(len(guesses), len(guesses), "state", region, given)
-        return Analysis(system, where, guesses, _assumptions((), [error]))
+        return Analysis(system, where, guesses[: given or None], _assumptions((), [error]))
     except InconsistentStateError as error:
         if region is None:
             raise

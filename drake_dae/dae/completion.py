@@ -8,6 +8,7 @@ import numpy as np
 from drake_dae.dae.samples import Margin, Samples, show, traced
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import Structure
+from drake_dae.dae.system import flaw
 from drake_dae.errors import FloatArray, ModelError
 
 TRANSVERSAL = 0.05
@@ -45,6 +46,9 @@ def check_completion(
             f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "
             "state nor a parameter"
         )
+    kink = flaw(xi, system.state, system.parameter_symbol, "the state")
+    if kink:
+        raise ModelError(f"{system.name}: the completion {kink}")
     signals = tuple(
         next(
             (

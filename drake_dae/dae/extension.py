@@ -22,11 +22,10 @@ from numpy.typing import ArrayLike
 from drake_dae.dae.expressions import Factorization, TracedFunction
 from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.samples import SINGULAR, Fields, Samples, multiply, show, traced
+from drake_dae.dae.samples import SINGULAR, Fields, Samples, default_spread, multiply, show, traced
 from drake_dae.dae.signals import Signal, numbers
 from drake_dae.dae.structure import (
     Structure,
-    default_spread,
     examine_structure,
     find_structure,
 )
@@ -104,6 +103,8 @@ def extend(
         integrators: Name of a control -> how many; or names, for one each.
         nominal_control: Values of controls at the nominal state, for the integrators that hold
             them; zero where not given. B(x) is often singular at zero.
+
+    A control must not be named as a state is; rename one where it is.
 
     Returns:
         The system with the states (x, u_i, u_j, ..., u_i', ...).

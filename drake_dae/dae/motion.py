@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.dae.expressions import Factorization, PositiveDefiniteFactorization
+from drake_dae.dae.samples import default_spread
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
@@ -171,10 +172,6 @@ class Motion:
             blocks.append(ca.horzcat(*columns, ca.jacobian(row, self.control)))
         return ca.sparsify(ca.vertcat(*blocks))
 
-    def unknowns(self) -> ca.SX:
-        """State and all unknowns that exist up to now, below each other."""
-        return ca.vertcat(*self._symbols)
-
     def _first_order(self, constraint: ca.SX) -> tuple[ca.SX, ca.SX]:
         """E x' - f - g v and c', in terms of the first unknowns."""
         system, rate = self.system, self._rates[0]
@@ -252,9 +249,10 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
     symbols = [system.state, *unknowns, system.parameter_symbol]
     function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
     random, p = np.random.default_rng(0), system.parameter_values
+    deviation = default_spread(system.nominal_state)
     finite = 0
     for spread in (0.0, 0.1, 0.1):
-        x = system.nominal_state + 0.1 * random.standard_normal(system.num_states)
+        x = system.nominal_state + deviation * random.standard_normal(system.num_states)
         numbers = [random.standard_normal(u.numel()) for u in unknowns]
         changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
         one, other = (v.full() for v in function(x, *numbers, changed))

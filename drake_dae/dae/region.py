@@ -87,6 +87,25 @@ class ConsistentRegion:
             )
         return state
 
+    def draw(self, guess: FloatArray) -> FloatArray:
+        """A consistent state that has the bounded states of a guess, where there is one.
+
+        So random values in the bounds cover them, whatever the constraints move.
+
+        Raises:
+            InconsistentStateError: No consistent state in the region.
+        """
+        region = self.region
+        if region is None:
+            return self.project(guess)
+        bounded = np.isfinite(region.low)
+        held = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
+        try:
+            state = self.manifold.project(self._newton(held, guess))
+        except InconsistentStateError:
+            return self.project(guess)
+        return state if region.holds(state) else self.project(guess)
+
     def descend(
         self, function: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray
     ) -> FloatArray:
@@ -153,7 +172,8 @@ class ConsistentRegion:
         """The factor by which a step reaches the edge of the box."""
         edge = np.where(step < 0.0, region.low, region.high)
         moving = step != 0.0
-        return float(np.min((edge - state)[moving] / step[moving], initial=np.inf))
+        with np.errstate(over="ignore"):
+            return float(np.min((edge - state)[moving] / step[moving], initial=np.inf))
 
     def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
         """Newton's method for the constraints that does not leave the box."""

@@ -81,7 +81,7 @@ class Samples:
 
     Attributes:
         states: Shape (samples, n).
-        fields: The matrices g, h, m ... at each.
+        fields: f, g, h, l and m at each state, by letter.
         scale: How large each state is over all of them and the guesses, shape (n,).
 
     Raises:
@@ -104,7 +104,7 @@ class Samples:
         failure = None
         for number, guess in enumerate(guesses):
             try:
-                state = self._consistent.project(guess)
+                state = self._consistent.draw(guess)
             except InconsistentStateError as error:
                 failure = failure or error
                 continue
@@ -308,6 +308,17 @@ class _ScaledMatrix:
         return TracedFunction(self._system.name, inputs, {"gradient": product}, often=False)
 
 
+def default_spread(nominal: FloatArray) -> FloatArray:
+    """How far states are drawn from the nominal one, shape (n,): 0.1.
+
+    In unusual units a hundredth of the nominal value where that is above 10, and a tenth where it
+    is below 1e-3 and not round-off.
+    """
+    size = np.abs(nominal)
+    small = (size < 1e-3) & (size > 1e-12 * size.max())
+    return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
+
+
 def traced(system: DaeSystem, **expressions: ca.SX) -> TracedFunction:
     """A function of the state and of all parameters."""
     inputs = {"x": system.state, "p": system.parameter_symbol}
@@ -319,11 +330,6 @@ def _masked(matrix: ca.SX, zero: Booleans | None) -> ca.SX:
     for i, j in np.argwhere(zero) if zero is not None else ():
         result[int(i), int(j)] = 0.0
     return ca.sparsify(result)
-
-
-def largest(matrix: FloatArray) -> FloatArray:
-    """The largest size in each row; 0 without columns."""
-    return np.max(np.abs(matrix), axis=1, initial=0.0)
 
 
 def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:

@@ -12,7 +12,15 @@ from drake_dae.dae.lie import lie_derivative, lie_derivative_along
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.motion import Motion
 from drake_dae.dae.region import Region
-from drake_dae.dae.samples import Booleans, Fields, Margin, Samples, show, traced
+from drake_dae.dae.samples import (
+    Booleans,
+    Fields,
+    Margin,
+    Samples,
+    default_spread,
+    show,
+    traced,
+)
 from drake_dae.dae.signals import numbers
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
@@ -99,8 +107,8 @@ def find_structure(
     Raises:
         AssumptionError: An assumption that is violated, with the state where.
         InconsistentStateError: No consistent state near the nominal one.
-        ModelError: No control input, a function that is not finite at the nominal state, or a mass
-            matrix that is not symmetric and positive definite there.
+        ModelError: No control input, a function that is not finite at the nominal state, a mass
+            matrix that is not symmetric and positive definite, or a count or spread without sense.
     """
     try:
         structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
@@ -148,17 +156,6 @@ def examine_structure(
     structure = examine_outputs(constrained)
     degrees = structure.output_degrees
     return structure, control_violation(system, degrees, structure.control_margin)
-
-
-def default_spread(nominal: FloatArray) -> FloatArray:
-    """How far states are drawn from the nominal one, shape (n,): 0.1, in other units than usual.
-
-    That is a hundredth of the nominal value where this is above 10, and a tenth where it is below
-    1e-3 and not round-off.
-    """
-    size = np.abs(nominal)
-    small = (size < 1e-3) & (size > 1e-12 * size.max())
-    return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
 
 
 def check_system(system: DaeSystem) -> None:

@@ -16,8 +16,8 @@ from drake_dae.dae.manifold import DEPENDENT, ROUND_OFF
 from drake_dae.dae.newton import Linearization, newton, shortest_steps
 from drake_dae.dae.pinned_motion import PinnedMotion, Reference, follow
 from drake_dae.dae.pinned_outputs import PinnedOutputs, Point
-from drake_dae.dae.samples import show
-from drake_dae.dae.structure import Structure, default_spread, find_structure
+from drake_dae.dae.samples import default_spread, show
+from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
 

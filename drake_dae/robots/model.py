@@ -233,15 +233,13 @@ class RobotModel:
                 f"{self.name}: actuation stages need one actuator per actuated joint, so "
                 "orthonormal columns of the actuation matrix"
             )
-        rates = ca.mtimes(ca.SX(ca.sparsify(ca.DM(select.T))), self.links.velocity_map)
-        if actuation and not ca.is_equal(
-            ca.sparsify(rates), ca.SX(ca.sparsify(ca.DM(select.T))), 9
-        ):
+        transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
+        rates = ca.mtimes(transposed, self.links.velocity_map)
+        if actuation and not ca.is_equal(ca.sparsify(rates), transposed, 9):
             raise ModelError(
                 f"{self.name}: actuation stages need the actuated velocities to be derivatives of "
                 "positions, q_i' = v_i: choose such coordinates where N(q) is not the identity"
             )
-        transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
         position = ca.mtimes(transposed, self.links.q)
         return chain(actuation, self.links, position, ca.mtimes(transposed, self.links.v))
 

@@ -48,7 +48,8 @@ class StateRealization(ParameterizedSystem):
 
     Newton's method starts from the last x that was computed in the same context. What it finds
     does not depend on that start beyond round-off, but for the branch: where several states have
-    the same coordinates, x continues the last one. `set_state` chooses the branch.
+    the same coordinates, x continues the last one. `set_state` chooses the branch;
+    `Clone` of a context keeps it, `SetTimeStateAndParametersFrom` does not.
 
     Args:
         normal_form: Of the system; or the system, or its structure, for a completion that is

@@ -62,6 +62,8 @@ def from_symbolic(
 ) -> DaeSystem:
     """A system (1)-(3) whose functions are expressions of `pydrake.symbolic`.
 
+    These share no subexpressions, so that what stands in them twice is translated twice.
+
     Args:
         state: The variables x, in order.
         f, g, h, k, l, m: As in `DaeSystem`: an Expression, Variable or number, or a list or array
