@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.errors import FloatArray, ModelError
 
+SINGULAR_PIVOT = 1e-12
+"""A matrix whose `pivot` is below this counts as singular; see `Factorization`."""
+
 
 class TracedFunction:
     """CasADi expressions, evaluated on preallocated NumPy arrays.

@@ -22,7 +22,16 @@ from numpy.typing import ArrayLike
 from drake_dae.dae.expressions import Factorization, TracedFunction
 from drake_dae.dae.lie import lie_derivative
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.samples import SINGULAR, Fields, Samples, default_spread, multiply, show, traced
+from drake_dae.dae.samples import (
+    SINGULAR,
+    Fields,
+    Samples,
+    default_spread,
+    multiply,
+    positive,
+    show,
+    traced,
+)
 from drake_dae.dae.signals import Signal, numbers
 from drake_dae.dae.structure import (
     Structure,
@@ -332,8 +341,8 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     samples = Samples(structure.manifold, Fields(system.explicit), structure.states)
     matrices = _control_matrices(structure, samples)
     size = np.abs(matrices).max(axis=0)
-    row_size = _positive(size.max(axis=1))
-    column_size = _positive((size / row_size[:, None]).max(axis=0))
+    row_size = positive(size.max(axis=1))
+    column_size = positive((size / row_size[:, None]).max(axis=0))
     scaled = matrices / row_size[:, None] / column_size
     left, values, _ = np.linalg.svd(scaled)
     ranks = (values > SINGULAR).sum(axis=1)
@@ -386,7 +395,7 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
 def _control_matrices(structure: Structure, samples: Samples) -> FloatArray:
     """B(x) without its round-off, shape (samples, p, p)."""
     elimination, state = structure.elimination, structure.system.state
-    _, h_star, n_star = samples.eliminated(
+    h_star, n_star = samples.eliminated(
         elimination.constraint_gradient, elimination.constraint_matrix
     )
     dynamic = [i for i, degree in enumerate(structure.output_degrees) if degree]
@@ -472,7 +481,3 @@ def _check_names(system: DaeSystem, given: Mapping[str, float], what: str) -> No
 
 def _is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 1
-
-
-def _positive(sizes: FloatArray) -> FloatArray:
-    return np.where(sizes > 0.0, sizes, 1.0)

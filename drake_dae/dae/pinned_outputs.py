@@ -14,18 +14,15 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.expressions import Factorization, TracedFunction
+from drake_dae.dae.expressions import SINGULAR_PIVOT, Factorization, TracedFunction
 from drake_dae.dae.manifold import CONSISTENT
 from drake_dae.dae.newton import Linearization, newton, shortest_steps
 from drake_dae.dae.samples import show
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import FloatArray, InconsistentStateError
 
-SINGULAR = 1e-12
-"""Below this sine between its columns A or B has no inverse; see `expressions.Factorization`."""
-
 VANISHED = 1e-9
-"""Nor has it below this part of its usual margin, which tells for a single number."""
+"""Below this part of its usual margin A or B counts as singular, also where it is one number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +246,9 @@ class PinnedOutputs:
         if not (np.all(np.isfinite(point.A)) and np.all(np.isfinite(point.B))):
             return "A(x) or B(x) is not finite"
         pairs = zip(point.margins, self._usual_margins, strict=True)
-        if not point.pivot[0] > SINGULAR or any(now < VANISHED * usual for now, usual in pairs):
+        if not point.pivot[0] > SINGULAR_PIVOT or any(
+            now < VANISHED * usual for now, usual in pairs
+        ):
             return "A(x) or B(x) is singular"
         moving = np.concatenate([point.rate, point.control, point.constraint_input])
         return "" if np.all(np.isfinite(moving)) else "x' is not finite"

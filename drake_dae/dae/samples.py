@@ -121,7 +121,7 @@ class Samples:
         if failure and not states:
             raise failure
         self.states = np.array(states)
-        self.scale = _positive(np.abs(np.vstack([guesses, self.states])).max(axis=0))
+        self.scale = positive(np.abs(np.vstack([guesses, self.states])).max(axis=0))
 
     def values(self, **expressions: ca.SX) -> list[tuple[FloatArray, ...]]:
         """Expressions of the state, as matrices, at each state.
@@ -148,8 +148,8 @@ class Samples:
 
     def eliminated(
         self, constraint_gradient: ca.SX, constraint_matrix: ca.SX
-    ) -> tuple[list[Sized], list[Sized], list[Sized]]:
-        """beta (14), h* (10) and n* (12) at each state, from their factors.
+    ) -> tuple[list[Sized], list[Sized]]:
+        """h* (10) and n* (12) at each state, from the factors of beta (14).
 
         Where they are zero but for round-off, they are zero here.
 
@@ -157,7 +157,7 @@ class Samples:
             constraint_gradient: Of the last derivatives of the constraints, shape (m, n).
             constraint_matrix: A(x), shape (m, m).
         """
-        beta, h_star, n_star = [], [], []
+        h_star, n_star = [], []
         values = self.values(gradient=constraint_gradient, matrix=constraint_matrix)
         for fields, (gradient, matrix) in zip(self.fields, values, strict=True):
             h, size = fields["h"], np.abs(fields["h"])
@@ -165,11 +165,11 @@ class Samples:
             # Units of the constraints' derivatives, and of the constraint inputs.
             rows, columns = _equilibration(np.abs(matrix))
             inverse = np.linalg.inv(matrix / rows[:, None] / columns) / columns[:, None] / rows
-            beta.append(multiply(-inverse, by_control, rows))
-            added, added_size = multiply(fields["g"], beta[-1], 1.0 / columns)
+            beta = multiply(-inverse, by_control, rows)
+            added, added_size = multiply(fields["g"], beta, 1.0 / columns)
             h_star.append(_without_round_off(h + added, size + added_size))
-            n_star.append(multiply(fields["m"], beta[-1], 1.0 / columns))
-        return beta, h_star, n_star
+            n_star.append(multiply(fields["m"], beta, 1.0 / columns))
+        return h_star, n_star
 
     def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
         """The derivatives of functions along fields; what is nothing but round-off is zero.
@@ -354,7 +354,8 @@ def _without_round_off(value: FloatArray, size: FloatArray) -> Sized:
     return np.where(np.abs(value) > ZERO * size, value, 0.0), size
 
 
-def _positive(sizes: FloatArray) -> FloatArray:
+def positive(sizes: FloatArray) -> FloatArray:
+    """Sizes to divide by: 1 in place of 0."""
     return np.where(sizes > 0.0, sizes, 1.0)
 
 

@@ -418,7 +418,7 @@ def _output_chains(
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     count = system.num_controls
     moving = system.l + ca.mtimes(system.m, motion.constraint_input)
-    _, h_star_values, n_star_values = samples.eliminated(
+    h_star_values, n_star_values = samples.eliminated(
         elimination.constraint_gradient, elimination.constraint_matrix
     )
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)

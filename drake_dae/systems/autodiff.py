@@ -21,11 +21,8 @@ from pydrake.systems.framework import (
     SystemScalarConverter,
 )
 
-from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.expressions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.errors import FloatArray, ModelError, NonFiniteError
-
-SINGULAR = 1e-12
-"""Below this sine between columns a matrix counts as singular; see `expressions.Factorization`."""
 
 
 class Formula(Protocol):
@@ -54,7 +51,7 @@ class TracedFormula:
         output: Which output.
         sources: Of the arguments; their own names if None.
         failure: (time, *arguments) -> the error to raise where the function is not finite or its
-            pivot is below `SINGULAR`.
+            pivot is below `SINGULAR_PIVOT`.
     """
 
     def __init__(
@@ -73,7 +70,7 @@ class TracedFormula:
     def value(self, time: float, *arguments: FloatArray) -> FloatArray:
         values = self._function.evaluate(*arguments)
         names = self._function.output_names
-        regular = "pivot" not in names or values[names.index("pivot")][0] >= SINGULAR
+        regular = "pivot" not in names or values[names.index("pivot")][0] >= SINGULAR_PIVOT
         if not (self._function.is_finite and regular):
             raise self._failure(time, *arguments)
         return values[self._output].copy()

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 
+from drake_dae.dae.expressions import SINGULAR_PIVOT
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics import Verdict, ZeroDynamics
 from drake_dae.errors import (
@@ -15,7 +16,7 @@ from drake_dae.errors import (
     SimulationError,
     SingularityError,
 )
-from drake_dae.systems.autodiff import SINGULAR, Formula, TracedFormula
+from drake_dae.systems.autodiff import Formula, TracedFormula
 from drake_dae.systems.parameters import ParameterizedSystem
 
 
@@ -81,7 +82,7 @@ class TrackingController(ParameterizedSystem):
         arguments = [port.Eval(context) for port in self._input_ports]
         arguments.append(context.get_numeric_parameter(0).value())
         values = function.evaluate(*arguments)
-        if function.is_finite and values[2][0] >= SINGULAR:
+        if function.is_finite and values[2][0] >= SINGULAR_PIVOT:
             return values
         raise self._failure(context.get_time(), *arguments)
 

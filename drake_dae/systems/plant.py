@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
     State,
 )
 
-from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.expressions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import (
@@ -24,7 +24,7 @@ from drake_dae.errors import (
     SimulationError,
     SingularityError,
 )
-from drake_dae.systems.autodiff import SINGULAR, Formula, TracedFormula
+from drake_dae.systems.autodiff import Formula, TracedFormula
 from drake_dae.systems.parameters import ParameterizedSystem
 
 
@@ -155,7 +155,7 @@ class DaePlant(ParameterizedSystem):
         p = context.get_numeric_parameter(0).value()
         arguments = (x, p) if control is None else (x, control, p)
         value, pivot = function.evaluate(*arguments)
-        if not function.is_finite or pivot[0] < SINGULAR:
+        if not function.is_finite or pivot[0] < SINGULAR_PIVOT:
             raise self._failure(function, context.get_time(), *arguments)
         return value
 

@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, ValueProducer
 
-from drake_dae.dae.expressions import TracedFunction
+from drake_dae.dae.expressions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.samples import show
 from drake_dae.dae.structure import Structure, find_structure
@@ -19,7 +19,7 @@ from drake_dae.errors import (
     SimulationError,
     SingularityError,
 )
-from drake_dae.systems.autodiff import SINGULAR, Formula
+from drake_dae.systems.autodiff import Formula
 from drake_dae.systems.parameters import ParameterizedSystem
 
 
@@ -198,7 +198,7 @@ class StateRealization(ParameterizedSystem):
     ) -> FloatArray:
         x = self._state_entry.Eval(context)
         value, pivot = function.evaluate(x, *control, context.get_numeric_parameter(0).value())
-        if function.is_finite and pivot[0] >= SINGULAR:
+        if function.is_finite and pivot[0] >= SINGULAR_PIVOT:
             return value
         time = context.get_time()
         where = f"at t = {time:.6g} s, state {show(x)}"
