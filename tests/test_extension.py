@@ -193,6 +193,12 @@ def test_all_else_stays():
         )
 
 
+@pytest.mark.parametrize("wrong", ["u0", 3, None])
+def test_integrators_are_named_in_a_list(wrong):
+    with pytest.raises(ModelError, match="a list of names, or name -> how many, got"):
+        extend(double_integrator(), wrong)
+
+
 def test_no_integrators_change_nothing():
     system = crane()
     assert extend(system, []) is system

@@ -109,6 +109,8 @@ def test_spread_and_count():
     assert find_structure(system, count=1).states.shape == (2, 4)
     with pytest.raises(ModelError, match="count must be a whole number from 1, got 0"):
         find_structure(system, count=0)
+    with pytest.raises(ModelError, match="seed must be a whole number from 0, got -1"):
+        find_structure(system, seed=-1)
     for wrong in ([0.1, 0.2], [[0.1]], np.nan):
         with pytest.raises(ModelError, match=r"spread must be a number or have shape \(4,\)"):
             find_structure(system, spread=wrong)

@@ -97,6 +97,8 @@ def analyze(
         raise ModelError(f"{system.name}: give a region or states, not both")
     if (reference is None) != (times is None):
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
+    if start is not None and reference is None:
+        raise ModelError(f"{system.name}: start is where a reference begins, and there is none")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:

@@ -121,6 +121,12 @@ def extend(
     Raises:
         ModelError: An unknown control, or a number of integrators below 1.
     """
+    check_is_system(system, "extend")
+    if isinstance(integrators, str) or not isinstance(integrators, Mapping | Sequence):
+        raise ModelError(
+            f"{system.name}: integrators are a list of names, or name -> how many, got "
+            f"{integrators!r}"
+        )
     if not isinstance(integrators, Mapping):
         integrators = dict.fromkeys(integrators, 1)
     bad = {name: count for name, count in integrators.items() if not _is_count(count)}
@@ -223,7 +229,7 @@ class _Chain:
         self.system = system
         if spread is None:
             spread = default_spread(system.nominal_state)
-        deviation = np.asarray(spread, dtype=float)
+        deviation = numbers(f"{system.name}: spread", spread)
         if deviation.shape not in ((), (system.num_states,)):
             raise ModelError(
                 f"{system.name}: spread must be a number or have shape ({system.num_states},), got "

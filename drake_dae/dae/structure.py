@@ -145,6 +145,8 @@ def examine_structure(
             f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
             f"{spread!r}"
         )
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ModelError(f"{system.name}: seed must be a whole number from 0, got {seed!r}")
     random = np.random.default_rng(seed)
     guesses = system.nominal_state + deviation * np.vstack(
         [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
