@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ import drake_dae
 from drake_dae import Record, cli, load_scenario
 from drake_dae.cli import FILES, main
 from drake_dae.diagrams.scenario import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
+from drake_dae.errors import NonMinimumPhaseWarning
 from drake_dae.simulation.plots import PLOTS
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
@@ -356,3 +358,19 @@ def test_a_bar_on_a_terminal(tmp_path):
     steps = shown.decode().rstrip().split("\r")
     assert len(steps) > 3
     assert re.search(r"100%\|.*\| 0\.50/0\.50 s, \d+\.\d x real time", steps[-1])
+
+
+@pytest.mark.filterwarnings("always")
+def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, capsys):
+    """`analyze` tells of unstable zero dynamics in its report, and does not warn of them too."""
+
+    def warn(options):
+        warnings.warn("two tanks: non-minimum phase", NonMinimumPhaseWarning, stacklevel=1)
+        return 0
+
+    monkeypatch.setattr(cli, "_simulate", warn)
+    monkeypatch.setattr(cli, "_analyze", warn)
+    assert main(["simulate", "two_link_wall"]) == 0
+    assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\n"
+    assert main(["analyze", "two_link_wall"]) == 0
+    assert capsys.readouterr().err == ""

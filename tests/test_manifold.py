@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS, Problem, pendulum
+from problems import PROBLEMS, Problem, double_integrator, pendulum
 
 from drake_dae.dae.manifold import Manifold, are_dependent
 from drake_dae.dae.structure import find_structure
@@ -201,3 +203,12 @@ def test_a_manifold_may_be_a_point():
 )
 def test_dependent_gradients(gradients, expected):
     assert are_dependent(np.array(gradients, dtype=float)) is expected
+
+
+def test_a_constraint_that_no_state_changes_is_never_met():
+    """Newton's step is zero there, which is not the same as being on N*."""
+    held = replace(double_integrator(), k=1, g=[0, 1], m=[0])
+    manifold = Manifold(held, [[held.k]])
+    assert not manifold.is_consistent([0.0, 0.0])
+    with pytest.raises(InconsistentStateError):
+        manifold.project([0.0, 0.0])

@@ -1,5 +1,6 @@
 from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
@@ -16,7 +17,9 @@ from problems import (
 )
 
 from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import find_structure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import GainError, ModelError
 
@@ -205,6 +208,31 @@ def test_a_singular_b_shows_in_the_pivot():
     state[5] = 0.0  # The heading rate, without which the thrust does not act on the force.
     pivot = law.function(state, reference_at(problem, 0.0), law.parameter_values())[2]
     assert pivot[0] < 1e-15
+
+
+def test_a_singular_a_shows_in_the_pivot():
+    """Two walls at an angle a hold a point, whose drives are states: the law needs A for v."""
+    angle = Parameter("a", 1.0)
+    normals = ca.blockcat(1, ca.cos(angle.symbol), 0, ca.sin(angle.symbol))
+    x = ca.SX.sym("x", 6)
+    system = DaeSystem(
+        state=x,
+        f=ca.vertcat(x[2:4], x[4:], ca.SX(2, 1)),
+        g=ca.vertcat(ca.SX(2, 2), normals, ca.SX(2, 2)),
+        h=ca.vertcat(ca.SX(4, 2), ca.SX.eye(2)),
+        k=ca.mtimes(normals.T, x[:2]),
+        l=ca.SX(2, 1),
+        m=ca.SX.eye(2),
+        parameters=(angle,),
+    )
+    law = TrackingLaw(system, poles(-3.0))
+    reference = np.array([10.0, 0.0, 20.0, 0.0])
+    # A holds the products of the normals: its pivot is sin(a)^2, that of B only sin(a).
+    for value in (1.0, 1e-3, 1e-7):
+        values = law.parameter_values()
+        values[0] = value
+        pivot = law.function(np.zeros(6), reference, values)[2]
+        assert pivot[0] == pytest.approx(np.sin(value) ** 2, rel=0.05)
 
 
 def test_wrong_arguments_are_refused():

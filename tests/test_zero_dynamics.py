@@ -22,7 +22,7 @@ from problems import (
 from scipy.integrate import solve_ivp
 
 import drake_dae.dae.pinned_motion as module
-from drake_dae import DaePlant, analyze, constant, make_closed_loop
+from drake_dae import DaePlant, ExpressionSignal, analyze, constant, make_closed_loop
 from drake_dae.dae.gains import poles
 from drake_dae.dae.pinned_motion import PinnedMotion
 from drake_dae.dae.structure import examine_structure, find_structure
@@ -1076,6 +1076,19 @@ def test_the_force_that_is_asked_for_decides(force, rate):
     assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
 
 
+def test_a_loop_is_judged_when_it_begins():
+    """The force grows from 20 to 60 N in 2 s: unstable above 40 N."""
+    law = TrackingLaw(slider(), poles(-3.0))
+    force = ExpressionSignal(lambda t: [20 + 20 * t])
+    for start, unstable in ((0.0, False), (2.0, True)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            make_closed_loop(
+                DaePlant(law.structure), law, [constant([0.0]), force], start_time=start
+            )
+        assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
+
+
 @pytest.mark.parametrize(
     ("rate", "nominal"),
     [(lambda x: -(x**2), 0.1), (lambda x: ca.cos(x) - 1, 0.3), (lambda x: 0 * x, 0.2)],
@@ -1102,3 +1115,21 @@ def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
         l=lambda x: [2 * x[0], x[1] - 2 * x[2]],
     )
     assert ZeroDynamics(find_structure(system)).stability().verdict is Verdict.UNDECIDED
+
+
+def test_rest_does_not_depend_on_the_unit_of_time():
+    """xi'' = s^2 (2 - xi^3) - s xi' of 1e10 1/s: what is left of x' at its rest is round-off."""
+    rate = 1e10
+    system = DaeSystem.from_functions(
+        ["y", "xi", "w"],
+        f=lambda x: [0, rate * x[2], rate * (2 - x[1] ** 3 - x[2])],
+        h=lambda x: [1, 0, 0],
+        l=lambda x: [x[0]],
+        nominal_state=[0.0, 1.3, 0.0],
+    )
+    stability = ZeroDynamics(find_structure(system)).stability()
+    assert stability.verdict is Verdict.STABLE
+    expected = rate * np.roots([1.0, 1.0, 3.0 * 2.0 ** (2 / 3)])
+    np.testing.assert_allclose(
+        np.sort_complex(stability.eigenvalues), np.sort_complex(expected), rtol=1e-9
+    )

@@ -16,7 +16,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.region import Region
 from drake_dae.dae.report import Analysis, Assumption, Finding, count_of
 from drake_dae.dae.samples import Fields, Margin, Samples, default_spread
-from drake_dae.dae.signals import numbers
+from drake_dae.dae.signals import check_whole_number, numbers
 from drake_dae.dae.structure import (
     Constrained,
     Structure,
@@ -99,10 +99,8 @@ def analyze(
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
     if start is not None and reference is None:
         raise ModelError(f"{system.name}: start is where a reference begins, and there is none")
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ModelError(f"{system.name}: seed must be a whole number from 0, got {seed!r}")
+    check_whole_number(f"{system.name}: count", count, 1)
+    check_whole_number(f"{system.name}: seed", seed, 0)
     if not (reference is None or callable(reference)):
         raise ModelError(
             f"{system.name}: reference must be a function of the time that returns R(t), got "
@@ -140,23 +138,26 @@ def analyze(
         _check_consistent(samples.manifold, guesses[:given], samples.states)
     where = _where(len(samples.states), len(guesses), "consistent state", region, given)
     analysis, dynamics = _examined(constrained, samples, where, search=states is None)
-    if reference is None or times is None or dynamics is None:
+    if dynamics is None:
         return analysis
+    if reference is None or times is None:
+        return replace(analysis, zero_dynamics=dynamics.stability(samples.states[0]))
     with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion tells when.
         _check_reference(dynamics.structure, reference, times)
     motion = dynamics.motion(reference, times, samples.states[0] if start is None else start)
+    rest, outputs = samples.states[0], None
     if motion.times.size:
-        # Outputs with mu_i = 0 are not told by the state: judged as the reference begins.
+        # The state does not tell outputs with mu_i = 0: they are as the reference begins.
+        rest = motion.states[0]
         outputs = first_outputs(dynamics.structure, reference(float(motion.times[0])))
-        stability = dynamics.stability(motion.states[0], outputs=outputs)
-        analysis = replace(analysis, zero_dynamics=stability)
-    return replace(analysis, motion=motion)
+    stability = dynamics.stability(rest, outputs=outputs)
+    return replace(analysis, motion=motion, zero_dynamics=stability)
 
 
 def _examined(
     constrained: Constrained, samples: Samples, where: str, search: bool
 ) -> tuple[Analysis, ZeroDynamics | None]:
-    """From the constraints on, with margins at given samples."""
+    """From the constraints on, with margins at given samples; without the zero dynamics."""
     elimination = constrained.elimination
     system = samples.system
     known: dict[str, Any] = {"constraint_degrees": constrained.degrees}
@@ -195,8 +196,7 @@ def _examined(
             }
             if samples.is_regular(matrix, structure.round_off):
                 dynamics = ZeroDynamics(structure)
-                stability = dynamics.stability(samples.states[0])
-                known |= {"zero_dynamics": stability, "structure": structure}
+                known["structure"] = structure
     assumptions = _assumptions(satisfied, errors, margins)
     return Analysis(system, where, samples.states, assumptions, **known), dynamics
 

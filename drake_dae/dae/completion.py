@@ -7,8 +7,8 @@ import numpy as np
 
 from drake_dae.dae.samples import Margin, Samples, show, traced
 from drake_dae.dae.signals import Signal
+from drake_dae.dae.smoothness import flaw
 from drake_dae.dae.structure import Structure
-from drake_dae.dae.system import flaw
 from drake_dae.errors import FloatArray, ModelError
 
 TRANSVERSAL = 0.05

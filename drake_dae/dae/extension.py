@@ -26,10 +26,10 @@ from drake_dae.dae.samples import (
     SINGULAR,
     Fields,
     Samples,
-    default_spread,
     multiply,
     positive,
     show,
+    spread_of,
     traced,
 )
 from drake_dae.dae.signals import Signal, numbers
@@ -227,15 +227,7 @@ class _Chain:
 
     def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike | None) -> None:
         self.system = system
-        if spread is None:
-            spread = default_spread(system.nominal_state)
-        deviation = numbers(f"{system.name}: spread", spread)
-        if deviation.shape not in ((), (system.num_states,)):
-            raise ModelError(
-                f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
-                f"{spread!r}"
-            )
-        self.spread = np.full(system.num_states, deviation)
+        self.spread = spread_of(system, spread)
         self.integrators: dict[str, int] = {}
         self.offset = ca.SX(system.num_controls, 1)
         self.matrix = ca.SX.eye(system.num_controls)

@@ -83,7 +83,8 @@ class Manifold:
         """
         p = self._defaults if parameters is None else parameters
         _, _, (norm, reach) = self._newton(state, p)
-        if isfinite(reach):
+        # A step of exactly zero with something left: no state changes it.
+        if isfinite(reach) and (reach > 0.0 or norm == 0.0):
             return bool(reach <= CONSISTENT * float(np.linalg.norm(state)) + FLOOR)
         return bool(norm <= CONSISTENT)
 

@@ -102,6 +102,10 @@ class Motion:
         """An expression in terms of state, control and parameters alone."""
         return self._inline(expression, len(self._values))
 
+    def has_unknowns(self, expression: ca.SX) -> bool:
+        """Whether an expression holds unknowns of the motion, which A(x) must be regular for."""
+        return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
+
     def inverse(self, expression: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX] | None:
         """The control for which an expression of the motion takes wanted values.
 

@@ -6,10 +6,12 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.manifold import Manifold, are_dependent
 from drake_dae.dae.region import ConsistentRegion, Region
+from drake_dae.dae.signals import numbers
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
 
@@ -317,6 +319,23 @@ def default_spread(nominal: FloatArray) -> FloatArray:
     size = np.abs(nominal)
     small = (size < 1e-3) & (size > 1e-12 * size.max())
     return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
+
+
+def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
+    """A spread as shape (n,): one that is given, a number for all, or the default.
+
+    Raises:
+        ModelError: A wrong shape, or a number that is not finite.
+    """
+    if spread is None:
+        return default_spread(system.nominal_state)
+    given = numbers(f"{system.name}: spread", spread)
+    if given.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(given)):
+        raise ModelError(
+            f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
+            f"{spread!r}"
+        )
+    return np.full(system.num_states, given)
 
 
 def traced(system: DaeSystem, **expressions: ca.SX) -> TracedFunction:

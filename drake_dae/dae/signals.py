@@ -103,3 +103,13 @@ def numbers(what: str, value: Any) -> FloatArray:
         return np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise ModelError(f"{what} must be real numbers, got {value!r}") from error
+
+
+def check_whole_number(what: str, value: Any, least: int) -> None:
+    """Refuses what is no whole number from a least one.
+
+    Raises:
+        ModelError: So.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ModelError(f"{what} must be a whole number from {least}, got {value!r}")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -17,11 +18,11 @@ from drake_dae.dae.samples import (
     Fields,
     Margin,
     Samples,
-    default_spread,
     show,
+    spread_of,
     traced,
 )
-from drake_dae.dae.signals import numbers
+from drake_dae.dae.signals import check_whole_number
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import AssumptionError, FloatArray, ModelError
 
@@ -46,6 +47,7 @@ class Structure:
         highest_derivatives: z_i^(mu_i) in terms of the unknowns of `motion`, shape (p, 1).
         drift: a_1(x), a_2(x) of (28): L_f*^mu_i l*_i, shape (p, 1).
         control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p).
+        chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
         round_off: Which entries of B(x) are zero but for round-off at all of many states, shape
             (p, p). A column of nothing else would be scaled up to the size of the others.
         states: The consistent states at which numbers were decided, shape (samples, n).
@@ -64,6 +66,7 @@ class Structure:
     highest_derivatives: ca.SX
     drift: ca.SX
     control_matrix: ca.SX
+    chains_need_force: bool
     round_off: Booleans
     states: FloatArray
     constraint_margin: Margin | None
@@ -135,18 +138,9 @@ def examine_structure(
     """
     check_is_system(system, "find_structure")
     check_system(system)
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ModelError(f"{system.name}: count must be a whole number from 1, got {count!r}")
-    if spread is None:
-        spread = default_spread(system.nominal_state)
-    deviation = numbers(f"{system.name}: spread", spread)
-    if deviation.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviation)):
-        raise ModelError(
-            f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
-            f"{spread!r}"
-        )
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ModelError(f"{system.name}: seed must be a whole number from 0, got {seed!r}")
+    check_whole_number(f"{system.name}: count", count, 1)
+    check_whole_number(f"{system.name}: seed", seed, 0)
+    deviation = spread_of(system, spread)
     random = np.random.default_rng(seed)
     guesses = system.nominal_state + deviation * np.vstack(
         [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
@@ -237,10 +231,8 @@ def examine_outputs(constrained: Constrained) -> Structure:
     """
     samples, motion, elimination = constrained.samples, constrained.motion, constrained.elimination
     system = motion.system
-    output_chains, drift, control_matrix, highest_derivatives, round_off = _output_chains(
-        motion, elimination, samples
-    )
-    degrees = tuple(len(chain) for chain in output_chains)
+    outputs = _output_chains(motion, elimination, samples)
+    degrees = tuple(len(chain) for chain in outputs.chains)
     # Rows of n* that are zero but for round-off are no feedthrough.
     n_star = [
         ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
@@ -254,14 +246,15 @@ def examine_outputs(constrained: Constrained) -> Structure:
         manifold=samples.manifold,
         motion=motion,
         elimination=replace(elimination, n_star=ca.vertcat(*n_star)),
-        output_chains=output_chains,
-        drift=drift,
-        control_matrix=control_matrix,
-        highest_derivatives=highest_derivatives,
+        output_chains=outputs.chains,
+        highest_derivatives=outputs.highest_derivatives,
+        drift=outputs.drift,
+        control_matrix=outputs.control_matrix,
+        chains_need_force=outputs.need_force,
+        round_off=outputs.round_off,
         states=samples.states,
         constraint_margin=constrained.margin,
-        round_off=round_off,
-        control_margin=samples.margin(control_matrix, round_off),
+        control_margin=samples.margin(outputs.control_matrix, outputs.round_off),
     )
 
 
@@ -409,13 +402,19 @@ def _constraint_chains(
     return chains
 
 
-def _output_chains(
-    motion: Motion, elimination: Elimination, samples: Samples
-) -> tuple[tuple[tuple[ca.SX, ...], ...], ca.SX, ca.SX, ca.SX, Booleans]:
-    """l*_i, ..., L_f*^(mu_i - 1) l*_i by Assumption (4), a(x) of (28) and B(x) of (16).
+class _Outputs(NamedTuple):
+    """What becomes of the outputs; see `Structure`."""
 
-    Also z_i^(mu_i) along the motion, and which entries of B(x) are but round-off.
-    """
+    chains: tuple[tuple[ca.SX, ...], ...]
+    drift: ca.SX
+    control_matrix: ca.SX
+    highest_derivatives: ca.SX
+    need_force: bool
+    round_off: Booleans
+
+
+def _output_chains(motion: Motion, elimination: Elimination, samples: Samples) -> _Outputs:
+    """By Assumption (4)."""
     system = motion.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     count = system.num_controls
@@ -425,7 +424,7 @@ def _output_chains(
     )
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
     highest_derivatives = ca.SX(count, 1)
-    round_off = np.zeros((count, count), dtype=bool)
+    round_off, need_force = np.zeros((count, count), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
     following = elimination.l_star
@@ -452,6 +451,7 @@ def _output_chains(
             else:
                 still.append(i)
                 chains[i].append(following[row])
+                need_force = need_force or motion.has_unknowns(moving[row])
         if not still:
             break
         last = ca.vertcat(*[chains[i][-1] for i in still])
@@ -481,12 +481,13 @@ def _output_chains(
                 5,
             )
         undecided = still
-    return (
-        tuple(tuple(chain) for chain in chains),
-        drift,
-        control_matrix,
-        highest_derivatives,
-        round_off,
+    return _Outputs(
+        chains=tuple(tuple(chain) for chain in chains),
+        drift=drift,
+        control_matrix=control_matrix,
+        highest_derivatives=highest_derivatives,
+        need_force=need_force,
+        round_off=round_off,
     )
 
 

@@ -125,6 +125,8 @@ class TrackingLaw:
             factors = Factorization(self.structure.control_matrix)
             found = factors.solve(wanted - self.structure.drift), factors.pivot
         control, pivot = found
+        if self.structure.chains_need_force:
+            pivot = ca.fmin(pivot, self.structure.elimination.pivot)
         # What the control reaches at once is as wanted.
         output = ca.vertcat(
             *[

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.system import flaw
+from drake_dae.dae.smoothness import flaw
 from drake_dae.errors import FloatArray, NonFiniteError, ReferenceSignalError
 from drake_dae.systems.autodiff import DifferentiableSystem, Formula
 
