@@ -1118,18 +1118,34 @@ def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
 
 
 def test_rest_does_not_depend_on_the_unit_of_time():
-    """xi'' = s^2 (2 - xi^3) - s xi' of 1e10 1/s: what is left of x' at its rest is round-off."""
-    rate = 1e10
+    """An electrostatic actuator with its voltage held: a plate on a spring, modes of 2e4 1/s.
+
+    Place, speed and charge in units of the gap, 0.1 m/s and q. What is left of x' where Newton's
+    method ends is round-off of these, times the rates. At a voltage V the force is
+    e V^2 / (2 (gap - x)^2), so that m s^2 + b s + k - e V^2 / (gap - x)^3 = 0.
+    """
+    mass, damping, stiffness, gap, e, resistance = 1e-9, 1e-6, 1.0, 2e-6, 8.85e-20, 1e3
+    q = np.sqrt(2 * e * stiffness * 0.4 * gap)
+
+    def force(x: ca.SX) -> ca.SX:
+        return (q * x[2]) ** 2 / (2 * e) - 0.1 * damping * x[1] - stiffness * gap * x[0]
+
     system = DaeSystem.from_functions(
-        ["y", "xi", "w"],
-        f=lambda x: [0, rate * x[2], rate * (2 - x[1] ** 3 - x[2])],
-        h=lambda x: [1, 0, 0],
-        l=lambda x: [x[0]],
-        nominal_state=[0.0, 1.3, 0.0],
+        3,
+        f=lambda x: [
+            0.1 * x[1] / gap,
+            force(x) / mass / 0.1,
+            -gap * x[2] * (1 - x[0]) / e / resistance,
+        ],
+        h=lambda x: [0, 0, 1 / resistance / q],
+        l=lambda x: [q * gap * x[2] * (1 - x[0]) / e],
+        nominal_state=[0.42, 0.0, 1.0],
     )
-    stability = ZeroDynamics(find_structure(system)).stability()
-    assert stability.verdict is Verdict.STABLE
-    expected = rate * np.roots([1.0, 1.0, 3.0 * 2.0 ** (2 / 3)])
-    np.testing.assert_allclose(
-        np.sort_complex(stability.eigenvalues), np.sort_complex(expected), rtol=1e-9
-    )
+    stability = ZeroDynamics(find_structure(system, spread=[0.02, 0.01, 0.02])).stability()
+    assert stability.verdict is Verdict.UNSTABLE
+    place, _, charge = stability.state
+    voltage = q * gap * charge * (1 - place) / e
+    softened = stiffness - e * voltage**2 / (gap * (1 - place)) ** 3
+    expected = np.roots([mass, damping, softened])
+    # The place is known to 1e-9 of the gap.
+    np.testing.assert_allclose(np.sort(stability.eigenvalues.real), np.sort(expected), rtol=1e-8)
