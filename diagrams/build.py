@@ -14,26 +14,23 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae import gains as designs
+from drake_dae.dae import references
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams import scenario as forms
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
-from drake_dae.errors import (
-    AssumptionError,
-    DrakeDaeError,
-    FloatArray,
-    InconsistentStateError,
-    ScenarioError,
-)
-from drake_dae.robots import actuation, constraints, outputs, surfaces
-from drake_dae.robots.links import Links
+from drake_dae.errors import AssumptionError, DrakeDaeError, InconsistentStateError, ScenarioError
+from drake_dae.robots import actuation, outputs
+from drake_dae.robots import contact as constraints
+from drake_dae.robots.contact import surfaces
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.multibody import MultibodyExpressions
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems import references
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
 

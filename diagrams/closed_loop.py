@@ -10,18 +10,15 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerT
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.references import ReferenceSignal
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics import first_outputs
-from drake_dae.errors import (
-    DrakeDaeError,
-    FloatArray,
-    InconsistentStateError,
-    ModelError,
-    WiringError,
-)
-from drake_dae.robots.multibody import MultibodyExpressions
-from drake_dae.simulation.meshcat import (
+from drake_dae.dae.zero_dynamics.zero_dynamics import first_outputs
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, WiringError
+from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.simulation.record import Record, Recorded
+from drake_dae.simulation.view import (
     FRAME_RATE,
     ContactForceVisualizer,
     ContactPoints,
@@ -30,10 +27,9 @@ from drake_dae.simulation.meshcat import (
     frame_times,
     scene_extent,
 )
-from drake_dae.simulation.record import Record, Recorded
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.references import ReferenceGenerator, ReferenceSignal
+from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
 

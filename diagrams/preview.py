@@ -7,17 +7,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.analysis import analyze
-from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.report import Analysis, count_of
+from drake_dae.analysis.analyze import analyze
+from drake_dae.analysis.report import Analysis, count_of
+from drake_dae.analysis.tables import Part, Table, digits, to_markdown, to_text
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.tables import Part, Table, digits, to_markdown, to_text
 from drake_dae.diagrams.build import build
 from drake_dae.diagrams.scenario import Scenario
-from drake_dae.errors import AssumptionError, FloatArray, ModelError, ScenarioError
+from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.summary import Limits
 from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.trace.functions import TracedFunction
 
 SAMPLES = 1001
 """At how many times along the reference, at least."""

@@ -8,33 +8,26 @@ numbers in the documentation are those of that paper.
 
 from importlib.metadata import version
 
-from drake_dae.dae.analysis import analyze
+from drake_dae.analysis.analyze import analyze
+from drake_dae.analysis.report import Analysis
 from drake_dae.dae.extension import Extension, dynamic_extension, extend
 from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
 from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.report import Analysis
+from drake_dae.dae.references import ExpressionSignal, constant, point_to_point, sinusoids
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics import ZeroDynamics
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.build import build
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation, make_closed_loop
 from drake_dae.diagrams.scenario import load_scenario
 from drake_dae.errors import DrakeDaeError
-from drake_dae.robots.actuation import DcMotors, ElectrohydraulicServos, FlexibleJoints
-from drake_dae.robots.constraints import CoincidentPoints, PointOnSurface, WeldedFrames
-from drake_dae.robots.links import LinkExpressions
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.multibody import MultibodyExpressions
-from drake_dae.robots.outputs import (
-    AxisCoordinates,
-    ExpressionOutput,
-    JointPositions,
-    PointCoordinates,
-    SurfaceCoordinates,
-)
-from drake_dae.robots.surfaces import (
+from drake_dae.robots.actuation.dc_motors import DcMotors
+from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
+from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
+from drake_dae.robots.contact.points import CoincidentPoints, PointOnSurface
+from drake_dae.robots.contact.surfaces import (
     Cylinder,
     Ellipsoid,
     ImplicitSurface,
@@ -42,23 +35,27 @@ from drake_dae.robots.surfaces import (
     Sphere,
     Torus,
 )
-from drake_dae.simulation.meshcat import start_meshcat
+from drake_dae.robots.contact.welds import WeldedFrames
+from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.links.textbook import LinkExpressions
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.outputs import (
+    AxisCoordinates,
+    ExpressionOutput,
+    JointPositions,
+    PointCoordinates,
+    SurfaceCoordinates,
+)
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import simulate
+from drake_dae.simulation.view import start_meshcat
+from drake_dae.symbolic import from_symbolic
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.realization import StateRealization
-from drake_dae.systems.references import (
-    ExpressionSignal,
-    ReferenceGenerator,
-    TrajectorySignal,
-    constant,
-    point_to_point,
-    sinusoids,
-)
+from drake_dae.systems.references import ReferenceGenerator, TrajectorySignal
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
-from drake_dae.systems.symbolic import from_symbolic
 
 __version__ = version("drake_dae")
 

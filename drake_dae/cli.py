@@ -28,10 +28,10 @@ from drake_dae.diagrams.scenario import (
     shipped_scenarios,
 )
 from drake_dae.errors import DrakeDaeError, NonMinimumPhaseWarning, ScenarioError
-from drake_dae.simulation.meshcat import start_meshcat
 from drake_dae.simulation.plots import PLOTS, save_plots
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
+from drake_dae.simulation.view import start_meshcat
 from drake_dae.systems.robot_plant import RobotPlant
 
 FILES = ("scenario.yaml", "summary.txt", "record.npz", *PLOTS, "animation.html")

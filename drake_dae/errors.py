@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-FloatArray = np.typing.NDArray[np.float64]
-
 
 class DrakeDaeError(Exception):
     """Base of every exception that drake_dae raises on purpose."""

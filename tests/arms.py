@@ -27,7 +27,7 @@ from drake_dae import (
 from drake_dae.dae.gains import GainDesign
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.diagrams.scenario import FOLDER, find_scenario
-from drake_dae.robots.actuation import Stage
+from drake_dae.robots.actuation.stage import Stage
 
 
 class Arm(NamedTuple):

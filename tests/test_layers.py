@@ -14,7 +14,21 @@ PACKAGE = ROOT / "drake_dae"
 
 # A module imports from its own layer and from layers before it; "" is drake_dae/__init__.py, which
 # gathers the public names, so that nothing but the command may import it.
-LAYERS = ("errors", "dae", "robots", "systems", "simulation", "diagrams", "", "cli", "__main__")
+LAYERS = (
+    "errors",
+    "arrays",
+    "trace",
+    "dae",
+    "analysis",
+    "robots",
+    "symbolic",
+    "systems",
+    "simulation",
+    "diagrams",
+    "",
+    "cli",
+    "__main__",
+)
 
 # Distributions whose modules bear another name.
 IMPORT_NAMES = {"drake": "pydrake", "pyyaml": "yaml"}

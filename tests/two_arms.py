@@ -7,15 +7,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae import (
-    AxisCoordinates,
-    JointPositions,
-    PointCoordinates,
-    RobotModel,
-    WeldedFrames,
-)
+from drake_dae import AxisCoordinates, JointPositions, PointCoordinates, RobotModel, WeldedFrames
 from drake_dae.diagrams.scenario import FOLDER
-from drake_dae.robots.actuation import Stage
+from drake_dae.robots.actuation.stage import Stage
 
 APART = 1.8
 LENGTH = 0.2

@@ -5,14 +5,17 @@ from collections.abc import Iterator, Sequence
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.samples import Margin, Samples, show, traced
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.smoothness import flaw
+from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.samples import Samples, traced
 from drake_dae.dae.structure import Structure
-from drake_dae.errors import FloatArray, ModelError
+from drake_dae.errors import ModelError
+from drake_dae.trace.smoothness import flaw
 
 TRANSVERSAL = 0.05
 """Single states complete the chains if the sine of their smallest angle is above this."""
+
 
 Completion = tuple[ca.SX, tuple[Signal, ...], Margin]
 """xi, its signals, and the margin of the Jacobian of Phi."""

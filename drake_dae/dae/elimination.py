@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from drake_dae.dae.motion import Motion
+from drake_dae.dae.derivatives import Motion
 
 
 @dataclass(frozen=True, eq=False)

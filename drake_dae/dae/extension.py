@@ -19,27 +19,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.expressions import Factorization, TracedFunction
-from drake_dae.dae.lie import lie_derivative
+from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.samples import (
-    SINGULAR,
-    Fields,
-    Samples,
-    multiply,
-    positive,
-    show,
-    spread_of,
-    traced,
-)
-from drake_dae.dae.signals import Signal, numbers
-from drake_dae.dae.structure import (
-    Structure,
-    examine_structure,
-    find_structure,
-)
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.states.margins import SINGULAR
+from drake_dae.dae.states.samples import Fields, Samples, spread_of, traced
+from drake_dae.dae.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import AssumptionError, FloatArray, ModelError
+from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.trace.factorization import Factorization
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.lie import lie_derivative
+from drake_dae.trace.round_off import multiply, positive
 
 
 @dataclass(frozen=True, eq=False, repr=False)

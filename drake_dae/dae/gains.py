@@ -8,7 +8,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.errors import FloatArray, GainError
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import GainError
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,7 @@ class FeedbackGains:
 
 GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
 """Makes gains for outputs of given names and degrees, once these are known."""
+
 
 Poles = float | complex | Sequence[float | complex]
 

@@ -7,22 +7,19 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.expressions import TracedFunction
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import FloatArray, InconsistentStateError
+from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, are_dependent
 
 CONSISTENT = 1e-8
 """A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
 size; or, where gradients depend on each other, if its residual is at most this."""
 
+
 FLOOR = 1e-12
 """A distance from N* that is round-off of states that are zero."""
-
-ROUND_OFF = 1e-12
-"""A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
-
-DEPENDENT = 1e-9
-"""Gradients of length one whose smallest singular value is below this depend on each other."""
 
 
 class Manifold:
@@ -161,16 +158,6 @@ class Manifold:
                 "the constraints contradict each other, or start away from this state"
             )
         return left + "Start nearer to the constraint, away from its singular states"
-
-
-def are_dependent(gradients: FloatArray) -> bool:
-    """Whether rows, whose lengths do not matter, are linearly dependent."""
-    if not np.all(np.isfinite(gradients)):
-        return True
-    length = np.linalg.norm(gradients, axis=1, keepdims=True)
-    if gradients.shape[0] > gradients.shape[1] or not np.all(length > 0.0):
-        return True
-    return bool(np.linalg.svd(gradients / length, compute_uv=False)[-1] < DEPENDENT)
 
 
 def _least_squares_step(gradients: FloatArray, residual: FloatArray) -> FloatArray:

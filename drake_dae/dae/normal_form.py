@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dgetrf, dgetrs
 
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.completion import check_completion, choose_completion
-from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.manifold import ROUND_OFF
-from drake_dae.dae.newton import Linearization, newton
-from drake_dae.dae.samples import Fields, Samples, show
+from drake_dae.dae.states.samples import Fields, Samples
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import ROUND_OFF, Linearization, newton
 
 
 class NormalForm:

@@ -7,7 +7,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.errors import FloatArray, ModelError
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.errors import ModelError
 
 
 @dataclass(frozen=True)
@@ -89,27 +90,3 @@ def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
 def is_symbol(value: Any) -> bool:
     """Whether it is a CasADi SX matrix of symbols."""
     return isinstance(value, ca.SX) and value.is_valid_input()
-
-
-def numbers(what: str, value: Any) -> FloatArray:
-    """Real numbers as a new array.
-
-    Raises:
-        ModelError: What is something else.
-    """
-    try:
-        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
-            raise TypeError
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{what} must be real numbers, got {value!r}") from error
-
-
-def check_whole_number(what: str, value: Any, least: int) -> None:
-    """Refuses what is no whole number from a least one.
-
-    Raises:
-        ModelError: So.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ModelError(f"{what} must be a whole number from {least}, got {value!r}")

@@ -8,23 +8,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arrays import Booleans, FloatArray, check_whole_number, show
+from drake_dae.dae.derivatives import Motion
 from drake_dae.dae.elimination import Elimination, affine, eliminate
-from drake_dae.dae.lie import lie_derivative, lie_derivative_along
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.motion import Motion
-from drake_dae.dae.region import Region
-from drake_dae.dae.samples import (
-    Booleans,
-    Fields,
-    Margin,
-    Samples,
-    show,
-    spread_of,
-    traced,
-)
-from drake_dae.dae.signals import check_whole_number
+from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.region import Region
+from drake_dae.dae.states.samples import Fields, Samples, spread_of, traced
 from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import AssumptionError, FloatArray, ModelError
+from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 
 MANY = 10
 """So many random states have no zero in common of a function that is not zero."""

@@ -12,10 +12,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.expressions import PositiveDefiniteFactorization
-from drake_dae.dae.signals import Parameter, Signal, is_symbol, numbers
-from drake_dae.dae.smoothness import flaw
-from drake_dae.errors import FloatArray, ModelError
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.signals import Parameter, Signal, is_symbol
+from drake_dae.errors import ModelError
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.smoothness import flaw
 
 
 @dataclass(frozen=True, eq=False)

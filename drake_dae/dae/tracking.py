@@ -6,11 +6,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.expressions import Factorization, TracedFunction
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import FloatArray, GainError, ModelError
+from drake_dae.errors import GainError, ModelError
+from drake_dae.trace.factorization import Factorization
+from drake_dae.trace.functions import TracedFunction
 
 
 class TrackingLaw:

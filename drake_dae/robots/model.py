@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae.dae.expressions import TracedFunction
-from drake_dae.dae.newton import Linearization, newton, shortest_steps
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import FloatArray, InconsistentStateError, ModelError
-from drake_dae.robots.actuation import ActuationChain, Stage, chain
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.links import Links
-from drake_dae.robots.multibody import MultibodyExpressions
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.robots.actuation.chain import ActuationChain, chain
+from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import PositionOutput
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
 
 class RobotModel:

@@ -7,11 +7,12 @@ from typing import Protocol
 
 import casadi as ca
 
+from drake_dae.arrays import check_axes
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints import PointOnSurface, check_axes
-from drake_dae.robots.links import Links
-from drake_dae.robots.surfaces import Vector
+from drake_dae.robots.contact.points import PointOnSurface
+from drake_dae.robots.contact.surfaces import Vector
+from drake_dae.robots.links.links import Links
 
 
 class PositionOutput(Protocol):

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.errors import FloatArray
 from drake_dae.simulation.record import Record
 
 PLOTS = ("outputs.png", "errors.png", "residual.png", "controls.png")

@@ -10,8 +10,9 @@ import numpy as np
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import VectorLogSink
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.errors import FloatArray, ModelError
+from drake_dae.errors import ModelError
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,10 @@ from typing import Self
 
 import numpy as np
 
+from drake_dae.analysis.tables import Table
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.tables import Table
-from drake_dae.errors import FloatArray
-from drake_dae.robots.constraints import PointOnSurface
+from drake_dae.robots.contact.points import PointOnSurface
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics

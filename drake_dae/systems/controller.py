@@ -6,18 +6,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 
-from drake_dae.dae.expressions import SINGULAR_PIVOT
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics import Verdict, ZeroDynamics
+from drake_dae.dae.zero_dynamics.zero_dynamics import Verdict, ZeroDynamics
 from drake_dae.errors import (
-    FloatArray,
     NonFiniteError,
     NonMinimumPhaseWarning,
     SimulationError,
     SingularityError,
 )
-from drake_dae.systems.autodiff import Formula, TracedFormula
-from drake_dae.systems.parameters import ParameterizedSystem
+from drake_dae.systems.block import Formula, ParameterizedSystem, TracedFormula
+from drake_dae.trace.functions import SINGULAR_PIVOT
 
 
 class TrackingController(ParameterizedSystem):

@@ -13,19 +13,18 @@ from pydrake.systems.framework import (
     State,
 )
 
-from drake_dae.dae.expressions import SINGULAR_PIVOT, TracedFunction
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import (
-    FloatArray,
     InconsistentStateError,
     ModelError,
     NonFiniteError,
     SimulationError,
     SingularityError,
 )
-from drake_dae.systems.autodiff import Formula, TracedFormula
-from drake_dae.systems.parameters import ParameterizedSystem
+from drake_dae.systems.block import Formula, ParameterizedSystem, TracedFormula
+from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 
 
 class DaePlant(ParameterizedSystem):

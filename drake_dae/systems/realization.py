@@ -6,21 +6,19 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, ValueProducer
 
-from drake_dae.dae.expressions import SINGULAR_PIVOT, TracedFunction
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.samples import show
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import (
-    FloatArray,
     InconsistentStateError,
     ModelError,
     NonFiniteError,
     SimulationError,
     SingularityError,
 )
-from drake_dae.systems.autodiff import Formula
-from drake_dae.systems.parameters import ParameterizedSystem
+from drake_dae.systems.block import Formula, ParameterizedSystem
+from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 
 
 class StateRealization(ParameterizedSystem):

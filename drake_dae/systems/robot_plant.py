@@ -4,11 +4,11 @@ from functools import partial
 
 from pydrake.systems.framework import BasicVector, Context
 
-from drake_dae.dae.expressions import TracedFunction
 from drake_dae.dae.structure import Structure
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.autodiff import Formula, TracedFormula
+from drake_dae.systems.block import Formula, TracedFormula
 from drake_dae.systems.plant import DaePlant
+from drake_dae.trace.functions import TracedFunction
 
 
 class RobotPlant(DaePlant):

@@ -5,9 +5,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
-from drake_dae.dae.expressions import TracedFunction
-from drake_dae.errors import FloatArray, ModelError
-from drake_dae.systems.autodiff import DifferentiableSystem, Formula, TracedFormula
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.systems.block import DifferentiableSystem, Formula, TracedFormula
+from drake_dae.trace.functions import TracedFunction
 
 
 class ForceSensor(DifferentiableSystem):

@@ -1,0 +1,298 @@
+"""Time derivatives along the constrained motion, without differentiating a factorization.
+
+The repeated Lie derivatives of section 2 are time derivatives along x' = f* + h* u. Instead of
+expanding f* and differentiating the whole, the equations of the motion are differentiated:
+
+    E x' = f + g v + h u,    c' = 0,
+
+with c the last derivatives L_f^(r_i - 1) k_i of the constraints. Each order brings new unknowns
+(x'', v'), (x''', v''), ... that solve a linear system with one and the same matrix,
+
+    [[E, -g], [dc/dx, 0]] (x^(k+1), v^(k)) = what is known of the orders before,
+
+so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and A is J M^-1 J^T.
+"""
+
+from collections.abc import Callable, Sequence
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae.states.samples import default_spread
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+
+
+class Motion:
+    """The motion of a system on N* and its time derivatives, the control held constant.
+
+    Args:
+        system: (1)-(3).
+        constraint: c = (L_f^(r_1 - 1) k_1, ..., L_f^(r_m - 1) k_m), shape (m, 1).
+
+    Attributes:
+        control: The symbol u, shape (p, 1).
+        constraint_gradient: dc/dx, shape (m, n).
+        constraint_matrix: A(x) of Assumption (2), shape (m, m).
+        pivot: 0 exactly where A(x) is singular; see `expressions.Factorization`.
+    """
+
+    def __init__(self, system: DaeSystem, constraint: ca.SX) -> None:
+        self.system = system
+        self.control = ca.SX.sym("u", system.num_controls)
+        x = system.state
+        mass, f, g, h = system.mass_matrix, system.f, system.g, system.h
+        # Rows like q' = v need no unknown: their right side is a state.
+        plain = [
+            i
+            for i in range(system.num_states)
+            if f[i].is_leaf()
+            and not (g[i, :].nnz() or h[i, :].nnz())
+            and mass[i, :].nnz() == 1
+            and mass[:, i].nnz() == 1
+            and mass[i, i].is_one()
+        ]
+        self._rows = [i for i in range(system.num_states) if i not in plain]
+        force = g[self._rows, :]
+        self.constraint_gradient = ca.jacobian(constraint, x)
+        self._symbols: list[ca.SX] = [x]
+        self._rates: list[ca.SX] = []
+        self._values: list[ca.SX] = []
+        first = self._next_unknown()
+        rate = ca.SX(f)
+        rate[self._rows] = first[: len(self._rows), :]
+        self._rates.append(rate)
+        self._symbols.append(first)
+        #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
+        self.constraint_input = first[len(self._rows) :, :]  # Of a scalar [1:] would be a row.
+        residual, self._constraint_rate = self._first_order(constraint)
+        self._residual = residual[self._rows] - ca.mtimes(h[self._rows, :], self.control)
+        gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
+        if _agree(system, gradient, force):
+            gradient = force
+        self._matrix = ca.blockcat(
+            mass[self._rows, self._rows], -force, gradient.T, ca.SX(force.shape[1], force.shape[1])
+        )
+        self._unknowns, self.constraint_matrix, self.pivot = _solver(
+            mass[self._rows, self._rows], force, gradient
+        )
+        self._equations: list[ca.SX] = []
+        self._solve_order()
+
+    @property
+    def rate(self) -> ca.SX:
+        """x' as an unknown of the motion, shape (n, 1)."""
+        return self._rates[0]
+
+    def derivative(self, expression: ca.SX) -> ca.SX:
+        """The time derivative of an expression of the state and of this motion's unknowns.
+
+        Args:
+            expression: Shape (k, 1).
+
+        Returns:
+            Shape (k, 1), in terms of the state and of unknowns; see `expand`.
+        """
+        if ca.depends_on(expression, self._symbols[-1]):
+            self._add_order()
+        return self._total_derivative(expression)
+
+    def expand(self, expression: ca.SX) -> ca.SX:
+        """An expression in terms of state, control and parameters alone."""
+        return self._inline(expression, len(self._values))
+
+    def has_unknowns(self, expression: ca.SX) -> bool:
+        """Whether an expression holds unknowns of the motion, which A(x) must be regular for."""
+        return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
+
+    def inverse(self, expression: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX] | None:
+        """The control for which an expression of the motion takes wanted values.
+
+        The equations of the motion and `expression = wanted` are solved together for the control
+        and for the unknowns that it moves, block by block along their structure (Dulmage and
+        Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
+        it is inverse dynamics.
+
+        Args:
+            expression: Shape (p, 1), in terms of the state and of this motion's unknowns.
+            wanted: Shape (p, 1).
+
+        Returns:
+            u in terms of the state, shape (p, 1), and a scalar that is 0 exactly where it is not
+            determined; None if the equations are not linear in what the control moves.
+        """
+        used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
+        orders = max(used, default=0)
+        symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
+        values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
+        moved = ca.which_depends(values, self.control, 1, True) if orders else []
+        still = [i for i, moves in enumerate(moved) if not moves]
+        unknowns = ca.vertcat(symbols[[i for i, moves in enumerate(moved) if moves]], self.control)
+        equations = ca.vertcat(ca.SX(0, 1), *self._equations[:orders], expression - wanted)
+        involved = ca.which_depends(equations, unknowns, 1, True)
+        used_rows = [i for i, involves in enumerate(involved) if involves]
+        equations = equations[used_rows]
+        if equations.numel() != unknowns.numel():
+            return None
+        matrix = self._slopes(expression, orders, moved)[used_rows, :]
+        if ca.depends_on(matrix, unknowns):
+            return None
+        blocks = []
+        for rows, columns in _diagonal_blocks(matrix.sparsity()):
+            own = unknowns[columns]
+            known = ca.substitute(equations[rows], own, ca.SX.zeros(own.numel()))
+            factors = Factorization(ca.densify(matrix[rows, columns]))
+            blocks.append((own, factors.solve(-known), factors.pivot))
+        # From the control back to what it needs: the rest moves, but nobody asks for it.
+        needed, pivot = self.control, ca.SX(1)
+        for own, solution, own_pivot in reversed(blocks):
+            if ca.depends_on(needed, own):
+                needed, pivot = ca.vertcat(needed, solution), ca.fmin(pivot, own_pivot)
+        if still and ca.depends_on(needed, symbols[still]):
+            pivot = ca.fmin(pivot, self.pivot)
+        _, found = ca.substitute_inplace(
+            [symbols[still], *(own for own, _, _ in blocks)],
+            [values[still], *(solution for _, solution, _ in blocks)],
+            [self.control, pivot],
+        )
+        return found[0], found[1]
+
+    def _slopes(self, expression: ca.SX, orders: int, moved: Sequence[bool]) -> ca.SX:
+        """The derivatives of the equations of some orders, and of an expression, by what moves."""
+        rows = [*self._equations[:orders], expression]
+        blocks = []
+        for k, row in enumerate(rows):
+            columns = []
+            for j in range(orders):
+                size = self._symbols[j + 1].numel()
+                which = [i for i in range(size) if moved[j * size + i]]
+                if j == k:  # Known, in fewer operations.
+                    columns.append(self._matrix[:, which])
+                elif j < k:
+                    columns.append(ca.jacobian(row, self._symbols[j + 1][which]))
+                else:
+                    columns.append(ca.SX(row.numel(), len(which)))
+            blocks.append(ca.horzcat(*columns, ca.jacobian(row, self.control)))
+        return ca.sparsify(ca.vertcat(*blocks))
+
+    def _first_order(self, constraint: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """E x' - f - g v and c', in terms of the first unknowns."""
+        system, rate = self.system, self._rates[0]
+        residual = ca.mtimes(system.mass_matrix, rate) - system.f
+        residual -= ca.mtimes(system.g, self.constraint_input)
+        constraint_rate = ca.jtimes(constraint, system.state, rate)
+        if system.motion is None:
+            return residual, constraint_rate
+        shorter = ca.vertcat(*system.motion(rate, self.constraint_input))
+        longer = ca.vertcat(residual, constraint_rate)
+        if shorter.shape != longer.shape or not _agree(
+            system, shorter, longer, self._symbols[1], self.control
+        ):
+            raise ModelError(
+                f"{system.name}: 'motion' is not (E x' - f - g v, c') near the nominal state"
+            )
+        return shorter[: system.num_states], shorter[system.num_states :, :]
+
+    def _next_unknown(self) -> ca.SX:
+        size = len(self._rows) + self.system.num_constraints
+        return ca.SX.sym(f"w{len(self._symbols)}", size)
+
+    def _total_derivative(self, expression: ca.SX) -> ca.SX:
+        moving = self._symbols[: len(self._rates)]
+        return ca.jtimes(expression, ca.vertcat(*moving), ca.densify(ca.vertcat(*self._rates)))
+
+    def _add_order(self) -> None:
+        following = self._next_unknown()
+        self._rates.append(following)
+        size = self._residual.numel()
+        both = self._total_derivative(ca.vertcat(self._residual, self._constraint_rate))
+        self._residual, self._constraint_rate = both[:size, :], both[size:, :]
+        self._symbols.append(following)
+        self._solve_order()
+
+    def _solve_order(self) -> None:
+        """The newest unknowns enter residual and constraint rate linearly: solve for them."""
+        newest = self._symbols[-1]
+        self._equations.append(ca.vertcat(self._residual, self._constraint_rate))
+        known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
+        count = len(self._rows)
+        solution = self._unknowns(known[:count, :], known[count:, :])
+        self._values.append(ca.densify(self._inline(solution, len(self._values))))
+
+    def _inline(self, expression: ca.SX, orders: int) -> ca.SX:
+        """Puts the values of the first `orders` unknowns in."""
+        return (
+            ca.substitute(
+                expression,
+                ca.vertcat(*self._symbols[1 : orders + 1]),
+                ca.vertcat(*self._values[:orders]),
+            )
+            if orders
+            else expression
+        )
+
+
+def _diagonal_blocks(pattern: ca.Sparsity) -> list[tuple[list[int], list[int]]]:
+    """Rows and columns of the blocks of a square matrix, in the order in which they are solved."""
+    count, rows, columns, row_starts, column_starts, _, _ = pattern.btf()
+    return [
+        (
+            rows[row_starts[k] : row_starts[k + 1]],
+            columns[column_starts[k] : column_starts[k + 1]],
+        )
+        for k in range(count)
+    ]
+
+
+def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
+    """Whether two expressions are the same function, by their numbers around the nominal state.
+
+    The parameters are changed, too: what agrees at their defaults alone is not the same.
+    """
+    symbols = [system.state, *unknowns, system.parameter_symbol]
+    function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
+    random, p = np.random.default_rng(0), system.parameter_values
+    deviation = default_spread(system.nominal_state)
+    finite = 0
+    for spread in (0.0, 0.1, 0.1):
+        x = system.nominal_state + deviation * random.standard_normal(system.num_states)
+        numbers = [random.standard_normal(u.numel()) for u in unknowns]
+        changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
+        one, other = (v.full() for v in function(x, *numbers, changed))
+        if not (np.all(np.isfinite(one)) and np.all(np.isfinite(other))):
+            continue  # Out of the domain of one of the functions.
+        finite += 1
+        # By columns: constraints may have very different units.
+        size = np.abs(one).max(axis=0, initial=0.0) + np.abs(other).max(axis=0, initial=0.0)
+        if not np.all(np.abs(one - other) <= 1e-9 * np.abs(other) + 1e-11 * size):
+            return False
+    return finite > 0
+
+
+def _solver(
+    mass: ca.SX, force: ca.SX, gradient: ca.SX
+) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
+    """Solves [[E, -g], [dc/dx, 0]] (w, v) = -(residual, rate), from E, g and (dc/dx)^T.
+
+    Returns:
+        The solver, A(x), and a scalar that is 0 exactly where A is singular.
+    """
+    inertia = PositiveDefiniteFactorization(mass)
+    half = inertia.forward(force)
+    coupling: Factorization | PositiveDefiniteFactorization
+    if gradient is force:  # A = g^T E^-1 g, as J M^-1 J^T
+        other = ca.sparsify(inertia.scaled(half))
+        matrix = ca.sparsify(ca.tril2symm(ca.tril(ca.mtimes(other.T, half))))
+        coupling = PositiveDefiniteFactorization(matrix)
+    else:
+        other = ca.sparsify(inertia.scaled(inertia.forward(gradient)))
+        matrix = ca.sparsify(ca.mtimes(other.T, half))
+        coupling = Factorization(matrix)
+
+    def solve(residual: ca.SX, rate: ca.SX) -> ca.SX:
+        free = inertia.forward(-residual)
+        multiplier = coupling.solve(-rate - ca.mtimes(other.T, free))
+        return ca.vertcat(inertia.backward(free + ca.mtimes(half, multiplier)), multiplier)
+
+    return solve, matrix, coupling.pivot

@@ -1,0 +1,208 @@
+"""A box of the state space: the consistent states in it, and where a function is smallest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.manifold import Manifold
+from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import ROUND_OFF
+
+_SLACK = 1e-6
+"""How far out of a box a state may be, relative to the box, as Newton's method leaves it."""
+
+
+_FLAT = 1e-3
+"""A slope that changes a function by less than this fraction across the box leads nowhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """The states low <= x <= high.
+
+    Attributes:
+        low: Shape (n,); -inf where there is no bound.
+        high: Shape (n,), not below `low`.
+    """
+
+    low: FloatArray
+    high: FloatArray
+
+    def holds(self, state: FloatArray) -> bool:
+        """Whether a state is in it."""
+        bounds = np.where(np.isfinite([self.low, self.high]), [self.low, self.high], 0.0)
+        slack = _SLACK * np.maximum(np.abs(bounds).max(axis=0), bounds[1] - bounds[0])
+        return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
+
+
+class ConsistentRegion:
+    """The consistent states in a region, with the default parameters.
+
+    Args:
+        manifold: N*, or what is known of it.
+        region: None is the whole of N*.
+    """
+
+    def __init__(self, manifold: Manifold, region: Region | None) -> None:
+        self.manifold = manifold
+        self.region = region
+
+    def _gradients(self, state: FloatArray) -> FloatArray:
+        """C = d(residual)/dx, shape (sum r_i, n)."""
+        values = self._gradient(state, self.manifold.system.parameter_values)[0]
+        return values.reshape(-1, state.size)
+
+    @cached_property
+    def _gradient(self) -> TracedFunction:
+        system = self.manifold.system
+        return TracedFunction(
+            f"{system.name} constraints",
+            {"x": system.state, "p": system.parameter_symbol},
+            {"gradient": ca.jacobian(self.manifold.residual_expression, system.state)},
+            often=False,
+        )
+
+    def project(self, guess: FloatArray) -> FloatArray:
+        """A consistent state in the region, near a guess.
+
+        Raises:
+            InconsistentStateError: None found.
+        """
+        region = self.region
+        if region is None:
+            return self.manifold.project(guess)
+        try:
+            state = self.manifold.project(guess)
+            if region.holds(state):
+                return state
+        except InconsistentStateError:
+            pass
+        state = self.manifold.project(self._newton(region, guess))
+        if not region.holds(state):
+            raise InconsistentStateError(
+                f"{self.manifold.system.name}: no consistent state found in the region",
+                self.manifold.residual(np.clip(state, region.low, region.high)),
+            )
+        return state
+
+    def draw(self, guess: FloatArray) -> FloatArray:
+        """A consistent state that has the bounded states of a guess, where there is one.
+
+        So random values in the bounds cover them, whatever the constraints move.
+
+        Raises:
+            InconsistentStateError: No consistent state in the region.
+        """
+        region = self.region
+        if region is None:
+            return self.project(guess)
+        bounded = np.isfinite(region.low)
+        held = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
+        try:
+            state = self.manifold.project(self._newton(held, guess))
+        except InconsistentStateError:
+            return self.project(guess)
+        return state if region.holds(state) else self.project(guess)
+
+    def descend(
+        self, function: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray
+    ) -> FloatArray:
+        """Follows a function that is nowhere negative downhill, along N* and inside the region.
+
+        Each step is as long as it takes a straight slope to come to zero, so that zeros are found
+        in a few steps; the least of a function that has no zero is approached only.
+
+        Args:
+            function: Value and gradient, shape (n,), at a state.
+            start: A consistent state in the region.
+
+        Returns:
+            The last state, shape (n,).
+        """
+        region = self.region
+        if region is None:
+            return start
+        width = np.where(np.isfinite(region.high - region.low), region.high - region.low, 1.0)
+        state, (value, gradient) = start, function(start)
+        for _ in range(40):
+            direction = self._downhill(region, state, gradient, width)
+            slope = float(direction @ direction)
+            # In units of the box: the state moves by the width times this.
+            if not value > 0.0 or not np.sqrt(slope) > _FLAT * value:
+                break
+            length = min(value / slope, self._room(region, state, width * direction))
+            for _ in range(6):
+                try:
+                    trial = self.project(state + length * width * direction)
+                except InconsistentStateError:
+                    length /= 4.0
+                    continue
+                trial_value, trial_gradient = function(trial)
+                if trial_value < value:
+                    break
+                length /= 4.0
+            else:
+                break
+            state, value, gradient = trial, trial_value, trial_gradient
+        return state
+
+    def _downhill(
+        self, region: Region, state: FloatArray, gradient: FloatArray, width: FloatArray
+    ) -> FloatArray:
+        """Against the gradient, along N* and not out of the box, in units of the box."""
+        rows = self._gradients(state) * width
+        slope = gradient * width
+        held = np.zeros(state.size, dtype=bool)
+        while True:
+            normal = np.vstack([rows, np.eye(state.size)[held]])
+            length = np.linalg.norm(normal, axis=1)
+            normal = normal[length > 0.0] / length[length > 0.0, None]
+            direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
+            edge = _SLACK * width
+            blocked = (direction < 0.0) & (state <= region.low + edge)
+            blocked |= (direction > 0.0) & (state >= region.high - edge)
+            if not np.any(blocked & ~held):
+                return np.where(held, 0.0, direction)
+            held |= blocked
+
+    @staticmethod
+    def _room(region: Region, state: FloatArray, step: FloatArray) -> float:
+        """The factor by which a step reaches the edge of the box."""
+        edge = np.where(step < 0.0, region.low, region.high)
+        moving = step != 0.0
+        with np.errstate(over="ignore"):
+            return float(np.min((edge - state)[moving] / step[moving], initial=np.inf))
+
+    def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
+        """Newton's method for the constraints that does not leave the box."""
+        state = np.clip(guess, region.low, region.high)
+        for _ in range(30):
+            residual, gradient = self.manifold.residual(state), self._gradients(state)
+            if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(gradient))):
+                break
+            step = _bounded_step(gradient, residual, region.low - state, region.high - state)
+            state = np.clip(state + step, region.low, region.high)
+            if np.max(np.abs(step), initial=0.0) <= ROUND_OFF * np.max(np.abs(state)):
+                break
+        return state
+
+
+def _bounded_step(
+    gradient: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """A short dx with C dx + r = 0; what would go past its bound stops there."""
+    step, free = np.zeros(low.size), low < high
+    while free.any():
+        left = residual + gradient[:, ~free] @ step[~free]
+        step[free] = -np.linalg.lstsq(gradient[:, free], left)[0]
+        past = free & ((step < low) | (step > high))
+        if not past.any():
+            break
+        step[past] = np.clip(step[past], low[past], high[past])
+        free &= ~past
+    return step

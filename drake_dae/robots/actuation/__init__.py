@@ -1,0 +1,8 @@
+"""What stands between the control and the joints: a chain of stages toward the motor."""
+
+from drake_dae.robots.actuation.dc_motors import DcMotors
+from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
+from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
+from drake_dae.robots.actuation.stage import Stage
+
+__all__ = ["DcMotors", "ElectrohydraulicServos", "FlexibleJoints", "Stage"]

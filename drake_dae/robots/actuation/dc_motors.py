@@ -1,0 +1,65 @@
+"""Armature-controlled direct-current motors.                                (74)-(75)"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.actuation.stage import AttachedStage, diagonal_parameter
+from drake_dae.robots.links.links import Links
+
+
+@dataclass(frozen=True, eq=False)
+class DcMotors:
+    """Armature-controlled direct-current motors (74)-(75), driven by voltages u:
+
+        M(q) q'' + H = J^T lambda + N K_m I_a,    L I_a' + R I_a + K_m N q' = u.
+
+    Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
+    positions and 1 for forces. The law needs positions and velocities, and the currents.
+
+    Attributes:
+        torque_constant: K_m in N m/A, a number or shape (p,), not 0.
+        inductance: L in H, positive.
+        resistance: R in ohm, not negative.
+        gear_ratio: N; what the URDF declares if None.
+    """
+
+    torque_constant: ArrayLike
+    inductance: ArrayLike
+    resistance: ArrayLike
+    gear_ratio: ArrayLike | None = None
+
+    def attach(self, links: Links) -> AttachedStage:
+        names = [signal.name for signal in links.actuator_signals]
+        p = len(names)
+        ratio = links.gear_ratios if self.gear_ratio is None else self.gear_ratio
+        constant, k_m = diagonal_parameter(
+            "dc_motors.torque_constant", self.torque_constant, p, "N m/A"
+        )
+        inductance, l = diagonal_parameter("dc_motors.inductance", self.inductance, p, "H", True)  # noqa: E741
+        resistance, r = diagonal_parameter("dc_motors.resistance", self.resistance, p, "ohm")
+        gears, n = diagonal_parameter("dc_motors.gear_ratio", ratio, p, "")
+        for parameter, wrong, wanted in (
+            (constant, constant.value == 0, "not be zero"),
+            (gears, gears.value == 0, "not be zero"),
+            (resistance, resistance.value < 0, "not be negative"),
+        ):
+            if wrong.any():
+                raise ModelError(f"{parameter.name} must {wanted}, got {parameter.value}")
+        current = ca.SX.sym("I", p)
+        return AttachedStage(
+            state=current,
+            state_signals=tuple(Signal(f"{name}.current", "A") for name in names),
+            mass=ca.diag(l),
+            drift=lambda position, velocity: -r * current - k_m * n * velocity,
+            drive_matrix=ca.SX.eye(p),
+            drive_signals=tuple(Signal(f"{name}.voltage", "V") for name in names),
+            force=lambda position, velocity: n * k_m * current,
+            shaft=None,
+            carries_rotors=False,
+            ports={"motor_current": slice(0, p)},
+            parameters=(constant, inductance, resistance, gears),
+        )

@@ -1,0 +1,96 @@
+"""Elastic transmissions.                                                   (64)-(65)"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.actuation.stage import (
+    AttachedStage,
+    full_matrix,
+    matrix_parameter,
+    numbers_of,
+)
+from drake_dae.robots.links.links import Links
+
+
+@dataclass(frozen=True, eq=False)
+class FlexibleJoints:
+    """Elastic transmissions (64)-(65), with joint damping D beside the paper's stiffness K_2:
+
+        M(q_1) q_1'' + H = J^T lambda + K_2 (q_2 - q_1) + D (q_2' - q_1'),
+        M_2 q_2'' + K_2 (q_2 - q_1) + D (q_2' - q_1') = u.
+
+    The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4
+    for positions and 2 for forces; 3 and 1 with damping. Damping leaves p zero dynamics, which the
+    law does not move: K_2 d + D d' = tau for the deflections d, with the rates of D^-1 K_2. They
+    are stable, but bound the step of an explicit integrator. The law needs positions and
+    velocities of links and shafts.
+
+    Attributes:
+        stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite.
+        inertia: M_2 in kg m^2 (kg), likewise; what the URDF declares if None.
+        damping: D in N m s/rad (N s/m), likewise, positive definite; 0 for none.
+    """
+
+    stiffness: ArrayLike
+    inertia: ArrayLike | None = None
+    damping: ArrayLike = 0.0
+
+    def attach(self, links: Links) -> AttachedStage:
+        names = [signal.name for signal in links.actuator_signals]
+        p = len(names)
+        if np.any(np.isinf(numbers_of("flexible_joints.stiffness", self.stiffness))):
+            raise ModelError(
+                "FlexibleJoints: a stiffness is infinite. Rigid joints beside flexible ones are "
+                "not supported: the control would reach the outputs at different orders, and B(x) "
+                "of Assumption (5) would be singular. Give a high stiffness instead"
+            )
+        inertia = self.inertia
+        if inertia is None:
+            inertia = links.reflected_inertia
+            bare = [n for n, i in zip(names, links.reflected_inertia, strict=True) if i <= 0]
+            if bare:
+                raise ModelError(
+                    f"FlexibleJoints: no rotor inertia is declared for {', '.join(bare)}; give "
+                    "'inertia', or drake:rotor_inertia and drake:gear_ratio in the URDF"
+                )
+        rotary = all(signal.unit == "N m" for signal in links.actuator_signals)
+        units = ("N m/rad", "kg m^2", "N m s/rad") if rotary else ("", "", "")
+        stiffness, k = matrix_parameter("flexible_joints.stiffness", self.stiffness, p, units[0])
+        rotors, m_2 = matrix_parameter("flexible_joints.inertia", inertia, p, units[1])
+        parameters = [stiffness, rotors]
+        d = ca.SX(p, p)
+        if np.any(full_matrix("flexible_joints.damping", self.damping, p)):
+            try:
+                damping, d = matrix_parameter("flexible_joints.damping", self.damping, p, units[2])
+            except ModelError as error:
+                raise ModelError(
+                    f"{error}. Damp all flexible joints or none: where only some are damped, the "
+                    "control reaches the outputs at different orders"
+                ) from None
+            parameters.append(damping)
+        q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
+
+        def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
+            return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)
+
+        kinds = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
+        positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, kinds, strict=True)]
+        rates = [Signal(f"{n}.velocity", f"{unit}/s") for n, unit in zip(names, kinds, strict=True)]
+        return AttachedStage(
+            state=ca.vertcat(q_2, rate),
+            state_signals=(*positions, *rates),
+            mass=ca.diagcat(ca.SX.eye(p), m_2),
+            drift=lambda position, velocity: ca.vertcat(rate, -force(position, velocity)),
+            drive_matrix=ca.vertcat(ca.SX(p, p), ca.SX.eye(p)),
+            drive_signals=tuple(links.actuator_signals),
+            force=force,
+            shaft=(q_2, rate),
+            carries_rotors=True,
+            ports={"motor_state": slice(0, 2 * p)},
+            parameters=tuple(parameters),
+        )

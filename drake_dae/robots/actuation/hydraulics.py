@@ -1,0 +1,77 @@
+"""Electrohydraulic servos."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.actuation.stage import (
+    AttachedStage,
+    diagonal_parameter,
+    full_matrix,
+    matrix_parameter,
+)
+from drake_dae.robots.links.links import Links
+
+
+@dataclass(frozen=True, eq=False)
+class ElectrohydraulicServos:
+    """Electrohydraulic servos (the last model of section 3.3), driven by normalized currents u:
+
+        M(q) q'' + H = J^T lambda + G(q) f_a,    K_h^-1 f_a' + G_p f_a + G(q)^T q' = u.
+
+    Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
+    positions and 1 for forces. The law needs positions and velocities, and the actuator forces.
+
+    Attributes:
+        stiffness: K_h of the fluid in N/m, a number or shape (p,), positive.
+        leakage: G_p in m/(N s), a number, shape (p,) or (p, p), positive semidefinite.
+        geometry: G of the actuated positions, a CasADi column of shape (p, 1); returns shape
+            (p, p) in m. Or a number, shape (p,) or (p, p); 1 if left out.
+    """
+
+    stiffness: ArrayLike
+    leakage: ArrayLike
+    geometry: Callable[[ca.SX], ca.SX] | ArrayLike = 1.0
+
+    def attach(self, links: Links) -> AttachedStage:
+        names = [signal.name for signal in links.actuator_signals]
+        p = len(names)
+        fluid, k_h = diagonal_parameter("hydraulics.stiffness", self.stiffness, p, "N/m", True)
+        leakage, g_p = matrix_parameter(
+            "hydraulics.leakage", self.leakage, p, "m/(N s)", definite=False
+        )
+        pressing = ca.SX.sym("fa", p)
+
+        def geometry(position: ca.SX) -> ca.SX:
+            if not callable(self.geometry):
+                return ca.SX(full_matrix("hydraulics.geometry", self.geometry, p))
+            try:
+                value = ca.SX(self.geometry(position))
+            except (NotImplementedError, TypeError) as error:
+                raise ModelError(
+                    f"hydraulics.geometry must return a CasADi matrix, for example "
+                    f"casadi.diag(...): {error}"
+                ) from error
+            if value.shape != (p, p):
+                raise ModelError(f"hydraulics.geometry has shape {value.shape}, expected {(p, p)}")
+            return value
+
+        return AttachedStage(
+            state=pressing,
+            state_signals=tuple(Signal(f"{name}.actuator_force", "N") for name in names),
+            mass=ca.diag(1 / k_h),
+            drift=lambda position, velocity: (
+                -ca.mtimes(g_p, pressing) - ca.mtimes(geometry(position).T, velocity)
+            ),
+            drive_matrix=ca.SX.eye(p),
+            drive_signals=tuple(Signal(f"{name}.valve_current") for name in names),
+            force=lambda position, velocity: ca.mtimes(geometry(position), pressing),
+            shaft=None,
+            carries_rotors=False,
+            ports={"actuator_force": slice(0, p)},
+            parameters=(fluid, leakage),
+        )

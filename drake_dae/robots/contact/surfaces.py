@@ -1,0 +1,305 @@
+"""Surfaces as signed distances: positive on the free side, of unit gradient on the surface.
+
+With |grad phi| = 1 at the contact point, the multiplier of phi is the normal force in newtons.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+
+Vector = tuple[float, float, float]
+
+
+class Surface(Protocol):
+    """A smooth surface. Where it stands is an argument, so that it can be a parameter.
+
+    Attributes:
+        position: Where its reference point stands in the world by default, m, shape (3,).
+        coordinate_signals: (name, unit) of the two coordinates along it; empty if it has none.
+    """
+
+    @property
+    def position(self) -> Vector: ...
+
+    @property
+    def coordinate_signals(self) -> tuple[tuple[str, str], ...]: ...
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        """Signed distance in m of a point, given relative to the reference point, shape (3, 1)."""
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        """Coordinates along the surface of such a point, shape (2, 1)."""
+
+
+def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across a unit vector, upright where possible.
+
+    For a vertical wall the first is horizontal and the second points up; for a horizontal plane
+    they are x and y.
+    """
+    n = np.asarray(normal, dtype=float)
+    if abs(n[2]) < 0.9:
+        second = np.array([0.0, 0.0, 1.0]) - n[2] * n
+        second /= np.linalg.norm(second)
+        return np.cross(n, second), second
+    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    first /= np.linalg.norm(first)
+    return first, np.cross(n, first)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """phi = n . (p - point).
+
+    Attributes:
+        point: A point of the plane, m, shape (3,).
+        normal: Toward the free side, any length, shape (3,). Coordinates: along `tangents(n)`, m.
+    """
+
+    point: Vector
+    normal: Vector
+    coordinate_signals: ClassVar = (("along", "m"), ("across", "m"))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "normal", _unit("normal", self.normal))
+
+    @property
+    def position(self) -> Vector:
+        return self.point
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        return ca.dot(ca.DM(self.normal), offset)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        return ca.vertcat(*[ca.dot(ca.DM(t), offset) for t in tangents(self.normal)])
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """phi = |p - center| - radius; its negative inside.
+
+    Attributes:
+        center: m, shape (3,).
+        radius: m.
+        axis: Of longitude and latitude, which are singular on it, shape (3,).
+        inside: Whether the free side is the inside.
+    """
+
+    center: Vector
+    radius: float
+    axis: Vector = (0.0, 0.0, 1.0)
+    inside: bool = False
+    coordinate_signals: ClassVar = (("longitude", "rad"), ("latitude", "rad"))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", _vector("center", self.center))
+        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        _positive("radius", self.radius)
+
+    @property
+    def position(self) -> Vector:
+        return self.center
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        return _side(ca.norm_2(offset) - self.radius, self.inside)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        x, y, z = _components(self.axis, offset)
+        return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2)))
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """phi = distance from the axis - radius; its negative inside. It has no ends.
+
+    Attributes:
+        point: A point of the axis, m, shape (3,).
+        axis: Direction, any length, shape (3,).
+        radius: m. Coordinates: angle about the axis in rad, distance along it in m.
+        inside: Whether the free side is the inside.
+    """
+
+    point: Vector
+    axis: Vector
+    radius: float
+    inside: bool = False
+    coordinate_signals: ClassVar = (("angle", "rad"), ("along", "m"))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        _positive("radius", self.radius)
+
+    @property
+    def position(self) -> Vector:
+        return self.point
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        x, y, _ = _components(self.axis, offset)
+        return _side(ca.sqrt(x**2 + y**2) - self.radius, self.inside)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        x, y, z = _components(self.axis, offset)
+        return ca.vertcat(ca.atan2(y, x), z)
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """phi = F / |grad F| with F = (x/a)^2 + (y/b)^2 + (z/c)^2 - 1: the distance to first order.
+
+    Attributes:
+        center: m, shape (3,).
+        semi_axes: a, b, c in m along the world's axes, shape (3,). Coordinates: longitude and
+            latitude of the scaled sphere, rad, singular on the z axis.
+        inside: Whether the free side is the inside.
+    """
+
+    center: Vector
+    semi_axes: Vector
+    inside: bool = False
+    coordinate_signals: ClassVar = (("longitude", "rad"), ("latitude", "rad"))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", _vector("center", self.center))
+        object.__setattr__(self, "semi_axes", _vector("semi_axes", self.semi_axes))
+        for length in self.semi_axes:
+            _positive("semi_axes", length)
+
+    @property
+    def position(self) -> Vector:
+        return self.center
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        return _side(
+            _normalized(lambda p: ca.sumsqr(p / ca.DM(self.semi_axes)) - 1.0, offset), self.inside
+        )
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        x, y, z = ca.vertsplit(offset / ca.DM(self.semi_axes))
+        return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2)))
+
+
+@dataclass(frozen=True)
+class Torus:
+    """phi = distance from the ring - minor radius; its negative inside the tube.
+
+    Attributes:
+        center: m, shape (3,).
+        axis: Of the ring, any length, shape (3,).
+        major_radius: Of the ring, m.
+        minor_radius: Of the tube, m, less than the major one.
+        inside: Whether the free side is inside the tube. Coordinates: angle along the ring and
+            angle around the tube (0 outermost), rad.
+    """
+
+    center: Vector
+    axis: Vector
+    major_radius: float
+    minor_radius: float
+    inside: bool = False
+    coordinate_signals: ClassVar = (("ring_angle", "rad"), ("tube_angle", "rad"))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", _vector("center", self.center))
+        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        _positive("minor_radius", self.minor_radius)
+        if not self.major_radius > self.minor_radius:
+            raise ModelError(
+                f"major_radius {self.major_radius} must exceed minor_radius {self.minor_radius}"
+            )
+
+    @property
+    def position(self) -> Vector:
+        return self.center
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        x, y, z = _components(self.axis, offset)
+        radial = ca.sqrt(x**2 + y**2) - self.major_radius
+        return _side(ca.sqrt(radial**2 + z**2) - self.minor_radius, self.inside)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        x, y, z = _components(self.axis, offset)
+        return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2) - self.major_radius))
+
+
+@dataclass(frozen=True)
+class ImplicitSurface:
+    """phi = F / |grad F| for any smooth F(p) that is zero on the surface: the distance near it.
+
+    The gradient has length one on the surface itself.
+
+    Attributes:
+        function: F of a CasADi column p of shape (3, 1), relative to `point`; positive on the
+            free side, of any scale, with a gradient that does not vanish on the surface.
+        point: Where the origin of p stands in the world, m, shape (3,).
+    """
+
+    function: Callable[[ca.SX], ca.SX]
+    point: Vector = (0.0, 0.0, 0.0)
+    coordinate_signals: ClassVar = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "point", _vector("point", self.point))
+
+    @property
+    def position(self) -> Vector:
+        return self.point
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        return _normalized(self.function, offset)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        raise ModelError(
+            "an ImplicitSurface has no coordinates along it; use PointCoordinates or an expression"
+        )
+
+
+def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
+    """F / |grad F| at a point."""
+    p = ca.SX.sym("p", 3)
+    value = ca.SX(function(p))
+    if value.shape != (1, 1):
+        raise ModelError(f"a surface function returns one number, this one has {value.shape}")
+    quotient = value / ca.norm_2(ca.gradient(value, p))
+    return ca.substitute(quotient, p, offset)
+
+
+def _components(axis: Vector, offset: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Components along tangents(axis) and axis."""
+    first, second = tangents(axis)
+    if np.dot(np.cross(first, second), axis) < 0.0:
+        first = -first
+    x, y, z = (ca.dot(ca.DM(vector), offset) for vector in (first, second, np.array(axis)))
+    return x, y, z
+
+
+def _side(distance: ca.SX, inside: bool) -> ca.SX:
+    return -distance if inside else distance
+
+
+def _vector(name: str, value: ArrayLike) -> Vector:
+    array = np.asarray(value, dtype=float)
+    if array.shape != (3,) or not np.all(np.isfinite(array)):
+        raise ModelError(f"{name} must be three finite numbers, got {value!r}")
+    return (float(array[0]), float(array[1]), float(array[2]))
+
+
+def _unit(name: str, value: ArrayLike) -> Vector:
+    array = np.array(_vector(name, value))
+    length = float(np.linalg.norm(array))
+    if length == 0.0:
+        raise ModelError(f"{name} must not be zero")
+    return _vector(name, array / length)
+
+
+def _positive(name: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0.0):
+        raise ModelError(f"{name} must be positive, got {value}")

@@ -1,0 +1,224 @@
+"""The joints of a MultibodyPlant as turns about coordinate axes and shifts, read as links."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BallRpyJoint,
+    Joint,
+    PlanarJoint,
+    PrismaticJoint,
+    RevoluteJoint,
+    RpyFloatingJoint,
+    ScrewJoint,
+    UniversalJoint,
+    WeldJoint,
+)
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots.links.tree import Link, Motion
+
+SUPPORTED_JOINTS = (
+    RevoluteJoint,
+    PrismaticJoint,
+    WeldJoint,
+    ScrewJoint,
+    UniversalJoint,
+    PlanarJoint,
+    BallRpyJoint,
+    RpyFloatingJoint,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotions:
+    """The motions from the inboard to the outboard frame of a joint.
+
+    Attributes:
+        motions: From inboard to outboard; empty for a weld.
+        rotation: Shape (3, 3), the constant R such that X_FM(q) = R (motions) R^T: it turns an
+            oblique joint axis into a coordinate axis, which saves operations.
+    """
+
+    motions: tuple[Motion, ...]
+    rotation: FloatArray
+
+
+def check_joint(joint: Joint) -> None:
+    """Refuses a joint that has no motions.
+
+    Raises:
+        ModelError: It is a quaternion joint, or of a type that is not supported.
+    """
+    if isinstance(joint, SUPPORTED_JOINTS):
+        return
+    if joint.is_ephemeral():
+        raise ModelError(
+            f"body '{joint.child_body().name()}' is free, so Finalize gave it a "
+            f"{joint.type_name()} joint, whose quaternion is not supported; before Finalize, weld "
+            "it to the world (plant.WeldFrames) or add an RpyFloatingJoint from the world to it"
+        )
+    names = ", ".join(supported.kTypeName for supported in SUPPORTED_JOINTS)
+    raise ModelError(
+        f"joint '{joint.name()}' has type {joint.type_name()}, which is not supported; "
+        f"supported are {names}"
+    )
+
+
+def joint_motions(plant: MultibodyPlant, joint: Joint, reverse: bool = False) -> JointMotions:
+    """Reads the motions of a supported joint.
+
+    Args:
+        plant: The finalized plant of the joint.
+        joint: One that `check_joint` accepts.
+        reverse: From the frame on the child to the frame on the parent; Drake allows it for
+            revolute, prismatic and weld joints, where the inverse motion has the opposite axis.
+    """
+    sign = -1.0 if reverse else 1.0
+    i, j = joint.position_start(), joint.velocity_start()
+    unit = np.eye(3)
+    if isinstance(joint, RevoluteJoint):
+        axis, rotation = _align(sign * joint.revolute_axis())
+        return JointMotions((Motion(axis, (i,), (j,), unit[:, [axis]]),), rotation)
+    if isinstance(joint, PrismaticJoint):
+        direction = sign * joint.translation_axis().reshape(3, 1)
+        return JointMotions((Motion(None, (i,), (j,), direction),), unit)
+    if isinstance(joint, ScrewJoint):
+        axis, rotation = _align(_screw_axis(plant, joint))
+        metres_per_radian = joint.screw_pitch() / (2.0 * np.pi)
+        shift = Motion(None, (i,), (j,), metres_per_radian * unit[:, [axis]])
+        return JointMotions((shift, Motion(axis, (i,), (j,), unit[:, [axis]])), rotation)
+    if isinstance(joint, UniversalJoint):
+        turns = [Motion(k, (i + k,), (j + k,), unit[:, [k]]) for k in (0, 1)]
+        return JointMotions(tuple(turns), unit)
+    if isinstance(joint, PlanarJoint):
+        shift = Motion(None, (i, i + 1), (j, j + 1), unit[:, :2])
+        return JointMotions((shift, Motion(2, (i + 2,), (j + 2,), unit[:, [2]])), unit)
+    if isinstance(joint, BallRpyJoint):
+        return JointMotions(_roll_pitch_yaw(i, j), unit)
+    if isinstance(joint, RpyFloatingJoint):
+        shift = Motion(None, (i + 3, i + 4, i + 5), (j + 3, j + 4, j + 5), unit)
+        return JointMotions((shift, *_roll_pitch_yaw(i, j)), unit)
+    return JointMotions((), unit)
+
+
+def joint_velocity_map(joint: Joint, q: ca.SX) -> ca.SX:
+    """N(q) of one joint, shape (k, k), with q' = N v for its own positions and velocities.
+
+    Args:
+        joint: A supported joint.
+        q: Its own positions, shape (k, 1).
+    """
+    count = joint.num_positions()
+    block = ca.SX.eye(count)
+    if isinstance(joint, (BallRpyJoint, RpyFloatingJoint)):
+        # The velocities are the angular velocity of M in F, not the rates of the angles.
+        s, c, s_yaw, c_yaw = ca.sin(q[1]), ca.cos(q[1]), ca.sin(q[2]), ca.cos(q[2])
+        rates = ca.vertcat(
+            ca.horzcat(c_yaw / c, s_yaw / c, 0),
+            ca.horzcat(-s_yaw, c_yaw, 0),
+            ca.horzcat(c_yaw * s / c, s_yaw * s / c, 1),
+        )
+        block = ca.diagcat(ca.sparsify(rates), ca.SX.eye(count - 3))
+    return block
+
+
+def read_links(
+    plant: MultibodyPlant, q: ca.SX
+) -> tuple[list[Link], dict[int, tuple[int, RigidTransform]]]:
+    """Reads the tree of a plant whose joints are supported, outward from the world.
+
+    Args:
+        plant: The finalized plant.
+        q: Its positions, shape (nq, 1).
+
+    Returns:
+        The links, still without inertia, and for every body its index -> its link, and its
+        constant pose in that link.
+    """
+    links = [Link()]
+    bodies = {int(plant.world_body().index()): (0, RigidTransform())}
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    reached = list(bodies)
+    for body in reached:
+        for joint in joints:
+            ends = [int(joint.parent_body().index()), int(joint.child_body().index())]
+            frames = [joint.frame_on_parent(), joint.frame_on_child()]
+            reverse = body == ends[1]
+            if reverse:
+                ends, frames = ends[::-1], frames[::-1]
+            if body != ends[0] or ends[1] in bodies:
+                continue
+            link, X_LB = bodies[body]
+            X_LF = X_LB @ frames[0].GetFixedPoseInBodyFrame()
+            if isinstance(joint, WeldJoint):
+                X_LM = X_LF @ (joint.X_FM().inverse() if reverse else joint.X_FM())
+            else:
+                sequence = joint_motions(plant, joint, reverse)
+                X_FA = RigidTransform(RotationMatrix(sequence.rotation), np.zeros(3))
+                start = X_LF @ X_FA
+                for motion in sequence.motions:
+                    links.append(Link.moved(link, *constant_pose(start), motion, q))
+                    link, start = len(links) - 1, RigidTransform()
+                X_LM = X_FA.inverse()
+            bodies[ends[1]] = (link, X_LM @ frames[1].GetFixedPoseInBodyFrame().inverse())
+            reached.append(ends[1])
+    return links, bodies
+
+
+def constant_pose(pose: RigidTransform) -> tuple[FloatArray, FloatArray]:
+    """R, shape (3, 3), and p, shape (3,), of a constant pose."""
+    return _snap(pose.rotation().matrix()), clean(pose.translation())
+
+
+def clean(values: FloatArray) -> FloatArray:
+    """Sets entries to zero that are below 1e-13 of the largest one."""
+    return np.where(np.abs(values) < 1e-13 * np.abs(values).max(), 0.0, values)
+
+
+def _snap(rotation: FloatArray) -> FloatArray:
+    """Makes entries of a rotation within 1e-13 of -1, 0, 1 exact, so that expressions fold.
+
+    Files write pi with 14 digits: its error must not fill a rotation that has two zeros in a row.
+    """
+    nearest = np.rint(rotation)
+    return np.where(np.abs(rotation - nearest) < 1e-13, nearest, rotation)
+
+
+def _roll_pitch_yaw(i: int, j: int) -> tuple[Motion, ...]:
+    """R_FM = Rz(yaw) Ry(pitch) Rx(roll); the first turn carries the angular velocity in F."""
+    none = np.zeros((3, 0))
+    return (
+        Motion(2, (i + 2,), (j, j + 1, j + 2), np.eye(3)),
+        Motion(1, (i + 1,), (), none),
+        Motion(0, (i,), (), none),
+    )
+
+
+def _screw_axis(plant: MultibodyPlant, joint: ScrewJoint) -> FloatArray:
+    """The axis of a screw joint, which pydrake does not bind, from a quarter turn."""
+    context = plant.CreateDefaultContext()
+    q = np.zeros(plant.num_positions())
+    q[joint.position_start()] = np.pi / 2
+    plant.SetPositions(context, q)
+    R = joint.frame_on_child().CalcPose(context, joint.frame_on_parent()).rotation().matrix()
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return axis / np.linalg.norm(axis)
+
+
+def _align(direction: FloatArray) -> tuple[int, FloatArray]:
+    """A coordinate axis, and a rotation that takes it to `direction`."""
+    direction = _snap(direction)
+    first = int(np.argmax(np.abs(direction)))
+    second, third = (first + 1) % 3, (first + 2) % 3
+    rotation = np.eye(3)
+    if direction[first] != 1.0:
+        normal = np.cross(direction, np.eye(3)[second])
+        rotation[:, first] = direction
+        rotation[:, third] = normal / np.linalg.norm(normal)
+        rotation[:, second] = np.cross(rotation[:, third], direction)
+    return first, rotation

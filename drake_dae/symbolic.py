@@ -1,0 +1,155 @@
+"""A DaeSystem from expressions of pydrake.symbolic."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+from numbers import Real
+from operator import add, mul, truediv
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.symbolic import Expression, ExpressionKind, Variable
+
+from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+
+_FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {
+    ExpressionKind.Constant: lambda number: number,
+    ExpressionKind.Var: lambda symbol: symbol,
+    ExpressionKind.Add: lambda *terms: reduce(add, terms),
+    ExpressionKind.Mul: lambda *factors: reduce(mul, factors),
+    ExpressionKind.Div: truediv,
+    ExpressionKind.Pow: pow,
+    ExpressionKind.Log: ca.log,
+    ExpressionKind.Exp: ca.exp,
+    ExpressionKind.Sqrt: ca.sqrt,
+    ExpressionKind.Sin: ca.sin,
+    ExpressionKind.Cos: ca.cos,
+    ExpressionKind.Tan: ca.tan,
+    ExpressionKind.Asin: ca.asin,
+    ExpressionKind.Acos: ca.acos,
+    ExpressionKind.Atan: ca.atan,
+    ExpressionKind.Atan2: ca.atan2,
+    ExpressionKind.Sinh: ca.sinh,
+    ExpressionKind.Cosh: ca.cosh,
+    ExpressionKind.Tanh: ca.tanh,
+}
+
+
+_CONTINUOUS = Variable.Type.CONTINUOUS
+
+
+_NOT_SMOOTH = {
+    ExpressionKind.Abs: "abs",
+    ExpressionKind.Min: "min",
+    ExpressionKind.Max: "max",
+    ExpressionKind.Ceil: "ceil",
+    ExpressionKind.Floor: "floor",
+    ExpressionKind.IfThenElse: "if_then_else",
+}
+
+
+def from_symbolic(
+    state: Sequence[Variable],
+    *,
+    f: Any,
+    h: Any,
+    l: Any,  # noqa: E741 - the paper's letter
+    g: Any = None,
+    k: Any = None,
+    m: Any = None,
+    parameters: Mapping[Variable, float] | None = None,
+    **labels: Any,
+) -> DaeSystem:
+    """A system (1)-(3) whose functions are expressions of `pydrake.symbolic`.
+
+    These share no subexpressions, so that what stands in them twice is translated twice.
+
+    Args:
+        state: The variables x, in order.
+        f, g, h, k, l, m: As in `DaeSystem`: an Expression, Variable or number, or a list or array
+            of these, of lists for a matrix, row by row. Without constraints leave out g, k and m.
+        parameters: Variable -> default.
+        labels: The remaining fields of `DaeSystem`; the states are named as their variables.
+
+    Raises:
+        ModelError: As `DaeSystem`; a variable that is neither a state nor a parameter; or an
+            expression that is not smooth, such as abs, or not known, such as an uninterpreted
+            function.
+    """
+    owner = labels.get("name", "system")
+    if isinstance(state, Variable):
+        raise ModelError(f"{owner}: the states must be a list of Variables, got {state!r}")
+    defaults = dict(parameters or {})
+    symbols: dict[int, ca.SX] = {}
+    for variable in [*state, *defaults]:
+        if not (isinstance(variable, Variable) and variable.get_type() == _CONTINUOUS):
+            raise ModelError(
+                f"{owner}: states and parameters must be continuous Variables of "
+                f"pydrake.symbolic, got {variable!r}"
+            )
+        if variable.get_id() in symbols:
+            raise ModelError(
+                f"{owner}: the variable {variable} stands twice among the states and parameters"
+            )
+        symbols[variable.get_id()] = ca.SX.sym(variable.get_name())
+
+    def translate(letter: str, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        if isinstance(value, (list, tuple)):
+            return [translate(letter, item) for item in value]
+        try:
+            return to_casadi(value, symbols)
+        except ModelError as error:
+            raise ModelError(f"{owner}: {letter} cannot hold {value}: {error}") from None
+
+    functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
+    return DaeSystem(
+        state=ca.vertcat(ca.SX(0, 1), *[symbols[variable.get_id()] for variable in state]),
+        **{
+            letter: ca.SX(0, 0) if value is None else translate(letter, value)
+            for letter, value in functions.items()
+        },
+        parameters=tuple(
+            Parameter(variable.get_name(), value, symbol=symbols[variable.get_id()])
+            for variable, value in defaults.items()
+        ),
+        **{"state_signals": tuple(Signal(v.get_name()) for v in state), **labels},
+    )
+
+
+def to_casadi(expression: Any, symbols: Mapping[int, ca.SX]) -> ca.SX:
+    """A scalar expression of `pydrake.symbolic`, or a number, as a CasADi expression.
+
+    Args:
+        expression: The expression.
+        symbols: Variable.get_id() -> what stands for it.
+
+    Raises:
+        ModelError: A variable without symbol, or a function that is not smooth or not known.
+    """
+    if isinstance(expression, Variable):
+        if expression.get_id() not in symbols:
+            raise ModelError(
+                f"the variable {expression} is neither a state nor a parameter; pass it in "
+                "'parameters' or put its number in"
+            )
+        return symbols[expression.get_id()]
+    if isinstance(expression, Real):
+        return ca.SX(float(expression))
+    if not isinstance(expression, Expression):
+        raise ModelError(
+            f"it is no expression of pydrake.symbolic, but {type(expression).__name__}"
+        )
+    kind = expression.get_kind()
+    if kind in _NOT_SMOOTH:
+        raise ModelError(
+            f"{_NOT_SMOOTH[kind]} has no derivatives everywhere, and the theory differentiates; "
+            "use a smooth function instead"
+        )
+    if kind not in _FUNCTIONS:
+        raise ModelError(f"nothing is known of the function {expression}")
+    _, parts = expression.Unapply()
+    return _FUNCTIONS[kind](*[to_casadi(part, symbols) for part in parts])

@@ -1,0 +1,101 @@
+"""Matrices of expressions, factored once for many right sides."""
+
+import casadi as ca
+
+
+class Factorization:
+    """A regular matrix A = Q R, factored once for many right sides; needs no pivoting.
+
+    A right side is orthogonalized along with the columns of A (modified Gram-Schmidt), so that the
+    error grows with the condition of A and not, as by Q^T B, with its square.
+
+    Args:
+        matrix: A, shape (n, n), regular where the expressions are evaluated.
+
+    Attributes:
+        pivot: The smallest sine of the angle between a column of A and the span of the columns
+            before it: 0 exactly where A is singular, 1 where it is orthogonal.
+    """
+
+    def __init__(self, matrix: ca.SX) -> None:
+        size = matrix.shape[0]
+        self._triangle = ca.SX(size, size)
+        self._directions: list[ca.SX] = []
+        self.pivot = ca.SX(1)
+        if size == 1:
+            # Exact, and without a square root.
+            self._directions, self._triangle = [ca.SX(1)], matrix
+            self.pivot = ca.fabs(ca.sign(matrix))
+            return
+        basis = [ca.densify(matrix[:, j]) for j in range(size)]
+        for i in range(size):
+            length, whole = ca.norm_2(basis[i]), ca.norm_2(matrix[:, i])
+            # A column of zeros makes 0 / 0, which fmin would pass over.
+            self.pivot = ca.fmin(self.pivot, ca.if_else(whole > 0, length / whole, 0))
+            direction = basis[i] / length
+            self._triangle[i, i] = length
+            for j in range(i + 1, size):
+                self._triangle[i, j] = ca.dot(direction, basis[j])
+                basis[j] -= self._triangle[i, j] * direction
+            self._directions.append(direction)
+
+    def solve(self, right: ca.SX) -> ca.SX:
+        """X of A X = B, shape (n, k); columns of B that are structurally zero stay so."""
+        result = ca.SX(*right.shape)
+        chosen = [j for j in range(right.shape[1]) if right[:, j].nnz()]
+        if not (chosen and self._directions):
+            return result
+        rest, coordinates = ca.densify(right[:, chosen]), []
+        for direction in self._directions:
+            coordinates.append(ca.mtimes(direction.T, rest))
+            rest -= ca.mtimes(direction, coordinates[-1])
+        result[:, chosen] = ca.solve(self._triangle, ca.vertcat(*coordinates))
+        return result
+
+
+class PositiveDefiniteFactorization:
+    """A symmetric positive definite matrix A = L D L^T, factored once for many right sides.
+
+    Args:
+        matrix: A, shape (n, n); its structural zeros are used.
+
+    Attributes:
+        pivot: A holds the products of some vectors; the smallest squared sine of the angle between
+            one of them and the span of those before it: 0 exactly where A is singular.
+    """
+
+    def __init__(self, matrix: ca.SX) -> None:
+        self._identity = ca.is_equal(matrix, ca.SX.eye(matrix.shape[0]))
+        self.pivot = ca.SX(1)
+        if self._identity:
+            return
+        self._diagonal, upper, _ = ca.ldl(matrix, False)
+        self._lower = upper.T + ca.SX.eye(matrix.shape[0])
+        for i in range(matrix.shape[0]):
+            square = self._diagonal[i] / matrix[i, i]
+            self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))
+
+    def solve(self, right: ca.SX) -> ca.SX:
+        """X of A X = B, shape (n, k); columns of B that are structurally zero stay so."""
+        return self.backward(self.forward(right))
+
+    def forward(self, right: ca.SX) -> ca.SX:
+        """Y = L^-1 B, shape (n, k)."""
+        return right if self._identity else _by_columns(self._lower, right)
+
+    def backward(self, half: ca.SX) -> ca.SX:
+        """X = L^-T D^-1 Y, shape (n, k)."""
+        return half if self._identity else _by_columns(self._lower.T, self.scaled(half))
+
+    def scaled(self, half: ca.SX) -> ca.SX:
+        """D^-1 Y, shape (n, k), so that the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
+        return half if self._identity else half / ca.repmat(self._diagonal, 1, half.shape[1])
+
+
+def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
+    """The solution with a triangular matrix, of the columns that are not structurally zero."""
+    result = ca.SX(*right.shape)
+    for j in range(right.shape[1]):
+        if right[:, j].nnz():
+            result[:, j] = ca.solve(triangle, right[:, j])
+    return ca.sparsify(result)

@@ -1,0 +1,105 @@
+"""Newton's method from a guess, damped, for equations that have to be solved now and then."""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray
+
+CONVERGED = 1e-8
+"""A Newton step of this size, relative to the state, that does not get smaller is round-off."""
+
+
+PRECISION = 1e-15
+"""The error, relative to the state, that a search leaves."""
+
+
+LENGTHS = tuple(0.5**k for k in range(10))
+"""The parts of a Newton step that are tried."""
+
+
+Linearization = tuple[Callable[[FloatArray], FloatArray], bool]
+"""x -> the Newton step from x by the matrix of another state; whether that matrix is regular."""
+
+
+@np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
+def newton(
+    start: FloatArray, linearize: Callable[[FloatArray], Linearization | None]
+) -> tuple[FloatArray, bool]:
+    """Damped Newton's method; a step must make the next one, by the same matrix, shorter.
+
+    That test does not depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
+    are measured relative to the start, or to 1 where that is larger.
+
+    Args:
+        start: The first iterate, shape (n,).
+        linearize: The linearization at an iterate, None if it is not finite, or has no steps.
+
+    Returns:
+        The last iterate, and whether it is a regular solution up to round-off.
+    """
+    x, unit = start, np.maximum(1.0, np.abs(start))
+    for _ in range(50):
+        linearization = linearize(x)
+        if linearization is None:
+            break
+        step_from, regular = linearization
+        step = step_from(x)
+        size = np.linalg.norm(step / unit)
+        for length in LENGTHS:
+            trial = x + length * step
+            following = step_from(trial)
+            left = np.linalg.norm(following / unit)
+            if left * left <= PRECISION * size:
+                # The step after that would be left / size times as long.
+                return trial + following, regular
+            if left <= (1.0 - 0.25 * length) * size:
+                break
+        else:
+            return x, regular and bool(size <= CONVERGED)
+        x = trial
+    return x, False
+
+
+def shortest_steps(
+    gradients: FloatArray, residual: Callable[[FloatArray], FloatArray]
+) -> Linearization | None:
+    """The shortest dx with C dx = -residual(x); regular if the rows of C are independent.
+
+    The rows are scaled to length one. Where they depend on each other, which may be where a search
+    starts, dx is that of least squares.
+
+    Args:
+        gradients: C, shape (k, n).
+        residual: x -> shape (k,).
+    """
+    if not np.all(np.isfinite(gradients)):
+        return None
+    length = np.linalg.norm(gradients, axis=1)
+    length[length == 0.0] = 1.0
+    rows = gradients / length[:, None]
+    q, r = scipy.linalg.qr(rows.T, mode="economic", check_finite=False)
+    if len(rows) > len(q) or np.min(np.abs(np.diag(r)), initial=1.0) <= DEPENDENT:
+        inverse = np.linalg.pinv(rows, DEPENDENT)
+        return lambda x: -inverse @ (residual(x) / length), False
+    solve = scipy.linalg.solve_triangular
+    return lambda x: -q @ solve(r, residual(x) / length, trans="T", check_finite=False), True
+
+
+ROUND_OFF = 1e-12
+"""A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
+
+
+DEPENDENT = 1e-9
+"""Gradients of length one whose smallest singular value is below this depend on each other."""
+
+
+def are_dependent(gradients: FloatArray) -> bool:
+    """Whether rows, whose lengths do not matter, are linearly dependent."""
+    if not np.all(np.isfinite(gradients)):
+        return True
+    length = np.linalg.norm(gradients, axis=1, keepdims=True)
+    if gradients.shape[0] > gradients.shape[1] or not np.all(length > 0.0):
+        return True
+    return bool(np.linalg.svd(gradients / length, compute_uv=False)[-1] < DEPENDENT)

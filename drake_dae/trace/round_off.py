@@ -1,0 +1,65 @@
+"""Products of numbers in which what is nothing but round-off is zero."""
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+
+ZERO = 1e-9
+"""A sum of products below this, relative to the sizes of its terms, is zero."""
+
+
+ROUND_OFF = 1e-12
+"""A factor below this, relative to the other factors in its row or column, is zero."""
+
+
+Sized = tuple[FloatArray, FloatArray]
+"""A matrix without its round-off, and how large its entries were before terms cancelled."""
+
+
+def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:
+    """A product in which entries that are nothing but round-off are zero.
+
+    Args:
+        left: Shape (a, k).
+        right: Shape (k, b).
+        scale: Units in which the columns of `left` and the rows of `right` compare, shape (k,).
+    """
+    value, size = right
+    row, column = np.abs(left) * scale, size / scale[:, None]
+    row_noise = ROUND_OFF * np.max(row, axis=1, keepdims=True, initial=0.0)
+    column_noise = ROUND_OFF * np.max(column, axis=0, keepdims=True, initial=0.0)
+    left = np.where(row > row_noise, left, 0.0)
+    kept = np.abs(value) / scale[:, None] > column_noise
+    value, size = np.where(kept, value, 0.0), np.where(column > column_noise, size, 0.0)
+    return without_round_off(left @ value, np.abs(left) @ size)
+
+
+def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
+    """A sum of products in which entries that are nothing but round-off are zero.
+
+    Args:
+        value: Shape (a, b).
+        size: The sums of the sizes of the terms, likewise.
+    """
+    return np.where(np.abs(value) > ZERO * size, value, 0.0), size
+
+
+def positive(sizes: FloatArray) -> FloatArray:
+    """Sizes to divide by: 1 in place of 0."""
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def smallest_singular_value(matrix: FloatArray) -> float:
+    """Of a matrix with no more rows than columns."""
+    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
+
+
+def equilibration(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Divisors of the rows and of the columns that bring all to about length one (Ruiz)."""
+    rows, columns = np.ones(matrix.shape[0]), np.ones(matrix.shape[1])
+    for _ in range(10):
+        scaled = matrix / rows[:, None] / columns
+        for divisor, axis in ((rows, 1), (columns, 0)):
+            length = np.linalg.norm(scaled, axis=axis)
+            divisor *= np.sqrt(np.where(length > 0.0, length, 1.0))
+    return rows, columns

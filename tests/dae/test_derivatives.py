@@ -1,0 +1,222 @@
+import casadi as ca
+import numpy as np
+import pytest
+from problems import PROBLEMS, Problem, changed
+
+from drake_dae.dae.derivatives import Motion
+from drake_dae.dae.signals import Parameter
+from drake_dae.dae.structure import find_structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.lie import lie_derivative
+
+
+@pytest.fixture(params=PROBLEMS)
+def problem(request) -> Problem:
+    return PROBLEMS[request.param]()
+
+
+def motion_of(system: DaeSystem) -> Motion:
+    chains = []
+    for i, degree in enumerate(find_structure(system).constraint_degrees):
+        chain = system.k[i]
+        for _ in range(degree - 1):
+            chain = lie_derivative(chain, system.explicit.f, system.state)
+        chains.append(chain)
+    return Motion(system, ca.vertcat(ca.SX(0, 1), *chains))
+
+
+def test_derivatives_are_those_along_the_constrained_motion(problem):
+    """Three orders of a function of the state, and of v, against Lie derivatives by hand's v."""
+    system = problem.system
+    motion = motion_of(system)
+    x, u = system.state, motion.control
+    structure = find_structure(system)
+    rate = structure.elimination.f_star + ca.mtimes(structure.elimination.h_star, u)
+    force = structure.elimination.alpha + ca.mtimes(structure.elimination.beta, u)
+
+    function = ca.sin(x[0]) + ca.sumsqr(x) * x[-1]
+    along, expected = ca.vertcat(function, motion.constraint_input), ca.vertcat(function, force)
+    found = [motion.expand(along)]
+    by_hand = [expected]
+    for _ in range(3):
+        along, expected = motion.derivative(along), lie_derivative(expected, rate, x)
+        found.append(motion.expand(along))
+        by_hand.append(expected)
+    values = TracedFunction(
+        "derivatives",
+        {"x": x, "u": u, "p": system.parameter_symbol},
+        {"found": ca.horzcat(*found), "by_hand": ca.horzcat(*by_hand)},
+    )
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        controls = random.standard_normal(system.num_controls)
+        one, two = values(problem.consistent(random), controls, system.parameter_values)
+        # Third derivatives, sums of a thousand terms up to 1e6 in size.
+        np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * np.abs(two).max())
+
+
+def test_the_rate_is_that_of_the_elimination(problem):
+    system = problem.system
+    motion, elimination = motion_of(system), find_structure(system).elimination
+    values = TracedFunction(
+        "rates",
+        {"x": system.state, "u": motion.control, "p": system.parameter_symbol},
+        {
+            "rate": motion.expand(motion.rate),
+            "by_hand": elimination.f_star + ca.mtimes(elimination.h_star, motion.control),
+            "matrix": motion.constraint_matrix,
+        },
+    )
+    random = np.random.default_rng(1)
+    state = problem.consistent(random)
+    controls = random.standard_normal(system.num_controls)
+    rate, by_hand, matrix = values(state, controls, system.parameter_values)
+    # A few operations on numbers up to 100.
+    np.testing.assert_allclose(rate, by_hand, rtol=1e-13, atol=1e-13)
+    expected = problem.known(state).constraint_matrix
+    np.testing.assert_allclose(matrix.reshape(expected.shape), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_structural_zeros_in_the_motion():
+    """A mass that nothing moves: its acceleration is structurally zero; E is not 1 in any row."""
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[1], 0, x[3], 0],
+        h=lambda x: [0, 0, 0, 1],
+        l=lambda x: x[2] + x[0],
+    )
+    system = changed(system, mass_matrix=np.diag([7.0, 2.0, 5.0, 3.0]))
+    structure = find_structure(system)
+    assert structure.output_degrees == (2,)
+    # 5 x2' = x3 and 3 x3' = u.
+    assert float(structure.control_matrix) == pytest.approx(1 / 15, rel=1e-15)
+
+
+def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
+    """The two-link arm as E x' = f + g v + h u with E = diag(1, 1, M), as a robot is given."""
+    inertia = ca.inv(arm.h[2:, :])
+    mass = ca.diagcat(ca.SX.eye(2), inertia)
+    return changed(
+        arm,
+        f=ca.mtimes(mass, arm.f),
+        g=ca.mtimes(mass, arm.g),
+        h=ca.vertcat(ca.SX(2, 2), ca.SX.eye(2)),
+        mass_matrix=mass,
+        **fields,
+    )
+
+
+def test_a_robot_with_a_mass_matrix():
+    problem = PROBLEMS["two_link_arm"]()
+    system = with_inertia(problem.system)
+    explicit = system.explicit
+    assert explicit.explicit is explicit
+    assert system.explicit is explicit
+    numbers = TracedFunction(
+        "fields",
+        {"x": system.state},
+        {
+            "found": ca.horzcat(explicit.f, explicit.g, explicit.h),
+            "by_hand": ca.horzcat(problem.system.f, problem.system.g, problem.system.h),
+        },
+    )
+    structure = find_structure(system)
+    law = TracedFunction(
+        "law", {"x": system.state}, {"a": structure.drift, "b": structure.control_matrix}
+    )
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        state = problem.consistent(random)
+        # The inertia matrix has a condition of 10, its inverse is taken twice.
+        np.testing.assert_allclose(*numbers(state), rtol=1e-12, atol=1e-12)
+        drift, control_matrix = law(state)
+        np.testing.assert_allclose(drift, problem.known(state).drift, rtol=1e-11)
+        np.testing.assert_allclose(
+            control_matrix, problem.known(state).control_matrix, rtol=1e-11, atol=1e-12
+        )
+
+
+def test_the_motion_may_be_given_in_fewer_operations():
+    arm = PROBLEMS["two_link_arm"]().system
+    plain = with_inertia(arm)
+    rate = ca.jtimes(arm.k, arm.state, arm.f)
+
+    def motion(x: ca.SX, v: ca.SX) -> tuple[ca.SX, ca.SX]:
+        reaction = ca.vertcat(ca.SX(2, 1), ca.jtimes(arm.k, arm.state, v, True)[:2])
+        residual = ca.mtimes(plain.mass_matrix, x) - plain.f - reaction
+        return residual, ca.jtimes(rate, arm.state, x)
+
+    state = np.array([1.0, -1.3, 0.2, 0.3])
+    values = [
+        TracedFunction(
+            "law",
+            {"x": system.state},
+            {"a": find_structure(system).drift, "b": find_structure(system).control_matrix},
+        )(state)
+        for system in (plain, with_inertia(arm, motion=motion))
+    ]
+    for one, two in zip(*values, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12)
+    wrongs = (
+        lambda x, v: (motion(x, 2 * v)[0], motion(x, v)[1]),
+        lambda x, v: (motion(x, v)[0], 2 * motion(x, v)[1]),
+        lambda x, v: (motion(x, v)[0], ca.SX(2, 1)),
+    )
+    for wrong in wrongs:
+        with pytest.raises(ModelError, match="'motion' is not"):
+            find_structure(with_inertia(arm, motion=wrong))
+
+
+def test_a_motion_of_small_states_is_taken():
+    """sqrt(y) near 1e-5: states drawn by 0.1 would be outside of its domain."""
+    y = ca.SX.sym("y", 3)
+    system = DaeSystem(
+        state=y,
+        f=-ca.sqrt(y),
+        g=[],
+        h=ca.SX.eye(3),
+        k=[],
+        l=y,
+        m=[],
+        mass_matrix=2 * ca.SX.eye(3),
+        nominal_state=[1e-5] * 3,
+        motion=lambda x, v: (2 * x + ca.sqrt(y), ca.SX(0, 1)),
+    )
+    assert find_structure(system).output_degrees == (1, 1, 1)
+
+
+def test_what_is_symmetric_at_the_default_parameters_alone_is_not_taken_as_symmetric():
+    """c = k' has the gradient g^T only for s = 1; the law and the motion hold for s = 2, too."""
+    x, scale = ca.SX.sym("x", 4), Parameter("s", 1.0)
+    place, speed = x[:2], x[2:]
+    system = DaeSystem(
+        state=x,
+        f=ca.vertcat(speed, 0, -9.81),
+        g=ca.vertcat(0, 0, 2 * scale.symbol * place[0], 2 * place[1]),
+        h=ca.vertcat(0, 0, 1, 0),
+        k=ca.dot(place, place) - 1,
+        l=place[0],
+        m=[0],
+        parameters=(scale,),
+        nominal_state=[0.6, -0.8, 0.0, 0.0],
+    )
+    structure = find_structure(system)
+    motion = structure.motion
+    function = TracedFunction(
+        "motion",
+        {"x": x, "u": motion.control, "s": scale.symbol},
+        {"rate": motion.expand(motion.rate)},
+    )
+    rng = np.random.default_rng(0)
+    for factor in (1.0, 2.0):
+        angle, rate, u = rng.normal(size=3)
+        place_now = np.array([np.sin(angle), -np.cos(angle)])
+        speed_now = rate * np.array([np.cos(angle), np.sin(angle)])
+        gradient = 2 * place_now
+        force = gradient * [factor, 1.0]
+        free = np.array([u, -9.81])
+        v = -(2 * speed_now @ speed_now + gradient @ free) / (gradient @ force)
+        found = function(np.concatenate([place_now, speed_now]), [u], [factor])[0]
+        np.testing.assert_allclose(found[2:], free + force * v, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,215 @@
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import PROBLEMS, Problem, double_integrator, pendulum
+
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.structure import find_structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.newton import are_dependent
+
+CONSTRAINED = [name for name, make in PROBLEMS.items() if make().constraint_degrees]
+
+
+@pytest.fixture(params=CONSTRAINED)
+def problem(request) -> Problem:
+    return PROBLEMS[request.param]()
+
+
+def manifold_of(k, n: int = 2, **parameters: float) -> Manifold:
+    """{x in R^n: k(x) = 0}."""
+    system = DaeSystem.from_functions(
+        n,
+        f=lambda x, *p: [0] * n,
+        h=lambda x, *p: np.eye(n)[:, :1],
+        g=lambda x, *p: np.zeros((n, ca.vertcat(*_list(k(x, *p))).numel())),
+        k=k,
+        l=lambda x, *p: x[0],
+        m=lambda x, *p: np.zeros((1, ca.vertcat(*_list(k(x, *p))).numel())),
+        parameters=parameters,
+        name="curve",
+    )
+    return Manifold(system, [[system.k[i]] for i in range(system.num_constraints)])
+
+
+def _list(value) -> list:
+    return list(value) if isinstance(value, (list, tuple)) else [value]
+
+
+def circle(**parameters: float) -> Manifold:
+    return manifold_of(lambda x, p: x[0] ** 2 + x[1] ** 2 - p.radius**2, **parameters)
+
+
+def test_residual_and_dimension_are_those_found_by_hand(problem):
+    manifold = find_structure(problem.system).manifold
+    assert manifold.dimension == problem.manifold_dimension
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        state = random.standard_normal(problem.system.num_states)
+        # A few operations on numbers of order 1.
+        np.testing.assert_allclose(
+            manifold.residual(state), problem.derivatives(state), rtol=1e-14, atol=1e-14
+        )
+        consistent = problem.consistent(random)
+        np.testing.assert_allclose(manifold.residual(consistent), 0.0, atol=1e-14)
+
+
+def test_projection_reaches_the_manifold_to_round_off(problem):
+    manifold = find_structure(problem.system).manifold
+    random = np.random.default_rng(1)
+    for size in (1e-9, 1e-6, 1e-3, 1e-1):
+        start = problem.consistent(random)
+        start = start + size * random.standard_normal(start.size)
+        state = manifold.project(start)
+        # Newton's method ends at the round-off of the residual, of numbers of order 1.
+        np.testing.assert_allclose(problem.derivatives(state), 0.0, atol=5e-15)
+        # The nearest state is at most as far as the one that the start was made from, up to the
+        # curvature of N*.
+        assert np.linalg.norm(state - start) < 3 * size * np.sqrt(start.size)
+
+
+def test_projection_leaves_consistent_states_alone(problem):
+    manifold = find_structure(problem.system).manifold
+    state = manifold.project(problem.consistent(np.random.default_rng(2)))
+    again = manifold.project(state)
+    np.testing.assert_allclose(again, state, rtol=0, atol=1e-15)
+
+
+def test_small_projections_are_orthogonal():
+    # To first order the nearest point: the change is along the gradient, so along the radius.
+    manifold = circle(radius=2.0)
+    point = np.array([1.2, 1.6])
+    for offset in (1e-3, -1e-3):
+        np.testing.assert_allclose(manifold.project((1 + offset) * point), point, atol=1e-15)
+
+
+def test_projection_converges_quadratically():
+    """10% off the circle: residuals 1e-1, 1e-2, 1e-5, 1e-10, 1e-20, so that five steps do."""
+    manifold = circle(radius=2.0)
+    state = manifold.project([2.2, 0.3], iterations=5)
+    assert np.hypot(*state) == pytest.approx(2.0, abs=1e-15)
+    with pytest.raises(InconsistentStateError, match="left after 2 Newton steps"):
+        manifold.project([2.2, 0.3], iterations=2)
+
+
+def test_projection_follows_the_parameters():
+    manifold = circle(radius=2.0)
+    assert np.hypot(*manifold.project([1.0, 1.0])) == pytest.approx(2.0, abs=1e-15)
+    assert np.hypot(*manifold.project([1.0, 1.0], [3.0])) == pytest.approx(3.0, abs=1e-15)
+    assert manifold.residual([1.0, 1.0], [3.0]) == pytest.approx([-7.0])
+
+
+def test_projection_takes_anything_like_a_state_and_changes_nothing():
+    manifold, start = circle(radius=2.0), np.array([1.5, 0.5])
+    expected = manifold.project(start)
+    np.testing.assert_array_equal(start, [1.5, 0.5])
+    for state in ([1.5, 0.5], (1.5, 0.5), start[:, None], start[None]):
+        np.testing.assert_array_equal(manifold.project(state), expected)
+    kept = expected.copy()
+    manifold.project([-1.0, 0.1])
+    np.testing.assert_array_equal(expected, kept)
+
+
+def test_wrong_sizes_are_refused():
+    manifold = circle(radius=2.0)
+    with pytest.raises(ModelError, match="'state' has size 3, not 2"):
+        manifold.project([1.0, 2.0, 3.0])
+    with pytest.raises(ModelError, match="'parameters' has size 2, not 1"):
+        manifold.project([1.0, 2.0], [1.0, 2.0])
+    with pytest.raises(ModelError, match="'state' has size 1"):
+        manifold.residual([1.0])
+
+
+def test_far_starts_are_damped():
+    # exp(x0) = 2: the full Newton step from -5 goes to 290, where exp is 1e126.
+    manifold = manifold_of(lambda x: ca.exp(x[0]) - 2)
+    assert manifold.project([-5.0, 1.0]) == pytest.approx([np.log(2), 1.0], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    "k",
+    [
+        lambda x: [x[0] - 1, x[0] - 1],
+        lambda x: [x[0] - 1, 3 * (x[0] - 1) * (1 + 1e-13 * x[1])],
+        lambda x: [ca.sin(x[0]) - 0.5, ca.sin(x[0]) ** 2 - 0.25],
+    ],
+)
+def test_redundant_constraints_still_have_a_projection(k):
+    """QR has no step where gradients depend on each other; least squares have."""
+    manifold = manifold_of(k)
+    state = manifold.project([0.3, 0.2])
+    np.testing.assert_allclose(manifold.residual(state), 0.0, atol=1e-14)
+
+
+def test_more_residual_than_floating_point_can_resolve_is_no_failure():
+    # In picometers: the residual of the nearest doubles is up to 1e12 * 1e-16.
+    manifold = manifold_of(lambda x: 1e12 * (x[0] ** 2 + x[1] ** 2 - 2.0))
+    for angle in np.linspace(0.1, 1.5, 12):
+        state = manifold.project([1.5 * np.cos(angle), 1.5 * np.sin(angle)])
+        assert np.hypot(*state) == pytest.approx(np.sqrt(2.0), abs=1e-15)
+
+
+def test_failures_say_what_is_left_and_why():
+    with pytest.raises(InconsistentStateError, match=r"y0 = 1 is left.* Start nearer") as caught:
+        manifold_of(lambda x: x[0] ** 2 + 1).project([0.3, 0.0])
+    assert caught.value.residual == pytest.approx([1.0], abs=0.01)
+    with pytest.raises(InconsistentStateError, match="constraints contradict each other"):
+        manifold_of(lambda x: [x[0] - 1, x[0] - 2]).project([0.0, 0.0])
+    with pytest.raises(InconsistentStateError, match="y0 is not finite at the given state"):
+        manifold_of(lambda x: ca.sqrt(x[0]) - 1).project([-1.0, 0.0])
+    with pytest.raises(InconsistentStateError, match="y0 is not finite at the given state"):
+        circle(radius=1.0).project([np.nan, 0.0])
+    # The gradient vanishes at the centre of the circle.
+    with pytest.raises(InconsistentStateError, match="y0 = -4 is left"):
+        circle(radius=2.0).project([0.0, 0.0])
+
+
+def test_residual_signals_name_constraints_and_derivatives():
+    signals = find_structure(pendulum().system).manifold.residual_signals
+    assert [(s.name, s.unit) for s in signals] == [("y0", ""), ("y0'", "1/s")]
+    mixed = find_structure(PROBLEMS["mixed_degrees"]().system).manifold.residual_signals
+    assert [s.name for s in mixed] == ["y0", "y1", "y1'"]
+
+
+def test_without_constraints_every_state_is_consistent():
+    problem = PROBLEMS["cart"]()
+    manifold = find_structure(problem.system).manifold
+    assert manifold.dimension == 2
+    assert manifold.residual([1.0, 2.0]).shape == (0,)
+    np.testing.assert_array_equal(manifold.project([1.0, 2.0]), [1.0, 2.0])
+
+
+def test_a_manifold_may_be_a_point():
+    manifold = manifold_of(lambda x: [x[0] - 1, x[1] * x[0] - 2])
+    assert manifold.dimension == 0
+    assert manifold.project([0.7, 1.5]) == pytest.approx([1.0, 2.0], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("gradients", "expected"),
+    [
+        ([[1, 0, 0], [0, 1, 0]], False),
+        ([[1, 1, 0], [2, 2, 0]], True),
+        ([[1, 1, 0], [1, 1, 1e-11]], True),
+        ([[1, 1, 0], [1, 1, 1e-6]], False),
+        # Lengths are units.
+        ([[1e-9, 0, 0], [0, 1e9, 0]], False),
+        ([[1, 0, 0], [0, 0, 0]], True),
+        ([[1, 0], [0, 1], [1, -1]], True),
+        ([[1, np.inf, 0], [0, 1, 0]], True),
+    ],
+)
+def test_dependent_gradients(gradients, expected):
+    assert are_dependent(np.array(gradients, dtype=float)) is expected
+
+
+def test_a_constraint_that_no_state_changes_is_never_met():
+    """Newton's step is zero there, which is not the same as being on N*."""
+    held = replace(double_integrator(), k=1, g=[0, 1], m=[0])
+    manifold = Manifold(held, [[held.k]])
+    assert not manifold.is_consistent([0.0, 0.0])
+    with pytest.raises(InconsistentStateError):
+        manifold.project([0.0, 0.0])

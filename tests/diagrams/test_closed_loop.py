@@ -1,0 +1,219 @@
+"""What the library claims of a robot in contact, against theory and MultibodyPlant."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from arms import (
+    arm,
+    consistent_states,
+    error_controlled,
+    fixed_step,
+    law,
+    numbers,
+    shipped,
+)
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from drake_dae import RobotPlant, constant, make_closed_loop, matrices, simulate, sinusoids
+
+ARMS = ["two_link", "seven_joint"]
+
+
+def run(loop, context, duration, config):
+    simulate(loop.diagram, context, duration, config)
+    return loop.record(context)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "position", "force", "residual"),
+    [("two_link_wall", 1e-12, 1e-11, 1e-12), ("seven_joint_wall", 1e-9, 1e-8, 1e-12)],
+)
+def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
+    """Both poles at -4: e(t) = (e(0) + (e'(0) + 4 e(0)) t) exp(-4 t).
+
+    RK5 at 1 ms leaves about 1e-15; the tolerances are those of the issue.
+    """
+    loop, context = shipped(scenario)
+    record = run(loop, context, 10.0, fixed_step())
+    assert record.time[-1] == 10.0
+    count = len(loop.plant.model.position_signals)
+    error = record["controlled_output"][:, :count] - record["desired_output"][:, :count]
+    # At rest the rate of the error is minus the reference's, which stands next to it.
+    rate = -record["reference"][0, 1 : 3 * count : 3]
+    t = record.time[:, None]
+    theory = (error[0] + (rate + 4.0 * error[0]) * t) * np.exp(-4.0 * t)
+    assert np.max(np.abs(error[0])) > 0.03
+    np.testing.assert_allclose(error, theory, rtol=0, atol=position)
+    pressed = record["constraint_force"][:, 0]
+    np.testing.assert_allclose(pressed, 20.0 + 5.0 * np.sin(2.0 * record.time), atol=force)
+    assert np.max(np.abs(record["constraint_residual"])) < residual
+
+
+def test_error_with_full_matrices_is_the_matrix_exponential():
+    """(60) with coupled outputs: (e, e')' = [[0, 1], [-Lambda_1, -Lambda_2]] (e, e')."""
+    random = np.random.default_rng(1)
+    roots = [0.3 * random.standard_normal((6, 6)) for _ in range(2)]
+    stiffness, damping = (
+        root @ root.T + np.diag(diagonal)
+        for root, diagonal in zip(roots, [np.full(6, 16.0), np.full(6, 8.0)], strict=True)
+    )
+    chosen = law("seven_joint", matrices([stiffness, damping]))
+    found = arm("seven_joint")
+    loop = make_closed_loop(
+        RobotPlant(found.model, found.structure),
+        chosen,
+        [
+            sinusoids(0.0, 0.1, 1.0),
+            sinusoids(0.6, 0.05, 2.0),
+            constant([0.0, 0.0, 0.0, 0.0]),
+            sinusoids(30.0, 10.0, 3.0),
+        ],
+    )
+    context = loop.diagram.CreateDefaultContext()
+    q = found.model.configuration(
+        [0.03, 0.58, 0.02, -0.03, 0.05, -0.1], found.model.dae.nominal_state[:7]
+    )
+    plant_context = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_consistent_state(plant_context, np.concatenate([q, np.zeros(7)]))
+    record = run(loop, context, 3.0, fixed_step())
+    error = record["tracking_error"]
+    rate = -record["reference"][0, 1:18:3]
+    companion = np.block([[np.zeros((6, 6)), np.eye(6)], [-stiffness, -damping]])
+    start = np.concatenate([error[0, :6], rate])
+    theory = [(scipy.linalg.expm(companion * t) @ start)[:6] for t in record.time[::100]]
+    # RK5 at 1 ms leaves about 1e-14, expm as much.
+    np.testing.assert_allclose(error[::100, :6], theory, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(loop.predicted_error(record)[::100, :6], theory, atol=1e-12)
+    assert np.max(np.abs(error[:, 6])) < 1e-10
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_dynamics_are_those_of_multibody_plant(name):
+    """The index-1 form [[M, -J'], [J, 0]] (v', lambda) = (B u - H, -Jdot v), solved densely."""
+    found, random = arm(name), np.random.default_rng(2)
+    plant = RobotPlant(found.model, found.structure)
+    context = plant.CreateDefaultContext()
+    for state in consistent_states(name, 20):
+        q, v = np.split(state, 2)
+        u = 20.0 * random.standard_normal(plant.dae.num_controls)
+        plant.set_state(context, state)
+        plant.GetInputPort("control").FixValue(context, u)
+        n = numbers(name, q, v)
+        j = n.constraint_jacobian
+        matrix = np.block([[n.mass, -j.T], [j, np.zeros((1, 1))]])
+        right = np.concatenate([u - n.bias, -n.constraint_acceleration])
+        solution = np.linalg.solve(matrix, right)
+        derivative = plant.EvalTimeDerivatives(context).CopyToVector()
+        # Condition numbers of about 1e3 on numbers of about 1e2.
+        np.testing.assert_allclose(derivative[: q.size], v, atol=0)
+        np.testing.assert_allclose(derivative[q.size :], solution[: q.size], rtol=1e-9, atol=1e-9)
+        force = plant.GetOutputPort("constraint_force").Eval(context)
+        np.testing.assert_allclose(force, solution[q.size :], rtol=1e-9, atol=1e-9)
+        z = plant.GetOutputPort("controlled_output").Eval(context)
+        np.testing.assert_allclose(z, [*n.outputs, *solution[q.size :]], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_law_is_the_explicit_law_59(name):
+    """(59) with Gbar = 0, from MultibodyPlant's M, H, J, P and Q = [J; P]^-1 [0; 1].
+
+    Qdot is a central difference along v with one Richardson step: error about 1e-12 relative.
+    """
+    chosen, random = law(name), np.random.default_rng(3)
+    count = len(arm(name).model.position_signals)
+    stiffness, damping = 16.0, 8.0
+
+    def q_matrix(q):
+        n = numbers(name, q, np.zeros_like(q))
+        return np.linalg.inv(np.vstack([n.constraint_jacobian, n.output_jacobian]))[:, 1:]
+
+    def difference(q, v, h):
+        return (q_matrix(q + h * v) - q_matrix(q - h * v)) / (2.0 * h)
+
+    for state in consistent_states(name, 20, seed=4):
+        q, v = np.split(state, 2)
+        n = numbers(name, q, v)
+        reference = random.standard_normal(3 * count + 1)
+        r, rate, acceleration = reference[:-1].reshape(count, 3).T
+        force = reference[-1]
+        q_rate = (4.0 * difference(q, v, 5e-4) - difference(q, v, 1e-3)) / 3.0
+        wanted = (
+            acceleration - stiffness * (n.outputs - r) - damping * (n.output_jacobian @ v - rate)
+        )
+        explicit = (
+            n.mass @ q_matrix(q) @ wanted
+            + n.bias
+            + n.mass @ q_rate @ n.output_jacobian @ v
+            - n.constraint_jacobian.T @ [force]
+        )
+        control = chosen.control(state, reference)
+        assert np.linalg.norm(control - explicit) < 1e-9 * np.linalg.norm(explicit)
+
+
+def test_residual_stays_at_zero_for_100_s_under_error_control():
+    """At accuracy 1e-6; without projection the same run drifts off."""
+    ends, largest = {}, {}
+    for project in (True, False):
+        found = arm("two_link")
+        plant = RobotPlant(found.model, found.structure, project=project)
+        chosen = law("two_link")
+        loop = make_closed_loop(
+            plant, chosen, [sinusoids(0.3, 0.3, 1.5), sinusoids(20.0, 5.0, 2.0)]
+        )
+        context = loop.diagram.CreateDefaultContext()
+        record = run(loop, context, 100.0, error_controlled(1e-6))
+        residual = np.abs(record["constraint_residual"])
+        ends[project] = residual[-1].max()
+        tenths = np.array_split(residual.max(axis=1), 10)
+        largest[project] = [part.max() for part in tenths]
+        assert record.time[-1] == 100.0
+    assert ends[True] < 1e-10
+    # Within a step, before its projection, the drift is that of one step at all times.
+    assert max(largest[True]) < 1e-5
+    assert max(largest[True]) < 5.0 * largest[True][0]
+    # Without it, it adds up.
+    assert largest[False][-1] > 3.0 * largest[False][0]
+    assert largest[False][-1] > 1e4 * ends[True]
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_free_constrained_motion_conserves_energy(name):
+    """u = 0, no damping: energy drifts by O(h^5), and the constraint force does no work."""
+    found = arm(name)
+    drift = {}
+    for step in (8e-3, 4e-3):
+        builder = DiagramBuilder()
+        plant = builder.AddSystem(RobotPlant(found.model, found.structure))
+        source = builder.AddSystem(ConstantVectorSource(np.zeros(plant.dae.num_controls)))
+        builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+        states = LogVectorOutput(plant.GetOutputPort("state"), builder)
+        forces = LogVectorOutput(plant.GetOutputPort("constraint_force"), builder)
+        rates = LogVectorOutput(plant.GetOutputPort("constraint_residual"), builder)
+        diagram = builder.Build()
+        simulator = Simulator(diagram)
+        ApplySimulatorConfig(fixed_step(step), simulator)
+        simulator.AdvanceTo(0.4)
+        log = states.FindLog(simulator.get_context())
+        energy = np.array([_energy(found.plant, x) for x in log.data().T])
+        drift[step] = np.max(np.abs(energy - energy[0]))
+        power = (
+            forces.FindLog(simulator.get_context()).data()
+            * rates.FindLog(simulator.get_context()).data()[1]
+        )
+        moved = np.max(np.abs(log.data()[:, -1] - log.data()[:, 0]))
+        assert moved > 0.1
+        # lambda times J v, where J v is the drift of one step.
+        assert np.max(np.abs(power)) < 1e-4 * step
+    # Halving the step divides an O(h^5) error by 32; 16 leaves room for higher orders.
+    assert drift[4e-3] < drift[8e-3] / 16.0 or drift[8e-3] < 1e-12
+    assert drift[4e-3] < 1e-6
+
+
+def _energy(plant, state):
+    context = plant.CreateDefaultContext()
+    plant.SetPositionsAndVelocities(context, state)
+    v = plant.GetVelocities(context)
+    # M with the rotors, which CalcKineticEnergy leaves out.
+    return 0.5 * v @ plant.CalcMassMatrix(context) @ v + plant.CalcPotentialEnergy(context)

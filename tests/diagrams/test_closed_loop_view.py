@@ -1,0 +1,395 @@
+"""The picture of a closed loop in Meshcat, live and recorded, against MultibodyPlant."""
+
+import socket
+from urllib.parse import urlparse
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm, fixed_step, law, parse
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RotationMatrix
+from pydrake.systems.analysis import Simulator
+from recordings import animation, objects, transforms, vertices
+
+from drake_dae import (
+    DaePlant,
+    DaeSystem,
+    ImplicitSurface,
+    PointOnSurface,
+    Record,
+    RobotPlant,
+    TrackingLaw,
+    build,
+    constant,
+    load_scenario,
+    make_animation,
+    make_closed_loop,
+    poles,
+    simulate,
+    start_meshcat,
+)
+from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.errors import ModelError
+from drake_dae.robots.contact import surfaces
+from drake_dae.simulation.record import Recorded
+from drake_dae.simulation.view import (
+    FRAME_RATE,
+    ContactForceVisualizer,
+    ContactPoints,
+    draw_surface,
+    frame_times,
+    scene_extent,
+)
+
+NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
+
+
+def recorded(name, *settings):
+    """A run of a scenario, and the page of its animation."""
+    scenario = load_scenario(find_scenario(name), settings)
+    loop, context = build(scenario, start_meshcat(), live=False)
+    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+    record = loop.record(context)
+    return loop, record, make_animation(loop, record, context)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def shown(request):
+    return recorded(request.param, "duration=1")
+
+
+def at(record, name, times):
+    """A recorded signal at other times, shape (k, size)."""
+    moments = record.time - record.time[0]
+    return np.array([np.interp(times, moments, column) for column in record[name].T]).T
+
+
+def rotation(quaternion):
+    """From (x, y, z, w), as three.js has it."""
+    x, y, z, w = quaternion
+    return RotationMatrix(Quaternion(np.array([w, x, y, z]))).matrix()
+
+
+def test_every_link_moves_as_the_plant_does(shown):
+    loop, record, page = shown
+    tracks = animation(page)
+    plant = parse(loop.plant.dae.name)
+    context = plant.CreateDefaultContext()
+    q = at(record, "state", np.arange(33) / 32)[:, : plant.num_positions()]
+    moving = 0
+    for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
+        body = joint.child_body()
+        path = f"/drake/visualizer/{loop.plant.dae.name}/{body.name()}"
+        if (path, "position") not in tracks:
+            continue  # It has no geometry.
+        position, turn = tracks[path, "position"], tracks[path, "quaternion"]
+        # 1 s at 32 frames a second.
+        for track in (position, turn):
+            np.testing.assert_array_equal(track.times, np.arange(33) / 32)
+        moving += np.ptp(turn.values, axis=0).max() > 0.01
+        for frame in (0, 7, 16, 32):
+            plant.SetPositions(context, q[frame])
+            pose = plant.EvalBodyPoseInWorld(context, body)
+            # The page holds single precision.
+            np.testing.assert_allclose(position.values[frame], pose.translation(), atol=1e-6)
+            np.testing.assert_allclose(
+                rotation(turn.values[frame]), pose.rotation().matrix(), atol=1e-6
+            )
+    assert moving >= 2
+
+
+def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
+    """For a plane and a sphere, where normal and force are known without the library."""
+    loop, record, page = shown
+    tracks = animation(page)
+    contact = loop.plant.model.constraints[0]
+    path = f"/contact/{contact.name}/force"
+    position, turn = tracks[path, "position"], tracks[path, "quaternion"]
+    scale = tracks[f"{path}/arrow", "scale"]
+    force = at(record, "constraint_force", position.times)[:, 0]
+    assert len(position.times) == len(turn.times) == len(scale.times) == 33
+    surface = contact.surface
+    for point, quaternion in zip(position.values, turn.values, strict=True):
+        if isinstance(surface, surfaces.Plane):
+            assert np.dot(point - surface.point, surface.normal) == pytest.approx(0.0, abs=1e-4)
+            normal = np.array(surface.normal)
+        else:
+            offset = point - surface.center
+            assert np.linalg.norm(offset) == pytest.approx(surface.radius, abs=1e-4)
+            normal = offset / np.linalg.norm(offset)
+        # Between steps of up to 0.1 s the joints go along a straight line.
+        np.testing.assert_allclose(rotation(quaternion)[:, 2], normal, atol=1e-3)
+    for values in scale.values.T:
+        np.testing.assert_allclose(values, force / np.max(force), rtol=1e-6)
+    # The longest arrow is a fifth of the scene, all of it on the far side of the contact.
+    things, places = objects(page), transforms(page)
+    shaft = things[f"{path}/arrow/shaft"]["geometries"][0]
+    head = things[f"{path}/arrow/head"]["geometries"][0]
+    nominal = loop.plant.structure.manifold.project(loop.plant.dae.nominal_state)
+    _, size = scene_extent(loop.plant.model, nominal[: nominal.size // 2])
+    assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
+    middle = places[f"{path}/arrow/shaft"][2, 3]
+    assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
+
+
+def test_the_tool_leads_the_arrow():
+    """The contact point is where MultibodyPlant has the tool's frame."""
+    _, record, page = recorded("seven_joint_wall", "duration=1")
+    position = animation(page)["/contact/wall/force", "position"]
+    plant = parse("seven_joint_arm")
+    context = plant.CreateDefaultContext()
+    frame = plant.GetFrameByName("tool")
+    for time, point in zip(position.times, position.values, strict=True):
+        plant.SetPositions(context, at(record, "state", time)[:7])
+        tip = plant.CalcPointsPositions(context, frame, np.zeros(3), plant.world_frame())[:, 0]
+        np.testing.assert_allclose(point, tip, atol=1e-6)
+    outputs = at(record, "controlled_output", position.times)
+    np.testing.assert_allclose(position.values[:, 1:], outputs[:, :2], atol=1e-3)
+
+
+def test_paths_of_the_contact_point(shown):
+    loop, record, page = shown
+    contact = loop.plant.model.constraints[0]
+    lines = objects(page)
+    times = np.arange(33) / 32
+    axes = ["xyz".index(axis) for axis in loop.plant.model.positions[0].axes]
+    for name, signal in (("actual", "controlled_output"), ("desired", "desired_output")):
+        path = vertices(lines[f"/paths/{contact.name}/{name}"])
+        assert path.shape == (33, 3)
+        wanted = at(record, signal, times)[:, : len(axes)]
+        # Where the joints, not the outputs, go along a straight line from step to step.
+        np.testing.assert_allclose(path[:, axes], wanted, atol=1e-3)
+
+
+def test_the_desired_path_ends_where_it_leaves_the_reach():
+    """The arm is 2 m long and the wall 1.2 m away: it reaches 1.6 m up. It is asked for more."""
+    loop, record, _ = recorded("two_link_wall", "duration=1")
+    record["desired_output"][:, 0] = 0.3 + 2.0 * record.time
+    context = loop.diagram.CreateDefaultContext()
+    lines = objects(make_animation(loop, record, context))
+    assert len(vertices(lines["/paths/wall/actual"])) == 33
+    path = vertices(lines["/paths/wall/desired"])
+    assert 1.5 < np.max(path[:, 2]) < 1.61
+    assert len(path) < 33
+
+
+def test_a_run_that_begins_later_is_shown_from_its_start():
+    _, record, page = recorded("two_link_wall", "duration=0.5", "integrator.start_time=-2")
+    tracks = animation(page)
+    scale = tracks["/contact/wall/force/arrow", "scale"]
+    np.testing.assert_array_equal(scale.times, np.arange(17) / 32)
+    force = at(record, "constraint_force", scale.times)[:, 0]
+    np.testing.assert_allclose(scale.values[:, 0], force / force.max(), rtol=1e-6)
+    assert record.time[0] == -2.0
+
+
+def test_a_parameter_moves_the_surface():
+    """The wall stands where the context of the run has it, not where the scenario put it."""
+    scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25", "start.errors={}"])
+    loop, context = build(scenario, start_meshcat(), live=False)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    state = loop.plant.state(own)
+    loop.plant.set_parameter(own, "wall.position", [1.1, 0.0, 0.0])
+    loop.plant.set_consistent_state(own, state)
+    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+    page = make_animation(loop, loop.record(context), context)
+    wall = objects(page)["/contact/wall/surface"]["geometries"][0]
+    thickness = min(wall[key] for key in ("width", "height", "depth"))
+    assert transforms(page)["/contact/wall/surface"][0, 3] == pytest.approx(1.1 + thickness / 2)
+    arrow = animation(page)["/contact/wall/force", "position"]
+    np.testing.assert_allclose(arrow.values[:, 0], 1.1, atol=1e-3)
+
+
+def test_a_parameter_turns_the_arrow():
+    """Of the normal of a dome that stands elsewhere."""
+    scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])
+    loop, context = build(scenario, start_meshcat(), live=False)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    state = loop.plant.state(own)
+    center = np.array([0.45, 0.02, 0.2])
+    loop.plant.set_parameter(own, "dome.position", center)
+    loop.plant.set_consistent_state(own, state)
+    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+    page = make_animation(loop, loop.record(context), context)
+    np.testing.assert_allclose(transforms(page)["/contact/dome/surface"][:3, 3], center)
+    position, turn = (
+        animation(page)["/contact/dome/force", name].values[0]
+        for name in ("position", "quaternion")
+    )
+    # The page holds single precision.
+    np.testing.assert_allclose(rotation(turn)[:, 2], (position - center) / 0.25, atol=1e-5)
+
+
+def test_one_moment_is_an_animation_too():
+    """What is left of a run that failed in its first step."""
+    loop, record, _ = recorded("two_link_wall", "duration=0.1")
+    start = Record(
+        record.time[:1], {n: Recorded(r.values[:1], r.signals) for n, r in record.signals.items()}
+    )
+    page = make_animation(loop, start, loop.diagram.CreateDefaultContext())
+    assert len(animation(page)["/contact/wall/force", "position"].times) == 1
+
+
+def test_an_animation_changes_nothing():
+    scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25"])
+    loop, context = build(scenario, start_meshcat(), live=False)
+    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+    record = loop.record(context)
+    state = context.get_continuous_state_vector().CopyToVector()
+    make_animation(loop, record, context)
+    np.testing.assert_array_equal(context.get_continuous_state_vector().CopyToVector(), state)
+    assert context.get_time() == 0.25
+    np.testing.assert_array_equal(loop.record(context).time, record.time)
+
+
+def test_frames():
+    np.testing.assert_array_equal(frame_times(0.0), [0.0])
+    np.testing.assert_array_equal(frame_times(1.0), np.arange(33) / 32)
+    # The end is shown, if need be a little late.
+    np.testing.assert_array_equal(frame_times(0.05), [0.0, 1 / 32, 2 / 32])
+    assert FRAME_RATE == 32.0  # A power of two: Meshcat finds the frame of a time exactly.
+
+
+# Live.
+
+
+def test_live_view_draws_while_it_runs():
+    meshcat = start_meshcat()
+    scenario = load_scenario(find_scenario("two_link_wall"))
+    loop, context = build(scenario, meshcat, live=True)
+    simulator = Simulator(loop.diagram, context)
+    simulator.AdvanceTo(0.5)
+    page = meshcat.StaticHtml()
+    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    points, normals = ContactPoints(loop.plant.model)(state)
+    arrow = transforms(page)["/contact/wall/force"]
+    np.testing.assert_allclose(arrow[:3, 3], points[0], atol=1e-9)
+    np.testing.assert_allclose(arrow[:3, 2], normals[0], atol=1e-9)
+    plant = parse("two_link_arm")
+    own = plant.CreateDefaultContext()
+    plant.SetPositions(own, state[:2])
+    pose = plant.EvalBodyPoseInWorld(own, plant.GetBodyByName("link2")).GetAsMatrix4()
+    link = transforms(page)["/drake/visualizer/two_link_arm/link2"]
+    np.testing.assert_allclose(link, pose, atol=1e-9)
+
+
+def test_without_live_view_the_steps_are_those_without_any():
+    """Drawing ends a step every 1/32 s; a recording must not change the run."""
+    times = []
+    for meshcat, live in ((None, True), (start_meshcat(), False), (start_meshcat(), True)):
+        scenario = load_scenario(find_scenario("two_link_wall"), ["duration=1"])
+        loop, context = build(scenario, meshcat, live)
+        simulate(loop.diagram, context, 1.0, scenario.integrator)
+        times.append(loop.record(context).time)
+    np.testing.assert_array_equal(times[0], times[1])
+    assert set(frame_times(1.0)) <= set(times[2])
+    assert not set(frame_times(1.0)) <= set(times[0])
+
+
+def test_only_this_machine_reaches_meshcat():
+    meshcat = start_meshcat()
+    url = urlparse(meshcat.web_url())
+    assert url.hostname == "localhost"
+    with socket.create_connection(("localhost", url.port), timeout=5):
+        pass
+    # On Linux all of 127.0.0.0/8 is this machine, so that a server on all interfaces would answer.
+    with pytest.raises(OSError, match=r"refused|timed out|assign|unreachable"):
+        socket.create_connection(("127.0.0.2", url.port), timeout=5)
+
+
+# Arrows and surfaces.
+
+
+def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
+    model = arm("two_link").model
+    meshcat = start_meshcat()
+    visualizer = ContactForceVisualizer(meshcat, model, None, length=0.3)
+    state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
+    seen = {}
+    for force in (0.0, 10.0, -20.0):
+        meshcat.StartRecording()
+        visualizer.draw(state, np.array([force]), 0.0)
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        tracks = animation(meshcat.StaticHtml())
+        direction = rotation(tracks["/contact/wall/force", "quaternion"].values[0])[:, 2]
+        seen[force] = direction[0], tracks["/contact/wall/force/arrow", "scale"].values[0, 0]
+    assert seen[0.0][1] == pytest.approx(1e-3)
+    # The wall's normal is -x; the largest force so far has the full length.
+    assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
+    assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
+    assert visualizer.largest_force == 20.0
+
+
+@pytest.mark.parametrize(
+    ("surface", "kind"),
+    [
+        (surfaces.Plane((0, 0, 0), (1, 2, 2)), "BoxGeometry"),
+        (surfaces.Sphere((0, 0, 0), 0.5), "SphereGeometry"),
+        (surfaces.Cylinder((0, 0, 0), (1, 2, 2), 0.5), "CylinderGeometry"),
+        (surfaces.Ellipsoid((0, 0, 0), (0.5, 0.6, 0.7)), "SphereGeometry"),
+    ],
+)
+def test_surfaces_stand_where_they_are(surface, kind):
+    meshcat = start_meshcat()
+    contact = PointOnSurface("tool", surface, name="it")
+    position, center = np.array([0.1, 0.2, 0.3]), np.array([0.7, -0.4, 0.9])
+    draw_surface(meshcat, contact, position, center, size=2.0)
+    page = meshcat.StaticHtml()
+    shape = objects(page)["/contact/it/surface"]["geometries"][0]
+    pose = transforms(page)["/contact/it/surface"]
+    assert shape["type"] == kind
+    turn, place = pose[:3, :3], pose[:3, 3]
+    axis = np.array([1.0, 2.0, 2.0]) / 3.0
+    if kind == "BoxGeometry":
+        # Its upper side is in the plane, below the center; no shape can be seen to stand higher.
+        np.testing.assert_allclose(turn[:, 2], axis, atol=1e-12)
+        foot = center - np.dot(center - position, axis) * axis
+        np.testing.assert_allclose(place + 0.01 * axis, foot, atol=1e-12)
+    elif kind == "CylinderGeometry":
+        np.testing.assert_allclose(turn[:, 2], axis, atol=1e-12)
+        foot = position + np.dot(center - position, axis) * axis
+        np.testing.assert_allclose(place, foot, atol=1e-12)
+        assert (shape["radiusTop"], shape["height"]) == (0.5, 2.0)
+    else:
+        np.testing.assert_allclose(place, position, atol=1e-12)
+
+
+def test_a_torus_is_drawn_on_its_surface():
+    meshcat = start_meshcat()
+    torus = surfaces.Torus((0, 0, 0), (1, 2, 2), 0.5, 0.2)
+    position = np.array([0.1, 0.2, 0.3])
+    draw_surface(meshcat, PointOnSurface("tool", torus, name="it"), position, position, 1.0)
+    points = vertices(objects(meshcat.StaticHtml())["/contact/it/surface"])
+    offset = ca.SX.sym("offset", 3)
+    distance = ca.Function("distance", [offset], [torus.distance(offset)]).map(len(points))
+    assert len(points) > 1000
+    np.testing.assert_allclose(distance((points - position).T), 0.0, atol=1e-6)
+
+
+def test_an_implicit_surface_is_left_out():
+    meshcat = start_meshcat()
+    bowl = ImplicitSurface(lambda p: p[2] - p[0] ** 2 - p[1] ** 2)
+    draw_surface(meshcat, PointOnSurface("tool", bowl, name="it"), np.zeros(3), np.zeros(3), 1.0)
+    assert "/contact/it/surface" not in objects(meshcat.StaticHtml())
+
+
+# Without a picture.
+
+
+def test_an_animation_needs_a_meshcat_and_a_robot():
+    robot = RobotPlant(arm("two_link").model, arm("two_link").structure)
+    references = [constant([0.3]), constant([20.0])]
+    loop = make_closed_loop(robot, law("two_link"), references)
+    context = loop.diagram.CreateDefaultContext()
+    simulate(loop.diagram, context, 0.01, fixed_step())
+    with pytest.raises(ModelError, match="made with a meshcat"):
+        make_animation(loop, loop.record(context), context)
+    system = DaeSystem.from_functions(1, f=lambda x: [0.0], h=lambda x: [1.0], l=lambda x: [x[0]])
+    plain = TrackingLaw(system, poles(-1.0))
+    loop = make_closed_loop(DaePlant(system), plain, [constant([1.0])], meshcat=start_meshcat())
+    context = loop.diagram.CreateDefaultContext()
+    simulate(loop.diagram, context, 0.01, fixed_step())
+    with pytest.raises(ModelError, match="RobotPlant"):
+        make_animation(loop, loop.record(context), context)

@@ -1,0 +1,549 @@
+"""Constraints against MultibodyPlant: what their Jacobians are, and what their multipliers do.
+
+Drake and the library compute the same numbers of order 1 to 100 by different recursions, so the
+tolerance of 1e-10 is round-off with room.
+"""
+
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.integrate
+from arms import fixed_step
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    JacobianWrtVariable,
+    MultibodyForces,
+    RevoluteJoint,
+    RpyFloatingJoint,
+    SpatialInertia,
+)
+from two_arms import APART, GRASP, NOMINAL, two_arms
+
+from drake_dae import (
+    CoincidentPoints,
+    JointPositions,
+    LinkExpressions,
+    MultibodyExpressions,
+    Plane,
+    PointOnSurface,
+    RobotModel,
+    RobotPlant,
+    Sphere,
+    TrackingLaw,
+    WeldedFrames,
+    constant,
+    find_structure,
+    make_closed_loop,
+    poles,
+    simulate,
+    sinusoids,
+)
+from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.trace.functions import TracedFunction
+
+VELOCITY = JacobianWrtVariable.kV
+PAIRS = [
+    ("object", "right::tool"),
+    ("right::link5", "left::link3"),
+    ("world", "left::tool"),
+    ("right::tool", "world"),
+    ("left::link2", "object"),
+]
+
+
+@cache
+def arms():
+    model = two_arms()
+    return model, find_structure(model.dae)
+
+
+def evaluate(constraint, links, q):
+    """phi and J = (dphi/dq) N at a configuration, shapes (m,) and (m, nv)."""
+    phi = constraint.residual(links)
+    symbols = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in constraint.parameters])
+    function = TracedFunction(
+        constraint.name,
+        {"q": links.q, "p": symbols},
+        {"phi": phi, "jacobian": ca.mtimes(ca.jacobian(phi, links.q), links.velocity_map)},
+    )
+    values = np.concatenate([np.zeros(0), *[p.value for p in constraint.parameters]])
+    residual, jacobian = function(q, values)
+    assert len(residual) == len(constraint.force_signals) == len(constraint.residual_signals)
+    return residual, jacobian.reshape(len(residual), -1)
+
+
+def configurations(count, seed=0):
+    """Random ones of the two arms, with Drake's context there."""
+    plant = arms()[0].links.plant
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        q = random.uniform(-2.0, 2.0, plant.num_positions())
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, q)
+        yield q, context, random
+
+
+def frames(*names):
+    """Of the two arms, by scoped name."""
+    plant = arms()[0].links.plant
+    for name in names:
+        *instance, own = name.split("::")
+        yield plant.GetFrameByName(own, *map(plant.GetModelInstanceByName, instance))
+
+
+def random_pose(random):
+    return RigidTransform(RollPitchYaw(random.uniform(-1, 1, 3)), random.uniform(-1, 1, 3))
+
+
+def push(context, forces, frame, point, force, moment=(0.0, 0.0, 0.0)):
+    """Adds a force at a point and a moment, all in the world, to the body of a frame."""
+    plant, body = frame.GetParentPlant(), frame.body()
+    lever = point - body.EvalPoseInWorld(context).translation()
+    body.AddInForce(context, lever, SpatialForce(moment, force), plant.world_frame(), forces)
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_weld_measures_a_pose_and_its_rate_the_relative_velocity(first, second):
+    """Anywhere, also far off the constraint: phi from Drake's angle and axis, and
+
+    r' = w + w x r / 2 + (w . r) r / 4.
+    """
+    links = arms()[0].links
+    a, b = frames(first, second)
+    for q, context, random in configurations(5):
+        pose = random_pose(random)
+        phi, jacobian = evaluate(WeldedFrames(first, second, pose), links, q)
+        found = links.plant.CalcRelativeTransform(context, a, b)
+        turn = (found.rotation() @ pose.rotation().inverse()).ToAngleAxis()
+        r = 2.0 * np.tan(turn.angle() / 2.0) * turn.axis()
+        scale = 1.0 + r @ r  # Where phi goes to infinity, its errors do.
+        np.testing.assert_allclose(phi[:3], found.translation() - pose.translation(), atol=1e-10)
+        np.testing.assert_allclose(phi[3:], r, atol=1e-10 * scale)
+        velocity = links.plant.CalcJacobianSpatialVelocity(context, VELOCITY, b, np.zeros(3), a, a)
+        turning = np.eye(3) - _cross(r) / 2.0 + np.outer(r, r) / 4.0
+        np.testing.assert_allclose(jacobian[:3], velocity[3:], atol=1e-10)
+        np.testing.assert_allclose(jacobian[3:], turning @ velocity[:3], atol=1e-10 * scale)
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_rate_of_a_weld_is_the_spatial_velocity(first, second):
+    """On the constraint J v is the velocity of B in A, in m/s and rad/s, without a factor."""
+    links = arms()[0].links
+    a, b = frames(first, second)
+    for q, context, _ in configurations(3, seed=1):
+        pose = links.plant.CalcRelativeTransform(context, a, b)
+        phi, jacobian = evaluate(WeldedFrames(first, second, pose), links, q)
+        velocity = links.plant.CalcJacobianSpatialVelocity(context, VELOCITY, b, np.zeros(3), a, a)
+        np.testing.assert_allclose(phi, 0.0, atol=1e-12)
+        np.testing.assert_allclose(jacobian, np.roll(velocity, 3, axis=0), atol=1e-10)
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_multipliers_of_a_weld_are_force_and_moment(first, second):
+    """J^T lambda: A exerts them on B at B's origin, and B the opposite on A at the same point."""
+    links = arms()[0].links
+    a, b = frames(first, second)
+    for q, context, random in configurations(3, seed=2):
+        pose = links.plant.CalcRelativeTransform(context, a, b)
+        _, jacobian = evaluate(WeldedFrames(first, second, pose), links, q)
+        multiplier = random.uniform(-50.0, 50.0, 6)
+        rotation = a.CalcPoseInWorld(context).rotation().matrix()
+        force, moment = rotation @ multiplier[:3], rotation @ multiplier[3:]
+        point = b.CalcPoseInWorld(context).translation()
+        forces = MultibodyForces(links.plant)
+        push(context, forces, b, point, force, moment)
+        push(context, forces, a, point, -force, -moment)
+        generalized = links.plant.CalcGeneralizedForces(context, forces)
+        np.testing.assert_allclose(jacobian.T @ multiplier, generalized, atol=1e-10)
+        # Virtual power, from the bodies' own velocities.
+        v = random.uniform(-1.0, 1.0, q.size)
+        links.plant.SetVelocities(context, v)
+        velocity = b.CalcSpatialVelocity(context, a, a)
+        power = multiplier[:3] @ velocity.translational() + multiplier[3:] @ velocity.rotational()
+        assert multiplier @ jacobian @ v == pytest.approx(power, abs=1e-10)
+
+
+@pytest.mark.parametrize("axes", ["xyz", "xz", "y", "zx"])
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_multipliers_of_coincident_points_are_a_force(first, second, axes):
+    links = arms()[0].links
+    a, b = frames(first, second)
+    chosen = ["xyz".index(axis) for axis in axes]
+    for q, context, random in configurations(2, seed=3):
+        on_b = random.uniform(-0.5, 0.5, 3)
+        point = b.CalcPoseInWorld(context) @ on_b
+        on_a = a.CalcPoseInWorld(context).inverse() @ point
+        pin = CoincidentPoints(first, tuple(on_a), second, tuple(on_b), axes)
+        phi, jacobian = evaluate(pin, links, q)
+        np.testing.assert_allclose(phi, 0.0, atol=1e-12)
+        multiplier, force = random.uniform(-50.0, 50.0, len(axes)), np.zeros(3)
+        force[chosen] = multiplier
+        forces = MultibodyForces(links.plant)
+        push(context, forces, b, point, force)
+        push(context, forces, a, point, -force)
+        generalized = links.plant.CalcGeneralizedForces(context, forces)
+        np.testing.assert_allclose(jacobian.T @ multiplier, generalized, atol=1e-10)
+        # Apart, phi is the gap from A to B along the world's axes.
+        gap = random.uniform(-0.5, 0.5, 3)
+        moved = a.CalcPoseInWorld(context).inverse() @ (point - gap)
+        apart = CoincidentPoints(first, tuple(moved), second, tuple(on_b), axes)
+        np.testing.assert_allclose(evaluate(apart, links, q)[0], gap[chosen], atol=1e-12)
+
+
+@pytest.mark.parametrize("curved", [False, True])
+def test_multiplier_of_a_point_on_a_surface_is_its_normal_force(curved):
+    links = arms()[0].links
+    (frame,) = frames("object")
+    for q, context, random in configurations(3, seed=4):
+        on_body = random.uniform(-0.5, 0.5, 3)
+        point = frame.CalcPoseInWorld(context) @ on_body
+        normal = random.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        ball = Sphere(tuple(point - 0.4 * normal), 0.4)
+        surface = ball if curved else Plane(tuple(point), tuple(normal))
+        contact = PointOnSurface("object", surface, tuple(on_body))
+        phi, jacobian = evaluate(contact, links, q)
+        np.testing.assert_allclose(phi, 0.0, atol=1e-12)
+        multiplier = random.uniform(-50.0, 50.0)
+        forces = MultibodyForces(links.plant)
+        push(context, forces, frame, point, multiplier * normal)
+        generalized = links.plant.CalcGeneralizedForces(context, forces)
+        np.testing.assert_allclose(jacobian[0] * multiplier, generalized, atol=1e-10)
+
+
+def rod(joint):
+    """A rod of 3 kg and 0.8 m along the x axis of its frame, whose origin is one end."""
+    plant = MultibodyPlant(0.0)
+    inertia = SpatialInertia.ThinRodWithMassAboutEnd(3.0, 0.8, [1.0, 0.0, 0.0])
+    body = plant.AddRigidBody("rod", inertia)
+    plant.AddFrame(FixedOffsetFrame("tip", body.body_frame(), RigidTransform([0.8, 0.0, 0.0])))
+    wall = RigidTransform(RollPitchYaw(0.3, -0.7, 1.1), [0.5, 0.2, 0.9])
+    plant.AddFrame(FixedOffsetFrame("wall", plant.world_frame(), wall))
+    plant.AddJoint(joint(plant.world_frame(), body.body_frame()))
+    return plant
+
+
+WEIGHT = 3.0 * 9.81
+
+
+def test_wall_holds_a_cantilever():
+    """Its weight, and the weight's moment about the welded tip, in the axes of the wall."""
+    plant = rod(lambda world, frame: RpyFloatingJoint("free", world, frame))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    random = np.random.default_rng(5)
+    q = random.uniform(-1.0, 1.0, 6)
+    plant.SetPositions(context, q)
+    wall, tip = plant.GetFrameByName("wall"), plant.GetFrameByName("tip")
+    pose = plant.CalcRelativeTransform(context, wall, tip)
+    links = MultibodyExpressions(plant)
+    _, jacobian = evaluate(WeldedFrames("wall", "tip", pose), links, q)
+    # At rest M v' + H = J^T lambda with v' = 0, and J is regular.
+    multiplier = np.linalg.solve(jacobian.T, -plant.CalcGravityGeneralizedForces(context))
+    X_WT, R_WA = tip.CalcPoseInWorld(context), wall.CalcPoseInWorld(context).rotation()
+    lever = X_WT.rotation() @ np.array([-0.4, 0.0, 0.0])  # To the rod's middle.
+    up = np.array([0.0, 0.0, WEIGHT])
+    np.testing.assert_allclose(R_WA @ multiplier[:3], up, atol=1e-10)
+    np.testing.assert_allclose(R_WA @ multiplier[3:], np.cross(lever, up), atol=1e-10)
+
+
+def test_support_carries_half_of_a_rod():
+    """A level rod on a hinge: at its other end, half its weight and what the motor presses."""
+    plant = rod(lambda world, frame: RevoluteJoint("hinge", world, frame, [0.0, 1.0, 0.0]))
+    plant.AddJointActuator("motor", plant.GetJointByName("hinge"))
+    plant.Finalize()
+    support = CoincidentPoints("world", (0.8, 0.0, 0.0), "rod", (0.8, 0.0, 0.0), "z", "support")
+    system = RobotPlant(RobotModel.from_multibody(plant, [support], []))
+    context = system.CreateDefaultContext()
+    for torque in (0.0, 7.0):
+        system.GetInputPort("control").FixValue(context, torque)
+        force = system.GetOutputPort("constraint_force").Eval(context)
+        # A positive torque about y turns the x axis down.
+        np.testing.assert_allclose(force, WEIGHT / 2.0 + torque / 0.8, rtol=1e-12)
+
+
+def test_moving_arms_obey_newton_and_euler():
+    """Inverse dynamics of MultibodyPlant with the multipliers as external forces gives u."""
+    model, structure = arms()
+    plant, system = model.links.plant, RobotPlant(model, structure)
+    a, b = frames("object", "right::tool")
+    context, context_here = plant.CreateDefaultContext(), system.CreateDefaultContext()
+    random = np.random.default_rng(6)
+    spread = np.repeat([0.2, 1.0], 14)
+    for _ in range(6):
+        guess = model.dae.nominal_state + spread * random.standard_normal(28)
+        q, v = np.split(system.set_consistent_state(context_here, guess), 2)
+        u = 50.0 * random.standard_normal(14)
+        system.GetInputPort("control").FixValue(context_here, u)
+        acceleration = system.EvalTimeDerivatives(context_here).CopyToVector()[14:]
+        multiplier = system.GetOutputPort("constraint_force").Eval(context_here)
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        rotation = a.CalcPoseInWorld(context).rotation().matrix()
+        force, moment = rotation @ multiplier[:3], rotation @ multiplier[3:]
+        point = b.CalcPoseInWorld(context).translation()
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)
+        push(context, forces, b, point, force, moment)
+        push(context, forces, a, point, -force, -moment)
+        needed = plant.CalcInverseDynamics(context, acceleration, forces)
+        # Forces of 1e2 to 1e3 N, and J M^-1 J^T of condition 1e2 to 1e3.
+        np.testing.assert_allclose(needed, u, atol=1e-9)
+        # And the tool stays where it is in the object.
+        still = np.zeros(3)
+        jacobian = plant.CalcJacobianSpatialVelocity(context, VELOCITY, b, still, a, a)
+        bias = plant.CalcBiasSpatialAcceleration(context, VELOCITY, b, still, a, a)
+        np.testing.assert_allclose(jacobian @ v, 0.0, atol=1e-10)
+        relative = jacobian @ acceleration + bias.get_coeffs()
+        np.testing.assert_allclose(relative, 0.0, atol=1e-9)
+
+
+def test_weld_has_no_other_root():
+    """The orientation error grows up to half a turn, where it is infinite."""
+    turns = [*np.linspace(0.0, 3.14, 50), np.pi]
+    sizes = [evaluate(WeldedFrames("world", "plate"), turntable(), [q])[0][5] for q in turns]
+    assert np.all(np.diff(sizes) >= np.diff(turns))
+    assert sizes[-1] == np.inf
+    model = arms()[0]
+    midway = [APART / 2, 0.0, 0.4, *np.zeros(5)]
+    # From a right hand that is turned by nearly half a turn, Newton's method turns it back.
+    for turn in (-3.0, -1.6, 1.6, 3.0):
+        guess = NOMINAL + turn * np.eye(14)[13]
+        np.testing.assert_allclose(model.configuration(midway, guess), NOMINAL, atol=1e-6)
+
+
+def turntable():
+    """One joint about z."""
+    q, v = ca.SX.sym("q"), ca.SX.sym("v")
+    c, s = ca.cos(q), ca.sin(q)
+    rotation = ca.SX(3, 3)
+    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1], rotation[2, 2] = c, -s, s, c, 1
+    pose = (rotation, ca.SX.zeros(3))
+    return LinkExpressions(
+        q, v, ca.SX(1), ca.SX(0), frames={"plate": pose, "point": ca.SX.zeros(3)}
+    )
+
+
+def test_names_units_and_parameters():
+    dae = arms()[0].dae
+    names = [f"grasp.{axis}" for axis in ("fx", "fy", "fz", "mx", "my", "mz")]
+    assert [s.name for s in dae.constraint_input_signals] == names
+    assert [s.unit for s in dae.constraint_input_signals] == ["N"] * 3 + ["N m"] * 3
+    names = [f"grasp.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")]
+    assert [s.name for s in dae.constraint_output_signals] == names
+    assert [s.unit for s in dae.constraint_output_signals] == ["m"] * 3 + ["rad"] * 3
+    np.testing.assert_array_equal(
+        dae.parameter_values[dae.parameter_slice("grasp.position")], GRASP.pose.translation()
+    )
+    pin = CoincidentPoints("a", (0, 0, 0), "b", (0, 0, 0), "xz", "pin")
+    assert [s.name for s in pin.force_signals] == ["pin.fx", "pin.fz"]
+    assert [s.unit for s in (*pin.force_signals, *pin.residual_signals)] == ["N", "N", "m", "m"]
+
+
+def test_the_pose_of_a_weld_is_a_copy():
+    pose = RigidTransform()
+    weld = WeldedFrames("world", "plate", pose)
+    pose.set_translation([1.0, 2.0, 3.0])
+    assert weld.pose.IsExactlyIdentity()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: CoincidentPoints("a", (0, 0, 0), "b", (0, 0, 0), "xx"), "distinct letters"),
+        (lambda: WeldedFrames("a", "b", RigidTransform([np.inf, 0, 0])), "weld.position"),
+        (lambda: WeldedFrames("world", "plat").residual(turntable()), "did you mean 'plate'"),
+        (lambda: WeldedFrames("world", "point").residual(turntable()), "give .rotation, p."),
+    ],
+)
+def test_refusals(make, message):
+    with pytest.raises(ModelError, match=message):
+        make()
+
+
+# A four-bar linkage in the x-z plane: crank, coupler and rocker, thin rods between two hinges in
+# the ground. The crank can turn all the way round (Grashof: 0.3 + 0.8 < 0.7 + 0.5).
+
+LENGTHS = {"crank": 0.3, "coupler": 0.7, "rocker": 0.5}
+GROUND = 0.8
+DENSITY = 2.0  # kg/m
+
+
+def four_bar(axes="xz"):
+    plant = MultibodyPlant(0.0)
+    for name, length in LENGTHS.items():
+        inertia = SpatialInertia.ThinRodWithMassAboutEnd(DENSITY * length, length, [1.0, 0.0, 0.0])
+        plant.AddRigidBody(name, inertia)
+    elbow = FixedOffsetFrame(
+        "elbow", plant.GetFrameByName("crank"), RigidTransform([LENGTHS["crank"], 0.0, 0.0])
+    )
+    base = FixedOffsetFrame("base", plant.world_frame(), RigidTransform([GROUND, 0.0, 0.0]))
+    hinges = {
+        "crank": plant.world_frame(),
+        "coupler": plant.AddFrame(elbow),
+        "rocker": plant.AddFrame(base),
+    }
+    for name, parent in hinges.items():
+        # About -y a positive angle turns x toward z.
+        joint = plant.AddJoint(
+            RevoluteJoint(name, parent, plant.GetFrameByName(name), [0.0, -1.0, 0.0])
+        )
+        plant.AddJointActuator(name, joint)
+    plant.Finalize()
+    ends = [(LENGTHS[name], 0.0, 0.0) for name in ("coupler", "rocker")]
+    pin = CoincidentPoints("coupler", ends[0], "rocker", ends[1], axes)
+    outputs = [JointPositions(["crank"])] if len(axes) == 2 else []
+    return RobotModel.from_multibody(plant, [pin], outputs, [1.0, -0.5, 1.6], "four-bar")
+
+
+def linkage(crank):
+    """Angles of coupler and rocker from the ground, and their ratios and its derivatives.
+
+    The loop L1 e(a) + L2 e(b) = D + L3 e(c), differentiated by hand: b' = k2 a', c' = k3 a'.
+    """
+    first, second, third = LENGTHS.values()
+    reach = np.array([GROUND - first * np.cos(crank), -first * np.sin(crank)])
+    distance = np.hypot(*reach)
+    # The law of cosines at the pin's end of the crank: coupler above the diagonal.
+    cosine = (second**2 + distance**2 - third**2) / (2.0 * second * distance)
+    b = np.arctan2(reach[1], reach[0]) + np.arccos(cosine)
+    tip = second * np.array([np.cos(b), np.sin(b)]) - reach
+    c = np.arctan2(tip[1], tip[0])
+    k2 = first * np.sin(crank - c) / (second * np.sin(c - b))
+    k3 = first * np.sin(crank - b) / (third * np.sin(c - b))
+    fall = np.cos(c - b) * (k3 - k2) / np.sin(c - b)
+    k2_rate = first * np.cos(crank - c) * (1.0 - k3) / (second * np.sin(c - b)) - k2 * fall
+    k3_rate = first * np.cos(crank - b) * (1.0 - k2) / (third * np.sin(c - b)) - k3 * fall
+    return b, c, k2, k3, k2_rate, k3_rate
+
+
+def reduced(crank):
+    """I, I' and V' of the one degree of freedom: T = I(a) a'^2 / 2, V(a)."""
+    first, second, third = LENGTHS.values()
+    b, c, k2, k3, k2_rate, k3_rate = linkage(crank)
+    own = [DENSITY * length**3 / 3.0 for length in (first, second, third)]
+    moved = DENSITY * second * first  # Mass of the coupler times the crank's length.
+    middle = second / 2.0
+    inertia = own[0] + moved * first + own[1] * k2**2 + own[2] * k3**2
+    inertia += 2.0 * moved * middle * np.cos(crank - b) * k2
+    slope = 2.0 * own[1] * k2 * k2_rate + 2.0 * own[2] * k3 * k3_rate
+    slope += 2.0 * moved * middle * np.cos(crank - b) * k2_rate
+    slope -= 2.0 * moved * middle * np.sin(crank - b) * (1.0 - k2) * k2
+    lift = (DENSITY * first**2 / 2.0 + moved) * np.cos(crank)
+    lift += DENSITY * second * middle * np.cos(b) * k2
+    lift += DENSITY * third**2 / 2.0 * np.cos(c) * k3
+    return inertia, slope, 9.81 * lift
+
+
+def test_four_bar_moves_as_its_one_degree_of_freedom():
+    """I a'' + I' a'^2 / 2 + V' = 0 over more than a turn of the crank, without torques.
+
+    The reference is good to 1e-12. RK5 at 1 ms leaves 1e-11 rad, 1e-10 rad/s and 1e-11 J, and
+    halving the step divides that by at least 20 of the 32 of an O(h^5) error.
+    """
+    model = four_bar()
+    structure = find_structure(model.dae)
+    assert structure.constraint_degrees == (2, 2)
+    assert structure.output_degrees == (2, 0, 0)
+    assert structure.index == 3
+    plant, links = RobotPlant(model, structure), model.links
+    angle, rate, duration = 1.0, 5.0, 1.5
+    b, c, k2, k3, _, _ = linkage(angle)
+    start = [angle, b - angle, c, rate, (k2 - 1.0) * rate, k3 * rate]
+
+    def fall(t, y):
+        inertia, slope, lift = reduced(y[0])
+        return [y[1], -(slope * y[1] ** 2 / 2.0 + lift) / inertia]
+
+    truth = scipy.integrate.solve_ivp(
+        fall, (0.0, duration), [angle, rate], method="DOP853", rtol=1e-13, atol=1e-13
+    ).y[:, -1]
+    assert truth[0] > angle + 2.0 * np.pi
+    energy = TracedFunction(
+        "energy",
+        {"q": links.q, "v": links.v, "p": model.dae.parameter_symbol},
+        {"energy": links.kinetic_energy + links.potential_energy},
+    )
+    errors = []
+    for step in (2e-3, 1e-3):
+        context = plant.CreateDefaultContext()
+        plant.GetInputPort("control").FixValue(context, np.zeros(3))
+        plant.set_state(context, start)
+        values = plant.parameters(context)
+        before = energy(start[:3], start[3:], values)[0]
+        simulate(plant, context, duration, fixed_step(step))
+        end = plant.state(context)
+        after = energy(end[:3], end[3:], values)[0]
+        b, c, k2, k3, _, _ = linkage(end[0])
+        np.testing.assert_allclose(end[1:3], [b - end[0], c], atol=1e-10)
+        np.testing.assert_allclose(end[4:], [(k2 - 1.0) * end[3], k3 * end[3]], atol=1e-8)
+        errors.append([*np.abs(end[[0, 3]] - truth), abs(after - before)[0]])
+    assert np.all(np.array(errors[1]) < [1e-10, 1e-9, 1e-10])
+    assert np.all(np.array(errors[1]) < np.array(errors[0]) / 16.0)
+
+
+def test_third_equation_of_a_plane_linkage_is_refused():
+    with pytest.raises(AssumptionError, match=r"pin\.y"):
+        find_structure(four_bar("xyz").dae)
+
+
+def test_two_arms_track_motion_and_squeeze():
+    """Both poles at -4: e(t) = (e(0) + (e'(0) + 4 e(0)) t) exp(-4 t), and lambda = r_2 at once.
+
+    RK5 at 4 ms leaves 1e-13 m and rad; forces of 40 N from torques of 90 N m have round-off of
+    1e-13 N. The tolerances leave a factor of ten and more.
+    """
+    model, structure = arms()
+    assert structure.constraint_degrees == (2,) * 6
+    assert structure.output_degrees == (2,) * 8 + (0,) * 6
+    assert structure.index == 3
+    assert structure.zero_dynamics_dimension == 0
+    # Far from singular: no output nearly repeats another.
+    assert structure.constraint_margin.relative > 0.3
+    assert structure.control_margin.relative > 0.3
+    law = TrackingLaw(model.dae, poles(-4.0), structure)
+    loop = make_closed_loop(
+        RobotPlant(model, structure),
+        law,
+        [
+            sinusoids(APART / 2, 0.05, 2.0),
+            sinusoids(0.0, 0.05, 3.0),
+            sinusoids(0.4, 0.04, 2.5),
+            constant([0.0, 0.0]),
+            sinusoids(0.0, 0.1, 2.0),
+            constant([0.0, 0.0]),
+            sinusoids(40.0, 15.0, 4.0),
+            constant([0.0, 0.0]),
+            sinusoids(0.0, 1.0, 3.0),
+            constant([0.0, 0.0]),
+        ],
+    )
+    context = loop.diagram.CreateDefaultContext()
+    away = [APART / 2 + 0.03, -0.04, 0.42, 0.05, -0.04, 0.03, 0.1, -0.15]
+    start = np.concatenate([model.configuration(away, NOMINAL), np.zeros(14)])
+    loop.plant.set_consistent_state(loop.plant.GetMyMutableContextFromRoot(context), start)
+    simulate(loop.diagram, context, 1.0, fixed_step(4e-3))
+    record = loop.record(context)
+    assert record.time[-1] == 1.0
+    error = record["tracking_error"][:, :8]
+    rate = -record["reference"][0, 1:24:3]
+    t = record.time[:, None]
+    theory = (error[0] + (rate + 4.0 * error[0]) * t) * np.exp(-4.0 * t)
+    assert np.min(np.abs(error[0])) > 0.015
+    np.testing.assert_allclose(error, theory, rtol=0, atol=1e-12)
+    wanted = np.zeros((record.time.size, 6))
+    wanted[:, 0] = 40.0 + 15.0 * np.sin(4.0 * record.time)
+    wanted[:, 3] = np.sin(3.0 * record.time)
+    np.testing.assert_allclose(record["constraint_force"], wanted, rtol=0, atol=1e-11)
+    assert np.max(np.abs(record["constraint_residual"])) < 1e-12
+    assert np.all(np.abs(record["control"]) < model.links.effort_limits)
+
+
+def _cross(vector):
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

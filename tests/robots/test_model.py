@@ -1,0 +1,218 @@
+"""RobotModel: textbook equations against MultibodyPlant, outputs, and what it refuses."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm, consistent_states, numbers, parse
+
+from drake_dae import (
+    AxisCoordinates,
+    ExpressionOutput,
+    JointPositions,
+    LinkExpressions,
+    Plane,
+    PointCoordinates,
+    PointOnSurface,
+    RobotModel,
+    Signal,
+    Sphere,
+    SurfaceCoordinates,
+    find_structure,
+)
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.functions import TracedFunction
+
+WALL = PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")
+
+
+def textbook_links(**changes):
+    """The shipped two-link arm by hand: rods of 1 m, 12 kg and 6 kg, in the x-z plane."""
+    q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
+    c, s, g = ca.cos(q[1]), ca.sin(q[1]), 9.81
+    c1, c12 = ca.cos(q[0]), ca.cos(q[0] + q[1])
+    mass = ca.vertcat(ca.horzcat(12 + 6 * c, 2 + 3 * c), ca.horzcat(2 + 3 * c, 2))
+    bias = ca.vertcat(
+        -3 * s * (2 * v[0] * v[1] + v[1] ** 2) + g * (12 * c1 + 3 * c12),
+        3 * s * v[0] ** 2 + 3 * g * c12,
+    )
+    tip = ca.vertcat(c1 + c12, 0, ca.sin(q[0]) + ca.sin(q[0] + q[1]))
+    given = {"q": q, "v": v, "mass_matrix": mass, "bias": bias, "frames": {"tool": tip}}
+    return LinkExpressions(**{**given, **changes})
+
+
+def textbook(outputs=None, constraints=(WALL,), **changes):
+    outputs = [PointCoordinates("tool", "z")] if outputs is None else outputs
+    return RobotModel(textbook_links(**changes), constraints, outputs, [1.2, -1.6])
+
+
+def test_textbook_arm_is_the_urdf_arm():
+    """f, g, h, k, l of (43)-(45) from two sources; round-off of about 30 operations each."""
+    ours, theirs = textbook().dae, arm("two_link").model.dae
+    for letter in "fghklm":
+        first, second = (
+            TracedFunction(
+                letter,
+                {"x": dae.state, "p": dae.parameter_symbol},
+                {letter: getattr(dae, letter)},
+            )
+            for dae in (ours, theirs)
+        )
+        for state in consistent_states("two_link", 10):
+            np.testing.assert_allclose(
+                first(state, ours.parameter_values)[0],
+                second(state, theirs.parameter_values)[0],
+                rtol=1e-11,
+                atol=1e-12,
+            )
+
+
+def test_structure_of_both_arms():
+    """Section 3.1: r = 2, mu = (2, ..., 2) and force outputs met at once, index 3, no xi."""
+    for name, count in (("two_link", 1), ("seven_joint", 6)):
+        found = arm(name).structure
+        assert found.constraint_degrees == (2,)
+        assert found.output_degrees == (2,) * count + (0,)
+        assert found.index == 3
+        assert found.zero_dynamics_dimension == 0
+        assert found.manifold.dimension == 2 * count
+
+
+def test_names_and_units():
+    dae = arm("seven_joint").model.dae
+    assert [s.name for s in dae.output_signals] == [
+        "tool.y",
+        "tool.z",
+        "tool.z_axis.y",
+        "tool.z_axis.z",
+        "joint3",
+        "joint7",
+        "wall.force",
+    ]
+    assert [s.unit for s in dae.output_signals] == ["m", "m", "", "", "rad", "rad", "N"]
+    assert arm("seven_joint").structure.manifold.residual_signals == (
+        Signal("wall.distance", "m"),
+        Signal("wall.distance'", "m/s"),
+    )
+
+
+def test_masses_and_surface_are_parameters():
+    names = [p.name for p in arm("two_link").model.dae.parameters]
+    assert "link1.mass" in names
+    assert "wall.position" in names
+
+
+def test_surface_coordinates_and_expressions():
+    """On a sphere around the shoulder the longitude about y is an angle of the tip."""
+    ball = PointOnSurface("tool", Sphere((0, 0, 0), 1.5, axis=(0, 1, 0)), name="ball")
+    angle = ExpressionOutput(
+        lambda links: ca.atan2(links.position("tool")[2], links.position("tool")[0]),
+        [Signal("angle", "rad")],
+    )
+    model = RobotModel(textbook_links(), [ball], [angle], [1.2, -1.6])
+    structure = find_structure(model.dae)
+    assert structure.output_degrees == (2, 0)
+    state = structure.states[1]
+    both = ca.vertcat(
+        SurfaceCoordinates(ball).expression(model.links), angle.expression(model.links)
+    )
+    longitude, latitude, direct = TracedFunction(
+        "angles", {"q": model.links.q, "p": model.dae.parameter_symbol}, {"angles": both}
+    )(state[:2], model.dae.parameter_values)[0]
+    assert latitude == pytest.approx(0.0, abs=1e-12)
+    # Longitude counts from another direction of the same plane, either way round.
+    slopes = TracedFunction(
+        "slopes",
+        {"q": model.links.q, "p": model.dae.parameter_symbol},
+        {"slopes": ca.jacobian(both, model.links.q)},
+    )(state[:2], model.dae.parameter_values)[0]
+    np.testing.assert_allclose(np.abs(slopes[0]), np.abs(slopes[2]), rtol=1e-10)
+    assert np.isfinite([longitude, direct]).all()
+    names = [s.name for s in SurfaceCoordinates(ball).signals(model.links)]
+    assert names == ["ball.longitude", "ball.latitude"]
+
+
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+def test_configuration_inverts_the_outputs(name):
+    """q = psi(z_1) of (58), checked by MultibodyPlant's own outputs."""
+    model = arm(name).model
+    for state in consistent_states(name, 5, seed=8):
+        q, v = np.split(state, 2)
+        wanted = numbers(name, q, v).outputs
+        nominal = model.dae.nominal_state[: q.size]
+        found = model.configuration(wanted, nominal)
+        np.testing.assert_allclose(numbers(name, found, v).outputs, wanted, atol=1e-10)
+
+
+def test_configuration_out_of_reach_is_refused():
+    with pytest.raises(InconsistentStateError, match=r"out\s+of reach"):
+        textbook().configuration([2.5], [1.2, -1.6])
+
+
+def test_underactuated_robot_takes_an_actuation_matrix():
+    """One motor at the shoulder, the tip on a wall: the one output is the force."""
+    model = textbook(outputs=[], actuation_matrix=np.array([[1.0], [0.0]]))
+    assert model.dae.num_controls == 1
+    structure = find_structure(model.dae)
+    assert structure.output_degrees == (0,)
+    # n - sum r = 2 states, none of them steered.
+    assert structure.zero_dynamics_dimension == 2
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: textbook(outputs=[]), "1 position outputs are needed; given are 0"),
+        (
+            lambda: textbook(outputs=[JointPositions(["q0", "q1"])]),
+            r"1 position outputs are needed; given are 2 \(q0, q1\)",
+        ),
+        (lambda: textbook(outputs=[PointCoordinates("tol", "z")]), "did you mean 'tool'"),
+        (lambda: textbook(outputs=[JointPositions(["q7"])]), "there are q0, q1"),
+        (lambda: textbook(outputs=[PointCoordinates("tool", "w")]), "letters of x, y, z"),
+        (lambda: textbook(outputs=[AxisCoordinates("tool", "q", "x")]), "letters of x, y, z"),
+        (lambda: textbook(outputs=[AxisCoordinates("tool", "z", "x")]), "give .rotation, p."),
+        (
+            lambda: textbook(mass_matrix=ca.DM([[1, 2], [2, 1]])),
+            "not positive definite",
+        ),
+        (lambda: textbook(mass_matrix=ca.DM([[2, 1], [0, 2]])), "not symmetric"),
+        (lambda: textbook(mass_matrix=ca.DM.eye(3)), "mass_matrix has shape"),
+        (lambda: textbook(actuation_matrix=np.eye(3)), "actuation_matrix has shape"),
+        (lambda: textbook(position_limits=([0.0], [1.0])), r"position_limits .* shape \(2,\)"),
+        (lambda: textbook(velocity_limits=([1, 1], [1, 2])), "velocity_limits .* the lower one"),
+        (lambda: textbook(constraints=[WALL, WALL], outputs=[]), "unique"),
+        (
+            lambda: textbook(outputs=[ExpressionOutput(lambda links: links.q, [Signal("a")])]),
+            "returned 2 components",
+        ),
+    ],
+)
+def test_refusals(make, message):
+    with pytest.raises(ModelError, match=message):
+        make()
+
+
+def test_two_constraints_with_one_name_are_refused():
+    other = PointOnSurface("tool", Plane((0, 0, 0.2), (0, 0, 1)), name="wall")
+    with pytest.raises(ModelError, match=r"wall\.position"):
+        RobotModel(textbook_links(), [WALL, other], [], [1.2, -1.6])
+
+
+def test_unknown_frame_of_a_plant_names_what_is_near():
+    with pytest.raises(ModelError, match="tool"):
+        RobotModel.from_multibody(
+            parse("two_link_arm"),
+            [PointOnSurface("tol", WALL.surface)],
+            [PointCoordinates("tool", "z")],
+        )
+
+
+def test_two_points_of_one_frame_need_names():
+    outputs = [PointCoordinates("tool", "y"), PointCoordinates("tool", "y", (0, 0, 0.1), "heel")]
+    signals = [s.name for output in outputs for s in output.signals(arm("two_link").model.links)]
+    assert signals == ["tool.y", "heel.y"]
+
+
+def test_shapes_of_a_configuration_are_checked():
+    with pytest.raises(ModelError, match=r"shapes \(2,\) and \(2,\), expected \(1,\)"):
+        textbook().configuration([0.1, 0.2], [1.2, -1.6])

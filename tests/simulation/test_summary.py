@@ -1,0 +1,130 @@
+"""The table of a run."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm
+
+from drake_dae import ExpressionOutput, Record, RobotModel
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.links.textbook import LinkExpressions
+from drake_dae.simulation.record import Recorded
+from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.simulation.summary import Limits, summary
+
+
+def record(**changes):
+    values = {
+        "state": ([[0.0, 1.0], [0.5, -2.0], [0.25, 3.0]], [("q", "rad"), ("q_w", "rad/s")]),
+        "tracking_error": (
+            [[0.05, 0.0], [-0.0625, 2e-14], [0.001, -1e-14]],
+            [("tool.z", "m"), ("axis.y", "")],
+        ),
+        "constraint_force": ([[20.0], [24.9996], [15.25]], [("wall.force", "N")]),
+        "constraint_residual": ([[0.0, 0.0], [3e-12, -4.44e-11], [0, 0]], [("y", "m"), ("y'", "")]),
+        "control": ([[1.0, -3.0], [2.5, 40.0], [-7.25, 5.0]], [("motor1", "N m"), ("motor2", "N")]),
+    } | changes
+    return Record(
+        np.array([0.0, 0.4, 1.0]),
+        {
+            name: Recorded(np.array(rows, dtype=float), tuple(Signal(*pair) for pair in signals))
+            for name, (rows, signals) in values.items()
+        },
+    )
+
+
+PREDICTED = np.array([[0.05, 0.0], [-0.0625, 0.0], [0.00125, 0.0]])
+
+
+def table(text, head):
+    """The rows below a head, as lists of words."""
+    lines = text.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith(head))
+    stop = next((i for i in range(start, len(lines)) if not lines[i]), len(lines))
+    return [line.split() for line in lines[start + 1 : stop]]
+
+
+def test_every_figure():
+    run = RunStatistics(simulated_time=1.0, wall_time=0.25, steps=123, interrupted=False)
+    text = summary(record(), PREDICTED, Limits(np.array([10.0, np.inf])), run)
+    assert table(text, "tracking error  unit") == [
+        ["tool.z", "m", "0.05", "0.0625", "0.001", "0.00025"],
+        ["axis.y", "1", "0", "2e-14", "-1e-14", "2e-14"],
+    ]
+    assert table(text, "constraint force  unit") == [["wall.force", "N", "15.25", "25"]]
+    assert table(text, "control") == [
+        ["motor1", "N", "m", "-7.25", "2.5", "10"],
+        ["motor2", "N", "-3", "40", "none"],
+    ]
+    assert "constraint residual  4.4e-11 at most" in text
+    assert "simulated            1 s in 123 steps, 0.25 s, 4.0 times real time" in text
+    assert "interrupted" not in text
+    assert "failed" not in text
+    assert "limits" not in text
+    assert all(line == line.rstrip() for line in text.splitlines())
+
+
+def test_columns_stand_below_their_heads():
+    lines = summary(record(), PREDICTED).splitlines()
+    head, first, second = lines[:3]
+    for title in ("start", "largest", "final", "off prediction by"):
+        end = head.index(title) + len(title)
+        for row in (first, second):
+            assert row[end - 1] != " "
+            assert row[end : end + 1] in ("", " ")
+
+
+def test_what_a_reader_must_not_miss():
+    pulling = ([[20.0], [-0.5], [15.25]], [("wall.force", "N")])
+    limits = Limits(np.array([7.0, 40.0]), (np.array([-1.0, -2.0]), np.array([0.4, 3.0])))
+    text = summary(record(constraint_force=pulling), PREDICTED, limits)
+    (force,) = table(text, "constraint force")
+    assert " ".join(force).endswith("pulls: a real contact would open")
+    first, second = table(text, "control")
+    assert " ".join(first).endswith("over its limit")
+    assert second[-1] == "40"
+    assert "joint limits         q goes from 0 to 0.5 rad, its limits are -1 and 0.4" in text
+    # On its limit is not beyond it.
+    assert "q_w" not in text
+
+
+def test_interrupted_and_failed():
+    run = RunStatistics(simulated_time=1.0, wall_time=0.5, steps=12, interrupted=True)
+    assert "interrupted          the record ends there" in summary(record(), PREDICTED, run=run)
+    text = summary(record(), PREDICTED, failure="singular there")
+    assert "failed               the record ends at 1 s: singular there" in text
+    assert "simulated" not in text
+
+
+def test_without_contact():
+    none = {
+        "constraint_force": (np.zeros((3, 0)), []),
+        "constraint_residual": (np.zeros((3, 0)), []),
+    }
+    text = summary(record(**none), PREDICTED)
+    assert "constraint force" not in text
+    assert "constraint residual  0 at most" in text
+
+
+def test_a_signal_that_is_missing_is_named():
+    run = record()
+    del run.signals["constraint_residual"]
+    with pytest.raises(ModelError, match="no signal 'constraint_residual'"):
+        summary(run, PREDICTED)
+
+
+def test_limits_of_a_robot():
+    limits = Limits.of(arm("two_link").model)
+    np.testing.assert_array_equal(limits.control, [300.0, 120.0])
+    np.testing.assert_array_equal(limits.state[0], [-3.1416, -2.7925, -3.0, -3.0])
+    np.testing.assert_array_equal(limits.state[1], [3.1416, 2.7925, 3.0, 3.0])
+
+
+def test_limits_of_a_textbook_robot():
+    q, v = ca.SX.sym("q"), ca.SX.sym("v")
+    links = LinkExpressions(q, v, ca.SX.eye(1), ca.SX(0), effort_limits=np.array([3.0]))
+    output = ExpressionOutput(lambda links: links.q, [Signal("q", "rad")])
+    limits = Limits.of(RobotModel(links, [], [output]))
+    np.testing.assert_array_equal(limits.control, [3.0])
+    assert limits.state is None

@@ -1,0 +1,473 @@
+"""Conversion to AutoDiffXd: gradients by finite differences and by hand, and Drake's own tools."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from actuated import actuated, slope, states
+from arms import arm, consistent_states, fixed_step, law, shipped
+from problems import PROBLEMS
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.planning import DirectCollocation
+from pydrake.solvers import IpoptSolver, SnoptSolver
+from pydrake.symbolic import Variable, cos, sin
+from pydrake.systems.analysis import (
+    ApplySimulatorConfig,
+    ResetIntegratorFromFlags,
+    Simulator,
+    Simulator_,
+)
+from pydrake.systems.framework import (
+    DiagramBuilder,
+    InputPortSelection,
+    OutputPortSelection,
+)
+from pydrake.systems.primitives import (
+    FirstOrderTaylorApproximation,
+    Linearize,
+    SymbolicVectorSystem,
+    TrajectorySource,
+)
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_dae import (
+    DaePlant,
+    DaeSystem,
+    ExpressionSignal,
+    ForceSensor,
+    ReferenceGenerator,
+    RobotPlant,
+    TrackingController,
+    TrackingLaw,
+    TrajectorySignal,
+    constant,
+    make_closed_loop,
+    point_to_point,
+    poles,
+    sinusoids,
+)
+from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError, SingularityError
+
+GRADIENT = 3e-9
+"""Of finite differences, relative to the largest entry: sixth order at steps of 1e-3, where the
+round-off is 1e-16 / 1e-3 of values up to some 1e3 times as large as their derivatives."""
+
+
+def plant_of(name):
+    """A plant with a state on N* and a control: a problem, or an arm with a kind of actuation."""
+    random = np.random.default_rng(1)
+    if name in PROBLEMS:
+        problem = PROBLEMS[name]()
+        plant, state = DaePlant(problem.system), problem.consistent(random)
+    elif " " in name:
+        robot, kind = name.split(maxsplit=1)
+        plant = RobotPlant(*actuated(robot, kind))
+        state = states(robot, kind, 1)[0]
+    else:
+        plant = RobotPlant(arm(name).model, arm(name).structure)
+        state = consistent_states(name, 1)[0]
+    return plant, state, random.standard_normal(plant.dae.num_controls)
+
+
+PLANTS = [*PROBLEMS, "two_link", "seven_joint", "two_link flexible motor", "two_link hydraulic"]
+
+
+def evaluate(system, inputs, state, parameters, numbers):
+    """Rate and all outputs of a system of either scalar type, below each other."""
+    context = system.CreateDefaultContext()
+    for name, value in inputs.items():
+        if value.size:
+            system.GetInputPort(name).FixValue(context, value)
+    if state.size:
+        context.SetContinuousState(state)
+    if parameters.size:
+        context.get_mutable_numeric_parameter(0).SetFromVector(parameters)
+    parts = [system.EvalTimeDerivatives(context).CopyToVector()] if state.size else []
+    parts += [
+        system.get_output_port(i).Eval(context)
+        for i in range(system.num_output_ports())
+        if system.get_output_port(i).size()
+    ]
+    return np.concatenate([numbers(part).reshape(-1) for part in parts])
+
+
+def check_gradient(system, inputs, state=(), parameters=()):
+    """Value and derivatives along three random directions in all arguments at once."""
+    random = np.random.default_rng(2)
+    names = list(inputs)
+    parts = [*map(np.asarray, inputs.values()), np.asarray(state), np.asarray(parameters)]
+    point = np.concatenate(parts).astype(float)
+    ends = np.cumsum([part.size for part in parts])[:-1]
+    # Parameters may be small, like an inertia: they move in proportion.
+    scale = np.concatenate([*(np.ones(part.size) for part in parts[:-1]), np.abs(parts[-1])])
+    directions = scale[:, None] * random.standard_normal((point.size, 3))
+
+    def value(at, target=system, numbers=np.asarray):
+        *given, x, p = np.split(at, ends)
+        return evaluate(target, dict(zip(names, given, strict=True)), x, p, numbers)
+
+    converted = system.ToAutoDiffXd()
+    moving = InitializeAutoDiff(point, directions).reshape(-1)
+    np.testing.assert_array_equal(value(moving, converted, ExtractValue), value(point))
+    found = ExtractGradient(value(moving, converted, lambda part: part))
+    # Along a direction as a function of one number: parameters are large or small.
+    expected = np.array(
+        [
+            slope(lambda s, d=d: value(point + s * d), np.zeros(1), np.ones(1), 1e-3)
+            for d in directions.T
+        ]
+    ).T
+    for row, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(row, wanted, rtol=0, atol=GRADIENT * (1 + np.abs(wanted).max()))
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_plants(name):
+    plant, state, control = plant_of(name)
+    check_gradient(plant, {"control": control}, state, plant.dae.parameter_values)
+
+
+@pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
+@pytest.mark.parametrize("name", PLANTS)
+def test_controllers(name):
+    plant, state, _ = plant_of(name)
+    system = TrackingController(TrackingLaw(plant.dae, poles(-3.0), plant.structure))
+    reference = np.random.default_rng(3).standard_normal(len(system.law.reference_signals))
+    inputs = {"estimated_state": state, "reference": reference}
+    check_gradient(system, inputs, parameters=system.law.parameter_values())
+
+
+def test_a_controller_with_measured_force():
+    found = arm("two_link")
+    feedback = TrackingLaw(
+        found.model.dae, poles(-3.0), found.structure, measured_force=True, force_gain=2.0
+    )
+    inputs = {
+        "estimated_state": consistent_states("two_link", 1)[0],
+        "reference": np.array([0.2, 0.1, -0.3, 17.0]),
+        "measured_force": np.array([12.0]),
+    }
+    check_gradient(TrackingController(feedback), inputs, parameters=feedback.parameter_values())
+
+
+def test_a_force_sensor():
+    sensor = ForceSensor(2, time_constant=0.05, bias=[1.0, -2.0], noise_deviation=0.3)
+    check_gradient(sensor, {"force": [3.0, 4.0], "noise": [0.1, 0.2]}, [1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: plant_of("two_link hydraulic")[0],
+        lambda: plant_of("pendulum_tension")[0],
+        lambda: TrackingController(law("seven_joint")),
+        lambda: ReferenceGenerator([constant([1.0, 2.0])], [2, 0]),
+        lambda: ForceSensor(1, time_constant=0.1, noise_deviation=1.0),
+    ],
+)
+def test_ports_parameters_and_feedthrough_are_kept(make):
+    system = make()
+    converted = system.ToAutoDiffXd()
+    assert converted.get_name() == system.get_name()
+    assert converted.num_input_ports() == system.num_input_ports()
+    assert converted.num_output_ports() == system.num_output_ports()
+    for i in range(system.num_output_ports()):
+        own, other = system.get_output_port(i), converted.get_output_port(i)
+        assert (own.get_name(), own.size()) == (other.get_name(), other.size())
+        for j in range(system.num_input_ports()):
+            assert system.HasDirectFeedthrough(j, i) == converted.HasDirectFeedthrough(j, i)
+    for j in range(system.num_input_ports()):
+        own, other = system.get_input_port(j), converted.get_input_port(j)
+        assert (own.get_name(), own.size()) == (other.get_name(), other.size())
+    context = converted.CreateDefaultContext()
+    context.SetTimeStateAndParametersFrom(system.CreateDefaultContext())
+    assert isinstance(context.get_time(), AutoDiffXd)
+
+
+@pytest.mark.parametrize("as_trajectory", [False, True])
+def test_references_move_with_the_time(as_trajectory):
+    """dR/dt is the table of the next higher derivatives: of t^4, 24 t follows 12 t^2."""
+    t = 0.7
+    quartic = ExpressionSignal(lambda t: t**4)
+    if as_trajectory:
+        line = PiecewisePolynomial.LagrangeInterpolatingPolynomial(
+            np.linspace(0, 1, 5), (np.linspace(0, 1, 5) ** 4)[None]
+        )
+        quartic = TrajectorySignal(line)
+    generator = ReferenceGenerator([quartic, sinusoids(0.0, 1.0, 2.0)], [2, 1])
+    converted = generator.ToAutoDiffXd()
+    context = converted.CreateDefaultContext()
+    context.SetTime(AutoDiffXd(t, [3.0]))
+    port = converted.GetOutputPort("reference").Eval(context)
+    s, c = np.sin(2 * t), np.cos(2 * t)
+    # The trajectory's coefficients are solved for, with some digits lost.
+    np.testing.assert_allclose(
+        ExtractValue(port)[:, 0], [t**4, 4 * t**3, 12 * t**2, s, 2 * c], rtol=1e-11
+    )
+    np.testing.assert_allclose(
+        ExtractGradient(port)[:, 0],
+        3.0 * np.array([4 * t**3, 12 * t**2, 24 * t, 2 * c, -4 * s]),
+        rtol=1e-11,
+    )
+
+
+def test_a_time_that_moves_needs_one_more_derivative():
+    generator = ReferenceGenerator([point_to_point(0.0, 1.0, 0.0, 1.0, order=2)], [2])
+    converted = generator.ToAutoDiffXd()
+    context = converted.CreateDefaultContext()
+    context.SetTime(0.5)
+    assert ExtractValue(converted.GetOutputPort("reference").Eval(context))[0] == 0.5
+    context.SetTime(AutoDiffXd(0.5, [1.0]))
+    with pytest.raises(ReferenceSignalError, match="order=3"):
+        converted.GetOutputPort("reference").Eval(context)
+
+
+def pendulum(**fields):
+    """A unit mass on a unit rod, pushed sideways, z = x."""
+    return DaeSystem.from_functions(
+        ["x", "y", "vx", "vy"],
+        f=lambda s, p: [s[2], s[3], 0.0, -p.gravity],
+        g=lambda s, p: [0.0, 0.0, 2 * s[0], 2 * s[1]],
+        h=lambda s, p: [0.0, 0.0, 1.0, 0.0],
+        k=lambda s, p: [s[0] ** 2 + s[1] ** 2 - 1.0],
+        l=lambda s, p: [s[0]],
+        m=lambda s, p: [[0.0]],
+        parameters={"gravity": 9.81},
+        nominal_state=[0.0, -1.0, 0.0, 0.0],
+        name="pendulum",
+        **fields,
+    )
+
+
+def test_linearize_a_hanging_pendulum():
+    """v = -(vx^2 + vy^2 + x u - g y) / (2 x^2 + 2 y^2): x'' = -g x + u, y'' = 0, z = x."""
+    plant = DaePlant(pendulum())
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [0.0])
+    linear = Linearize(
+        plant,
+        context,
+        plant.GetInputPort("control").get_index(),
+        plant.GetOutputPort("controlled_output").get_index(),
+    )
+    g = 9.81
+    matrix = [[0, 0, 1, 0], [0, 0, 0, 1], [-g, 0, 0, 0], [0, 0, 0, 0]]
+    # A handful of products, each exact to round-off of numbers up to 10.
+    np.testing.assert_allclose(linear.A(), matrix, atol=1e-14)
+    np.testing.assert_allclose(linear.B()[:, 0], [0, 0, 1, 0], atol=1e-14)
+    np.testing.assert_allclose(linear.C(), [[1, 0, 0, 0]], atol=1e-14)
+    np.testing.assert_allclose(linear.D(), [[0]], atol=1e-14)
+
+
+def assert_poles(loop, context, poles, zeros, tolerance):
+    """The eigenvalues of a loop at rest are given poles and a number of zeros.
+
+    They are compared as coefficients of the characteristic polynomial, each relative to the one
+    that poles of the same size but one sign have: a multiple eigenvalue is not well determined.
+    """
+    none = (InputPortSelection.kNoInput, OutputPortSelection.kNoOutput)
+    matrix = Linearize(loop.diagram, context, *none).A()  # Refuses what is no equilibrium.
+    found, wanted = np.poly(matrix), np.poly([*poles, *np.zeros(zeros)])
+    size = np.poly(-np.abs(poles))
+    size = np.append(size, np.full(zeros, size[-1]))
+    np.testing.assert_array_less(np.abs(found - wanted) / size, tolerance)
+
+
+def resting_loop(model, structure, gains, sensor=None, **force_feedback):
+    """A loop at rest at its reference, pressing with 20 N, and its context."""
+    plant = RobotPlant(model, structure)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, np.zeros(model.dae.num_controls))
+    q = model.configuration(None, model.dae.nominal_state[: model.links.q.numel()])
+    plant.set_state(context, model.rest_state(q, [20.0]))
+    outputs = plant.GetOutputPort("controlled_output").Eval(context)
+    loop = make_closed_loop(
+        plant,
+        TrackingLaw(model.dae, gains, structure, **force_feedback),
+        [constant(outputs[:-1]), constant(20.0)],
+        sensor=sensor,
+    )
+    whole = loop.diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(whole), plant.state(context))
+    if sensor is not None:
+        sensor.set_force(sensor.GetMyMutableContextFromRoot(whole), [20.0])
+    return loop, whole
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("two_link", None),
+        ("seven_joint", None),
+        ("two_link", "flexible"),
+        ("two_link", "flexible motor"),
+        ("seven_joint", "motor"),
+    ],
+)
+def test_closed_loops_have_the_assigned_poles(name, kind):
+    """mu_i poles for each output, and sum r_i zeros: k^(r) = 0 lets a drift off N* stay."""
+    found = actuated(name, kind) if kind else arm(name)
+    model, structure = found.model, found.structure
+    degrees = structure.output_degrees
+    assigned = {
+        signal.name: [-2.0 - 0.3 * i - j for j in range(degree)]
+        for i, (signal, degree) in enumerate(zip(model.dae.output_signals, degrees, strict=True))
+        if degree
+    }
+    loop, context = resting_loop(model, structure, poles(assigned))
+    # Round-off of A, whose largest entries belong to stiff joints and small inductances.
+    assert_poles(loop, context, np.concatenate([*assigned.values()]), 2, 2e-9)
+
+
+def test_a_closed_loop_keeps_its_zero_dynamics():
+    """With the rod force held at v, m y'' = v y - m g: an oscillation with w^2 = -v / m."""
+    problem = PROBLEMS["pendulum_tension"]()
+    mass, length, gravity, angle = 2.0, 0.8, 9.81, 0.6
+    force = -mass * gravity / (length * np.cos(angle))
+    design = TrackingLaw(problem.system, poles(-1.0))
+    loop = make_closed_loop(DaePlant(problem.system), design, [constant(force)])
+    context = loop.diagram.CreateDefaultContext()
+    context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
+    swing = 1j * np.sqrt(-force / mass)
+    assert_poles(loop, context, [swing, -swing], 2, 1e-12)
+
+
+def test_a_force_loop_has_the_pole_of_its_sensor():
+    """time_constant y' = v - y with v = r - G (y - r): the pole is -(1 + G) / time_constant."""
+    found = arm("two_link")
+    loop, context = resting_loop(
+        found.model,
+        found.structure,
+        poles([-3.0, -4.0]),
+        ForceSensor(1, time_constant=0.05),
+        measured_force=True,
+        force_gain=3.0,
+    )
+    assert_poles(loop, context, [-3.0, -4.0, -80.0], 2, 1e-11)
+
+
+def test_a_loop_from_a_scenario_converts():
+    """And stays converted: the rates are those of the diagram, to round-off."""
+    loop, context = shipped("seven_joint_wall")
+    converted = loop.diagram.ToAutoDiffXd()
+    moving = converted.CreateDefaultContext()
+    moving.SetTimeStateAndParametersFrom(context)
+    np.testing.assert_array_equal(
+        ExtractValue(converted.EvalTimeDerivatives(moving).CopyToVector())[:, 0],
+        loop.diagram.EvalTimeDerivatives(context).CopyToVector(),
+    )
+
+
+def test_sensitivity_of_a_simulation():
+    """How the pendulum's end depends on its start angle and on gravity, through 50 steps."""
+
+    def end(simulator_type, plant, angle, gravity):
+        simulator = simulator_type(plant)
+        step = type(angle)(0.01)
+        ResetIntegratorFromFlags(simulator, "runge_kutta3", step).set_fixed_step_mode(True)
+        context = simulator.get_mutable_context()
+        plant.GetInputPort("control").FixValue(context, [1.0])
+        start = [np.sin(angle), -np.cos(angle), 0.0 * angle, 0.0 * angle]
+        context.SetContinuousState(np.array(start))
+        context.get_mutable_numeric_parameter(0).SetFromVector([gravity])
+        simulator.AdvanceTo(0.5)
+        return context.get_continuous_state_vector().CopyToVector()
+
+    plant, point = DaePlant(pendulum(), project=False), np.array([0.4, 9.81])
+    moving = InitializeAutoDiff(point).reshape(-1)
+    found = ExtractGradient(end(Simulator_[AutoDiffXd], plant.ToAutoDiffXd(), *moving))
+    for column, direction in zip(found.T, np.eye(2), strict=True):
+        expected = slope(lambda at: end(Simulator, plant, *at), point, direction, 1e-3)
+        np.testing.assert_allclose(column, expected, rtol=0, atol=GRADIENT)
+
+
+def collocate(system, solver, start, end, fixed):
+    """Least int u^2 dt from rest to rest in 1 s; the end is fixed in some of the states."""
+    context = system.CreateDefaultContext()
+    problem = DirectCollocation(system, context, 21, 0.05, 0.05)
+    program = problem.prog()
+    program.AddBoundingBoxConstraint(start, start, problem.initial_state())
+    program.AddBoundingBoxConstraint(end[fixed], end[fixed], problem.final_state()[fixed])
+    problem.AddRunningCost(problem.input()[0] ** 2)
+    line = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack([start, end]))
+    problem.SetInitialTrajectory(PiecewisePolynomial(), line)
+    result = solver.Solve(program)
+    assert result.is_success()
+    return result.get_optimal_cost(), problem.ReconstructInputTrajectory(result)
+
+
+@pytest.mark.parametrize("solver", [SnoptSolver(), IpoptSolver()], ids=["SNOPT", "IPOPT"])
+def test_direct_collocation(solver):
+    """The pendulum swings by 0.5 rad; against phi'' = -g sin phi + u cos phi, and replayed."""
+    phi, rate, u = Variable("phi"), Variable("rate"), Variable("u")
+    polar = SymbolicVectorSystem(
+        state=[phi, rate], input=[u], dynamics=[rate, -9.81 * sin(phi) + u * cos(phi)], output=[phi]
+    )
+    plant, angle = DaePlant(pendulum()), 0.5
+    start = np.array([0.0, -1.0, 0.0, 0.0])
+    end = np.array([np.sin(angle), -np.cos(angle), 0.0, 0.0])
+    cost, control = collocate(plant, solver, start, end, [0, 2])
+    wanted, _ = collocate(polar, solver, np.zeros(2), np.array([angle, 0.0]), [0, 1])
+    # Cubics in other coordinates, 0.05 s long: they differ by some 0.05^4.
+    assert cost == pytest.approx(wanted, rel=1e-4)
+
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(TrajectorySource(control))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    simulator = Simulator(builder.Build())
+    ApplySimulatorConfig(fixed_step(), simulator)
+    simulator.get_mutable_context().SetContinuousState(start)
+    simulator.AdvanceTo(1.0)
+    replayed = plant.state(plant.GetMyContextFromRoot(simulator.get_context()))
+    np.testing.assert_allclose(replayed, end, atol=1e-4)
+
+
+def test_failures_name_time_and_state():
+    found = arm("two_link")
+    controller = TrackingController(law("two_link")).ToAutoDiffXd()
+    context = controller.CreateDefaultContext()
+    context.SetTime(1.5)
+    controller.GetInputPort("estimated_state").FixValue(context, np.zeros(4))
+    controller.GetInputPort("reference").FixValue(context, np.zeros(4))
+    with pytest.raises(SingularityError, match=r"singular at t = 1.5 s.*wall.force") as info:
+        controller.GetOutputPort("control").Eval(context)
+    np.testing.assert_array_equal(info.value.state, np.zeros(4))
+
+    plant = RobotPlant(found.model, found.structure).ToAutoDiffXd()
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [0.0, np.nan])
+    with pytest.raises(NonFiniteError, match="its input joint2_motor is not finite") as info:
+        plant.EvalTimeDerivatives(context)
+    assert info.value.state.shape == (4,)
+
+
+def test_a_function_without_derivative_is_named():
+    """x' = sqrt(x) + u is 0 at x = 0, where its derivative is infinite."""
+    system = DaeSystem.from_functions(
+        1,
+        f=lambda x: ca.sqrt(x),
+        h=lambda x: 1,
+        l=lambda x: x,
+        nominal_state=[1.0],
+        name="root",
+    )
+    plant = DaePlant(system)
+    context = plant.CreateDefaultContext()
+    context.SetContinuousState([0.0])
+    plant.GetInputPort("control").FixValue(context, [0.0])
+    assert plant.EvalTimeDerivatives(context).CopyToVector() == [0.0]
+    with pytest.raises(NonFiniteError, match=r"root dynamics, .* is not differentiable"):
+        FirstOrderTaylorApproximation(plant, context)
+
+
+def test_what_does_not_convert_says_why():
+    with pytest.raises(ModelError, match=r"it samples.*time_constant alone"):
+        ForceSensor(1, sample_period=0.01).ToAutoDiffXd()
+
+    class Watched(DaePlant):
+        def __init__(self, system):
+            super().__init__(system)
+            self.DeclareVectorOutputPort("energy", 1, lambda context, output: None)
+
+    with pytest.raises(ModelError, match=r"its output port 'energy'; add it to _formulas"):
+        Watched(pendulum()).ToAutoDiffXd()

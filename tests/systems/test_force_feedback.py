@@ -1,0 +1,303 @@
+"""Measured force: the sensor, the loop it closes, what it does to the errors of a wrong model."""
+
+import numpy as np
+import pytest
+from arms import arm, consistent_states, fixed_step, law, touching
+from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
+
+from drake_dae import (
+    DcMotors,
+    ElectrohydraulicServos,
+    FlexibleJoints,
+    ForceSensor,
+    ReferenceGenerator,
+    RobotPlant,
+    TrackingController,
+    TrackingLaw,
+    constant,
+    poles,
+    sinusoids,
+)
+from drake_dae.errors import GainError, ModelError
+
+MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
+SERVOS = ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
+MOVE = [sinusoids(0.3, 0.1, 1.5), sinusoids(20.0, 5.0, 2.0)]
+HOLD = [constant(0.3), constant(20.0)]
+
+
+def run(
+    model,
+    references,
+    *,
+    measured=False,
+    gain=0.0,
+    sensor=None,
+    duration=4.0,
+    wrong=1.1,
+    felt=0.0,
+):
+    """The two-link arm under a law whose model has another mass of link 2.
+
+    The sensor starts with the force reference and `felt` newtons more.
+
+    Returns the times, the errors z - r (k, 2), and the last plant state and reference.
+    """
+    chosen = TrackingLaw(model.dae, poles(-10.0), measured_force=measured, force_gain=gain)
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(RobotPlant(model, chosen.structure))
+    controller = builder.AddSystem(TrackingController(chosen))
+    reference = builder.AddSystem(ReferenceGenerator(references, chosen.degrees))
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
+    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    force = plant.GetOutputPort("constraint_force")
+    if sensor is not None:
+        builder.AddSystem(sensor)
+        builder.Connect(force, sensor.GetInputPort("force"))
+        force = sensor.GetOutputPort("measured_force")
+    if measured:
+        builder.Connect(force, controller.GetInputPort("measured_force"))
+    outputs = LogVectorOutput(plant.GetOutputPort("controlled_output"), builder, 0.01)
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    model_context = controller.GetMyMutableContextFromRoot(context)
+    mass = controller.get_parameter(model_context, "link2.mass")
+    controller.set_parameter(model_context, "link2.mass", wrong * mass)
+    r = reference.reference(0.0)
+    second = chosen.degrees[0] + 1
+    q = model.configuration([r[0]], [1.2, -1.6])
+    plant.set_consistent_state(
+        plant.GetMyMutableContextFromRoot(context), model.rest_state(q, [r[second]])
+    )
+    if sensor is not None:
+        sensor.set_force(sensor.GetMyMutableContextFromRoot(context), [r[second] + felt])
+    ApplySimulatorConfig(fixed_step(), simulator)
+    simulator.AdvanceTo(duration)
+    log = outputs.FindLog(context)
+    times = log.sample_times()
+    wanted = np.array([reference.reference(t)[[0, second]] for t in times])
+    state = plant.state(plant.GetMyContextFromRoot(context))
+    parameters = controller.parameters(model_context)
+    return times, log.data().T - wanted, chosen, state, parameters
+
+
+@pytest.mark.parametrize("gain", [1.0, 4.0])
+def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
+    """(61) with a wrong mass: within 5 %, of which the lag takes about 1 %; position untouched."""
+    model = arm("two_link").model
+    slow, sensor = [MOVE[0], sinusoids(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
+    times, without, *_ = run(model, slow)
+    _, feedback, *_ = run(model, slow, measured=True, gain=gain, sensor=sensor)
+    later = times > 1.0
+    largest = np.max(np.abs(without[later, 1]))
+    assert largest > 1.0
+    ratio = np.max(np.abs(feedback[later, 1])) / largest
+    assert ratio == pytest.approx(1.0 / (1.0 + gain), rel=0.05)
+    # J^T lambda does not move the tip along the wall.
+    np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("stage", [MOTORS, SERVOS], ids=["motors", "servos"])
+def test_measured_force_removes_the_static_error_behind_motors(stage):
+    """At rest I_a' = 0 and the model's lambda' is 0, so (81) leaves Lambda_4 (lambda - r_2) = 0."""
+    model = touching("two_link", [stage])
+    _, without, *_ = run(model, HOLD, duration=3.0)
+    _, feedback, *_ = run(model, HOLD, duration=3.0, measured=True)
+    assert abs(without[-1, 1]) > 1.0
+    # The slowest mode is the pole at -10: exp(-30) of a few newtons.
+    assert abs(feedback[-1, 1]) < 1e-6 * abs(without[-1, 1])
+    np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
+
+
+def test_measured_force_removes_the_misprediction_behind_springs():
+    """At rest (71) leaves Lambda_5 (lambda - r_2) = -lambda'' of the model, not 0.
+
+    With the model's lambda in its place it leaves (lambda - model's lambda) in addition. Both are
+    checked at the end, where lambda'' comes from the law's own structure.
+    """
+    model = touching("two_link", [FlexibleJoints(8000.0, inertia=1.0)])
+    for measured in (False, True):
+        _, error, chosen, state, parameters = run(model, HOLD, duration=4.0, measured=measured)
+        structure = chosen.structure
+        reference = np.zeros(8)
+        reference[0], reference[5] = 0.3, 20.0
+        force = error[-1, 1] + 20.0
+        given = {"measured_force": [force]} if measured else {}
+        u = chosen.control(state, reference, parameters, **given)
+        values = _evaluate(structure, state, parameters, u)
+        predicted, second_rate = values
+        stiffness = 100.0  # Lambda_5 of two poles at -10
+        left = -second_rate / stiffness
+        if not measured:
+            left += force - predicted
+        assert error[-1, 1] == pytest.approx(left, rel=1e-4)
+        assert abs(error[-1, 1]) > 1.0
+
+
+def _evaluate(structure, state, parameters, control):
+    """The model's lambda and lambda'' at a state under a control."""
+    from drake_dae.trace.functions import TracedFunction
+
+    dae = structure.system
+    function = TracedFunction(
+        "force",
+        {"x": dae.state, "p": dae.parameter_symbol},
+        {
+            "force": structure.output_chains[1][0],
+            "drift": structure.drift,
+            "matrix": structure.control_matrix,
+        },
+    )
+    force, drift, matrix = function(state, parameters)
+    return force[0], (drift + matrix @ control)[1]
+
+
+def test_with_a_right_model_measured_force_changes_nothing():
+    """lambda is the model's lambda then: the law is the same to round-off."""
+    for stages in ([MOTORS], [FlexibleJoints(8000.0, inertia=1.0)]):
+        model = touching("two_link", stages)
+        plain = TrackingLaw(model.dae, poles(-4.0))
+        fed = TrackingLaw(model.dae, poles(-4.0), plain.structure, measured_force=True)
+        plant = RobotPlant(model, plain.structure)
+        context = plant.CreateDefaultContext()
+        random = np.random.default_rng(5)
+        for state in plain.structure.states[:4]:
+            plant.set_state(context, state)
+            force = plant.GetOutputPort("constraint_force").Eval(context)
+            reference = random.standard_normal(len(plain.reference_signals))
+            np.testing.assert_allclose(
+                fed.control(state, reference, measured_force=force),
+                plain.control(state, reference),
+                rtol=1e-8,
+            )
+
+
+def test_law_59_with_measured_force():
+    """u of (59) less u without Gbar is J^T Gbar (lambda - r_2)."""
+    found, gain = arm("two_link"), 3.0
+    fed = TrackingLaw(
+        found.model.dae, poles(-4.0), found.structure, measured_force=True, force_gain=gain
+    )
+    for state in consistent_states("two_link", 5):
+        reference = np.array([0.1, 0.2, 0.3, 20.0])
+        difference = fed.control(state, reference, measured_force=[26.0]) - law("two_link").control(
+            state, reference
+        )
+        q = state[:2]
+        # phi = 1.2 - x of the tip.
+        jacobian = [np.sin(q[0]) + np.sin(q.sum()), np.sin(q.sum())]
+        np.testing.assert_allclose(difference, gain * 6.0 * np.array(jacobian), rtol=1e-9)
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.5])
+def test_a_sampled_loop_multiplies_the_error_by_minus_g(gain):
+    """One-sample delay: stable below 1, as `largest_stable_gain` says."""
+    sensor = ForceSensor(1, sample_period=0.02)
+    assert sensor.largest_stable_gain() == 1.0
+    model = arm("two_link").model
+    given = {"wrong": 1.0, "felt": 1.0, "duration": 0.2}
+    times, error, *_ = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
+    middle = np.isclose(times % 0.02, 0.01)
+    ratios = error[middle, 1][1:] / error[middle, 1][:-1]
+    np.testing.assert_allclose(ratios, -gain, rtol=1e-6)
+
+
+def test_the_lagged_loop_decays_at_1_plus_g_over_tau():
+    """tau y' = lambda - y with lambda - r = -G (y - r): y - r decays at (1 + G) / tau."""
+    gain, tau = 3.0, 0.2
+    model = arm("two_link").model
+    given = {"wrong": 1.0, "felt": 2.0, "duration": 0.3}
+    sensor = ForceSensor(1, tau)
+    times, error, *_ = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
+    # RK5 at 1 ms, (1 + G) / tau = 20 1/s: about 1e-12.
+    expected = -gain * 2.0 * np.exp(-(1 + gain) / tau * times)
+    np.testing.assert_allclose(error[:, 1], expected, atol=1e-9)
+
+
+def sensed(sensor, source, duration, generator=None):
+    builder = DiagramBuilder()
+    builder.AddSystem(source)
+    builder.AddSystem(sensor)
+    builder.Connect(source.get_output_port(0), sensor.GetInputPort("force"))
+    noise = None
+    if sensor.HasInputPort("noise"):
+        size = sensor.GetInputPort("noise").size()
+        noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, size, 0.01))
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    log = LogVectorOutput(sensor.GetOutputPort("measured_force"), builder, 0.01)
+    simulator = Simulator(builder.Build())
+    if generator is not None:
+        noise.SetRandomContext(
+            noise.GetMyMutableContextFromRoot(simulator.get_mutable_context()), generator
+        )
+    ApplySimulatorConfig(fixed_step(), simulator)
+    simulator.AdvanceTo(duration)
+    found = log.FindLog(simulator.get_context())
+    return found.sample_times(), found.data()
+
+
+def test_lag_and_bias():
+    """A step of 8 N: 8 (1 - exp(-t / tau)) + bias, to the integrator's 1e-12."""
+    times, values = sensed(
+        ForceSensor(1, time_constant=0.1, bias=0.5), ConstantVectorSource([8.0]), 0.5
+    )
+    np.testing.assert_allclose(values[0], 8.0 * (1 - np.exp(-times / 0.1)) + 0.5, atol=1e-10)
+
+
+def test_sampling_holds():
+    times, values = sensed(ForceSensor(1, sample_period=0.1), Sine(1.0, 3.0, 0.0, 1), 1.0)
+    # Between its samples, at the middle of each period, it shows the last one.
+    middle = np.isclose(times % 0.1, 0.05)
+    np.testing.assert_allclose(values[0, middle], np.sin(3.0 * (times[middle] - 0.05)), atol=1e-9)
+
+
+def test_noise_has_its_deviation_and_its_seed():
+    sensor = lambda: ForceSensor(2, 0.01, noise_deviation=[0.5, 2.0])  # noqa: E731
+    still = ConstantVectorSource([0.0, 0.0])
+    _, first = sensed(sensor(), still, 20.0, RandomGenerator(3))
+    _, again = sensed(sensor(), ConstantVectorSource([0.0, 0.0]), 20.0, RandomGenerator(3))
+    _, other = sensed(sensor(), ConstantVectorSource([0.0, 0.0]), 20.0, RandomGenerator(4))
+    np.testing.assert_array_equal(first, again)
+    assert np.max(np.abs(first - other)) > 0.1
+    # 2000 samples: the deviation is known to 2 % (one sigma 1.6 %).
+    np.testing.assert_allclose(np.std(first, axis=1), [0.5, 2.0], rtol=0.06)
+
+
+def test_sensor_has_no_direct_feedthrough_from_force():
+    for sensor in (ForceSensor(1, 0.01), ForceSensor(1, 0.0, 0.01), ForceSensor(1, 0.01, 0.01)):
+        assert not sensor.HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: ForceSensor(1), ModelError, "without state it would\nclose|algebraic loop"),
+        (lambda: ForceSensor(1, -0.1), ModelError, "not negative"),
+        (
+            lambda: TrackingLaw(
+                arm("two_link").model.dae, poles(-4.0), measured_force=True, force_gain=-0.5
+            ),
+            GainError,
+            "positive semidefinite",
+        ),
+        (
+            lambda: TrackingLaw(arm("two_link").model.dae, poles(-4.0), force_gain=1.0),
+            GainError,
+            "needs measured_force=True",
+        ),
+        (
+            lambda: TrackingLaw(
+                arm("two_link").model.dae, poles(-4.0), measured_force=True, force_gain=np.eye(2)
+            ),
+            GainError,
+            r"shape \(1, 1\)",
+        ),
+    ],
+)
+def test_refusals(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

@@ -1,0 +1,231 @@
+"""DaePlant and RobotPlant as Drake systems: ports, feedthrough, start, projection, failure."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm, consistent_states, error_controlled, fixed_step
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_dae import DaePlant, DaeSystem, RobotPlant
+from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SingularityError
+
+
+def pendulum():
+    """A unit mass on a unit rod in Cartesian coordinates, pushed sideways; z = x, index 3."""
+    return DaeSystem.from_functions(
+        ["x", "y", "vx", "vy"],
+        f=lambda s, p: [s[2], s[3], 0.0, -p.gravity],
+        g=lambda s, p: [0.0, 0.0, 2 * s[0], 2 * s[1]],
+        h=lambda s, p: [0.0, 0.0, 1.0, 0.0],
+        k=lambda s, p: [s[0] ** 2 + s[1] ** 2 - 1.0],
+        l=lambda s, p: [s[0]],
+        m=lambda s, p: [[0.0]],
+        parameters={"gravity": 9.81},
+        nominal_state=[0.6, -0.8, 0.0, 0.0],
+        name="pendulum",
+    )
+
+
+def two_link(project=True):
+    return RobotPlant(arm("two_link").model, arm("two_link").structure, project)
+
+
+def driven(plant, control):
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource(np.atleast_1d(control)))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    simulator = Simulator(builder.Build())
+    return simulator, plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+
+
+def test_ports():
+    plant = two_link()
+    sizes = {
+        "state": 4,
+        "constraint_force": 1,
+        "constraint_residual": 2,
+        "controlled_output": 2,
+        "link_state": 4,
+    }
+    assert plant.num_output_ports() == len(sizes)
+    for name, size in sizes.items():
+        assert plant.GetOutputPort(name).size() == size
+    assert plant.num_input_ports() == 1
+    assert plant.GetInputPort("control").size() == 2
+
+
+def test_direct_feedthrough_is_exact():
+    """With rigid joints the force feeds through; z = x of the pendulum does not."""
+    for plant, through in (
+        (two_link(), {"constraint_force", "controlled_output"}),
+        (DaePlant(pendulum()), {"constraint_force"}),
+    ):
+        control = plant.GetInputPort("control").get_index()
+        found = {
+            plant.get_output_port(i).get_name()
+            for i in range(plant.num_output_ports())
+            if plant.HasDirectFeedthrough(control, i)
+        }
+        assert found == through
+
+
+def test_outputs_without_feedthrough_need_no_control():
+    plant = two_link()
+    context = plant.CreateDefaultContext()
+    assert np.max(np.abs(plant.GetOutputPort("constraint_residual").Eval(context))) < 1e-14
+    np.testing.assert_array_equal(
+        plant.GetOutputPort("state").Eval(context), plant.GetOutputPort("link_state").Eval(context)
+    )
+
+
+def test_outputs_follow_state_control_and_parameters():
+    """The declared prerequisites are complete: no cached value is stale."""
+    plant = two_link()
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [0.0, 0.0])
+    seen = [plant.GetOutputPort("constraint_force").Eval(context)[0]]
+    plant.GetInputPort("control").FixValue(context, [5.0, 0.0])
+    seen.append(plant.GetOutputPort("constraint_force").Eval(context)[0])
+    plant.set_state(context, consistent_states("two_link", 1)[0])
+    seen.append(plant.GetOutputPort("constraint_force").Eval(context)[0])
+    plant.set_parameter(context, "link1.mass", 13.0)
+    seen.append(plant.GetOutputPort("constraint_force").Eval(context)[0])
+    assert len(set(seen)) == 4
+    residual = plant.GetOutputPort("constraint_residual").Eval(context).copy()
+    plant.set_parameter(context, "wall.position", [1.25, 0, 0])
+    moved = plant.GetOutputPort("constraint_residual").Eval(context) - residual
+    np.testing.assert_allclose(moved, [0.05, 0.0], atol=1e-15)
+    np.testing.assert_array_equal(plant.get_parameter(context, "wall.position"), [1.25, 0, 0])
+    with pytest.raises(ModelError, match="no parameter 'wal'; it has"):
+        plant.set_parameter(context, "wal", 0.0)
+
+
+def test_pendulum_swings_as_in_polar_coordinates():
+    """phi'' = -g sin phi by an independent integrator; both to about 1e-9."""
+    from scipy.integrate import solve_ivp
+
+    simulator, context = driven(DaePlant(pendulum()), 0.0)
+    plant = simulator.get_system().GetSubsystemByName("pendulum")
+    ApplySimulatorConfig(error_controlled(1e-11), simulator)
+    simulator.AdvanceTo(2.0)
+    angle = np.arctan2(0.6, 0.8)
+    polar = solve_ivp(
+        lambda t, s: [s[1], -9.81 * np.sin(s[0])], (0, 2), [angle, 0], rtol=1e-12, atol=1e-12
+    ).y[:, -1]
+    theory = [
+        np.sin(polar[0]),
+        -np.cos(polar[0]),
+        polar[1] * np.cos(polar[0]),
+        polar[1] * np.sin(polar[0]),
+    ]
+    np.testing.assert_allclose(plant.state(context), theory, atol=1e-8)
+    # The rod's force: 2 v = -(g cos phi + phi'^2).
+    force = plant.GetOutputPort("constraint_force").Eval(context)[0]
+    assert 2 * force == pytest.approx(-(9.81 * np.cos(polar[0]) + polar[1] ** 2), abs=1e-7)
+
+
+def test_a_start_off_the_constraint_is_refused_with_its_residual():
+    plant = two_link()
+    simulator, context = driven(plant, [0.0, 0.0])
+    plant.set_state(context, plant.state(context) + np.array([0.01, 0.0, 0.0, 0.0]))
+    with pytest.raises(InconsistentStateError, match=r"wall\.distance = .* m.*set_cons"):
+        simulator.Initialize()
+
+
+def test_set_consistent_state_mends_a_guess():
+    plant = two_link()
+    simulator, context = driven(plant, [0.0, 0.0])
+    guess = plant.state(context) + np.array([0.05, -0.03, 0.2, 0.1])
+    state = plant.set_consistent_state(context, guess)
+    assert np.max(np.abs(plant.GetOutputPort("constraint_residual").Eval(context))) < 1e-14
+    assert 0 < np.linalg.norm(state - guess) < 0.3
+    simulator.Initialize()
+    plant.set_parameter(context, "wall.position", [5.0, 0, 0])
+    with pytest.raises(InconsistentStateError, match="no consistent state found"):
+        plant.set_consistent_state(context, guess)
+
+
+def test_projection_is_due_at_the_start_of_the_next_step():
+    """AdvancePendingEvents does it for the last state; without it the drift shows."""
+    plant = two_link()
+    simulator, context = driven(plant, [40.0, 20.0])
+    ApplySimulatorConfig(fixed_step(0.05), simulator)
+    simulator.AdvanceTo(0.3)
+    port = plant.GetOutputPort("constraint_residual")
+    before = np.max(np.abs(port.Eval(context)))
+    simulator.AdvancePendingEvents()
+    assert np.max(np.abs(port.Eval(context))) < 1e-13 < before
+
+
+def test_projection_does_not_change_the_reported_force():
+    """The force at a consistent state is that of the dynamics, to round-off."""
+    first, second = two_link(), two_link(project=False)
+    values = []
+    for plant in (first, second):
+        simulator, context = driven(plant, [40.0, 20.0])
+        ApplySimulatorConfig(fixed_step(1e-3), simulator)
+        simulator.AdvanceTo(0.2)
+        simulator.AdvancePendingEvents()
+        values.append(plant.GetOutputPort("constraint_force").Eval(context)[0])
+    assert values[0] == pytest.approx(values[1], rel=1e-10)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_control_that_is_not_finite_raises_instead_of_looping(bad):
+    simulator, _ = driven(two_link(), [0.0, bad])
+    ApplySimulatorConfig(error_controlled(1e-6), simulator)
+    reason = r"t = 0 s: its input joint2_motor is not finite"
+    with pytest.raises(NonFiniteError, match=reason) as info:
+        simulator.AdvanceTo(1.0)
+    assert info.value.time == 0.0
+    assert info.value.state.shape == (4,)
+
+
+def test_a_singular_constraint_matrix_raises_with_time_and_state():
+    """A bead with k = x2 - x1^2 / 2, forced along x1 alone: A = -x1 vanishes at x1 = 0."""
+    system = DaeSystem.from_functions(
+        ["x1", "x2"],
+        f=lambda x: [-1.0, x[0]],
+        g=lambda x: [1.0, 0.0],
+        h=lambda x: [0.0, 1.0],
+        k=lambda x: [x[1] - x[0] ** 2 / 2],
+        l=lambda x: [0.0],
+        m=lambda x: [[1.0]],
+        nominal_state=[1.0, 0.5],
+    )
+    plant = DaePlant(system)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [0.0])
+    plant.set_state(context, [0.0, 0.0])
+    with pytest.raises((SingularityError, NonFiniteError), match=r"A\(x\)"):
+        plant.EvalTimeDerivatives(context)
+
+
+def test_system_without_constraints():
+    """m = 0 is an ordinary system; nothing to project, empty ports."""
+    system = DaeSystem.from_functions(
+        2, f=lambda x: [x[1], -ca.sin(x[0])], h=lambda x: [0, 1], l=lambda x: [x[0]]
+    )
+    plant = DaePlant(system)
+    assert plant.GetOutputPort("constraint_force").size() == 0
+    simulator, context = driven(plant, [1.0])
+    simulator.AdvanceTo(0.1)
+    # x'' = 1 - sin x from rest: 0.1^2 / 2 up to 0.1^5.
+    assert plant.state(context)[0] == pytest.approx(0.005, abs=1e-5)
+
+
+def test_parameters_that_make_no_sense_are_refused():
+    plant = two_link()
+    context = plant.CreateDefaultContext()
+    for value, message in ((-5.0, "must be positive"), (np.nan, "finite"), ([1, 2], "1 entries")):
+        with pytest.raises(ModelError, match=message):
+            plant.set_parameter(context, "link2.mass", value)
+    assert plant.get_parameter(context, "link2.mass") == 6.0
+
+
+def test_what_is_no_system_is_refused():
+    with pytest.raises(ModelError, match="DaePlant needs a DaeSystem, got NoneType"):
+        DaePlant(None)

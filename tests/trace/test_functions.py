@@ -1,0 +1,257 @@
+import casadi as ca
+import numpy as np
+import pytest
+
+from drake_dae.errors import ModelError
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+
+
+def traced(**outputs) -> TracedFunction:
+    """A function of x, shape (3,), and p, shape (2,), with outputs made from them by name."""
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+    made = {name: make(x, p) for name, make in outputs.items()}
+    return TracedFunction("test", {"x": x, "p": p}, made)
+
+
+X, P = np.array([1.0, 2.0, 3.0]), np.array([10.0, 20.0])
+
+
+def test_outputs_have_their_own_shapes():
+    function = traced(
+        scalar=lambda x, p: x[0] * p[1],
+        column=lambda x, p: 2 * x,
+        row=lambda x, p: x.T,
+        matrix=lambda x, p: ca.mtimes(x, p.T),
+        sparse=lambda x, p: ca.diag(x),
+        none=lambda x, p: ca.SX(0, 1),
+        wide=lambda x, p: ca.SX(2, 0),
+    )
+    scalar, column, row, matrix, sparse, none, wide = function(X, P)
+    np.testing.assert_array_equal(scalar, [20.0])
+    np.testing.assert_array_equal(column, 2 * X)
+    np.testing.assert_array_equal(row, X[None])
+    np.testing.assert_array_equal(matrix, np.outer(X, P))
+    np.testing.assert_array_equal(sparse, np.diag(X))
+    assert none.shape == (0,)
+    assert wide.shape == (2, 0)
+    assert function.input_names == ("x", "p")
+    assert function.output_names[:2] == ("scalar", "column")
+
+
+def test_evaluate_reuses_its_arrays_and_a_call_makes_new_ones():
+    function = traced(y=lambda x, p: x * p[0], z=lambda x, p: ca.mtimes(x, p.T))
+    first = function.evaluate(X, P)
+    second = function.evaluate(2 * X, P)
+    assert all(one is two for one, two in zip(first, second, strict=True))
+    np.testing.assert_array_equal(first[0], 20 * X)
+    kept = function(X, P)
+    function(3 * X, P)
+    np.testing.assert_array_equal(kept[0], 10 * X)
+    np.testing.assert_array_equal(kept[1], np.outer(X, P))
+    x = X.copy()
+    function.evaluate(x, P)
+    np.testing.assert_array_equal(x, X)
+
+
+def test_a_call_takes_anything_like_an_array():
+    function = traced(y=lambda x, p: x + p[0])
+    for x in ([1, 2, 3], (1, 2, 3), X[:, None], X[None], np.array([1, 2, 3])):
+        np.testing.assert_array_equal(function(x, P)[0], [11.0, 12.0, 13.0])
+
+
+def test_wrong_arguments_are_refused_by_name():
+    function = traced(y=lambda x, p: x + p[0])
+    with pytest.raises(ModelError, match=r"test takes 2 arguments \(x, p\), got 1"):
+        function(X)
+    with pytest.raises(ModelError, match="test: 'p' has size 3, not 2"):
+        function(X, X)
+    with pytest.raises(ModelError, match="test: 'x' has size 1, not 3"):
+        function(1.0, P)
+    with pytest.raises(ValueError, match="argument"):
+        function.evaluate(X)
+
+
+def test_finite_outputs_are_told_from_others():
+    function = traced(
+        y=lambda x, p: ca.sqrt(x), z=lambda x, p: 1 / p, none=lambda x, p: ca.SX(0, 1)
+    )
+    function(X, P)
+    assert function.is_finite
+    for x, p in (([1, -1, 1], P), (X, [1, 0]), ([np.nan, 1, 1], P), (X, [np.inf, np.nan])):
+        function(x, p)
+        assert not function.is_finite
+    # Infinities of both signs do not cancel to a number.
+    function(X, [0.0, -0.0])
+    assert not function.is_finite
+    function(X, P)
+    assert function.is_finite
+
+
+def test_a_function_may_have_no_inputs_of_a_kind():
+    function = TracedFunction("constant", {"p": ca.SX(0, 1)}, {"y": ca.SX([1, 2])})
+    np.testing.assert_array_equal(function([])[0], [1.0, 2.0])
+    assert function.is_finite
+
+
+@pytest.mark.parametrize(
+    "name", ["", "a  - b", " arm", "_x", "x_", "link.mass", "Prüfstand", "1", "null", "a\nb"]
+)
+def test_any_name_will_do(name):
+    x = ca.SX.sym("x")
+    assert TracedFunction(name, {"x": x}, {"y": 2 * x})(3.0)[0] == 6.0
+
+
+def test_common_subexpressions_are_computed_once():
+    # Both outputs hold the same product of 30 sines, written twice.
+    def product(x, p):
+        result = ca.SX(1)
+        for i in range(30):
+            result *= ca.sin(x[0] + i)
+        return result
+
+    once = traced(y=product)
+    twice = traced(y=product, z=lambda x, p: 2 * product(x, p))
+    assert twice.num_operations < once.num_operations + 10
+
+
+def solve(a: ca.SX, b: ca.SX) -> tuple[ca.SX, ca.SX]:
+    factors = Factorization(a)
+    return factors.solve(b), factors.pivot
+
+
+def solve_positive_definite(a: ca.SX, b: ca.SX) -> ca.SX:
+    return PositiveDefiniteFactorization(a).solve(b)
+
+
+def solved(size: int, columns: int) -> TracedFunction:
+    a, b = ca.SX.sym("a", size, size), ca.SX.sym("b", size, columns)
+    solution, pivot = solve(a, b)
+    return TracedFunction(
+        "solve", {"a": ca.vec(a), "b": ca.vec(b)}, {"x": ca.vec(solution), "pivot": pivot}
+    )
+
+
+def solved_numbers(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
+    x, pivot = solved(a.shape[0], b.shape[1])(a.reshape(-1, order="F"), b.reshape(-1, order="F"))
+    return x.reshape(b.shape, order="F"), float(pivot[0])
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_solve_against_numpy(size):
+    random = np.random.default_rng(size)
+    for _ in range(5):
+        a, b = random.normal(size=(size, size)), random.normal(size=(size, 3))
+        x, pivot = solved_numbers(a, b)
+        # Condition numbers of such matrices reach 1e3.
+        np.testing.assert_allclose(x, np.linalg.solve(a, b), rtol=1e-11, atol=1e-11)
+        assert 0.0 < pivot <= 1.0 + 1e-15
+
+
+def test_solve_needs_no_pivoting():
+    x, pivot = solved_numbers(np.array([[0.0, 2.0], [3.0, 0.0]]), np.array([[2.0], [6.0]]))
+    np.testing.assert_array_equal(x, [[2.0], [1.0]])
+    assert pivot == 1.0
+
+
+@pytest.mark.parametrize("condition", [1e4, 1e8])
+def test_the_error_of_solve_grows_with_the_condition_and_not_its_square(condition):
+    random = np.random.default_rng(0)
+    left, right = (np.linalg.qr(random.normal(size=(5, 5)))[0] for _ in range(2))
+    a = left @ np.diag(np.geomspace(1.0, 1.0 / condition, 5)) @ right
+    x = random.normal(size=(5, 1))
+    # Ten times machine precision per step and condition; the square would be 1e-8 and 1.
+    assert np.abs(solved_numbers(a, a @ x)[0] - x).max() < 1e-15 * 100 * condition
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[0.0]],
+        [[0.0, 0.0], [0.0, 0.0]],
+        [[0.0, 1.0], [0.0, 2.0]],
+        [[1.0, 0.0], [2.0, 0.0]],
+        [[1.0, 2.0], [2.0, 4.0]],
+        [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 2.0]],
+        [[1.0, 1.0, 0.3], [1.0, 1.0, 0.5], [1.0, 1.0, 0.9]],
+    ],
+)
+def test_the_pivot_of_a_singular_matrix_is_zero(matrix):
+    a = np.array(matrix)
+    assert solved_numbers(a, np.ones((len(a), 1)))[1] < 1e-15
+
+
+def test_the_pivot_does_not_depend_on_units():
+    a = np.array([[1.0, 2.0], [1.0, -3.0]])
+    pivots = [solved_numbers(a @ np.diag(s), np.ones((2, 1)))[1] for s in ([1, 1], [1e9, 1e-9])]
+    np.testing.assert_allclose(*pivots, rtol=1e-14)
+
+
+def test_solve_keeps_structural_zeros_and_empty_systems():
+    a, b = ca.SX.sym("a", 3, 3), ca.SX.sym("b", 3)
+    x, _ = solve(a, ca.horzcat(ca.SX(3, 1), b))
+    assert x[:, 0].nnz() == 0
+    assert x[:, 1].nnz() == 3
+    assert solve(a, ca.SX(3, 2))[0].nnz() == 0
+    x, pivot = solve(ca.SX(0, 0), ca.SX(0, 2))
+    assert x.shape == (0, 2)
+    assert float(pivot) == 1.0
+    assert solve(ca.SX.sym("a"), ca.SX(1, 2))[0].nnz() == 0
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_the_solution_can_be_differentiated(size):
+    # (A + t D)^-1 b has the derivative -A^-1 D A^-1 b at t = 0.
+    random = np.random.default_rng(size)
+    a, d, b = (random.normal(size=(size, k)) for k in (size, size, 1))
+    t = ca.SX.sym("t")
+    x, _ = solve(a + t * d, ca.SX(b))
+    slope = np.array(ca.Function("slope", [t], [ca.jacobian(x, t)])(0.0))
+    expected = -np.linalg.solve(a, d @ np.linalg.solve(a, b))
+    # The condition number, up to 1e2 here, enters twice.
+    np.testing.assert_allclose(slope, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_solve_positive_definite_against_numpy(size):
+    random = np.random.default_rng(size)
+    factor, b = random.normal(size=(size, size)), random.normal(size=(size, 2))
+    matrix = factor @ factor.T + np.eye(size)
+    x = np.array(ca.DM(solve_positive_definite(ca.SX(matrix), ca.SX(b))))
+    np.testing.assert_allclose(x, np.linalg.solve(matrix, b), rtol=1e-12, atol=1e-12)
+
+
+def test_solve_positive_definite_keeps_structural_zeros():
+    b = ca.horzcat(ca.SX(2, 1), ca.SX.sym("b", 2))
+    x = solve_positive_definite(ca.SX([[2.0, 1.0], [1.0, 3.0]]), b)
+    assert x[:, 0].nnz() == 0
+    assert solve_positive_definite(ca.SX.eye(2), ca.SX(2, 0)).shape == (2, 0)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_the_pivot_of_a_positive_definite_matrix_is_an_angle(size):
+    """A = G^T G holds the products of the columns of G, whose angles its QR factors show."""
+    matrix = ca.SX.sym("a", size, size)
+    factors = PositiveDefiniteFactorization(matrix)
+    b = ca.SX.sym("b", size)
+    function = TracedFunction(
+        "pivot",
+        {"a": ca.vec(matrix), "b": b},
+        {
+            "pivot": factors.pivot,
+            "square": ca.dot(factors.forward(b), factors.scaled(factors.forward(b))),
+        },
+    )
+    random = np.random.default_rng(size)
+    columns, right = random.normal(size=(size + 2, size)), random.normal(size=size)
+    triangle = np.linalg.qr(columns)[1]
+    sines = np.abs(np.diag(triangle)) / np.linalg.norm(columns, axis=0)
+    pivot, square = function((columns.T @ columns).ravel(), right)
+    assert pivot[0] == pytest.approx(sines.min() ** 2, rel=1e-9)
+    wanted = right @ np.linalg.solve(columns.T @ columns, right)
+    assert square[0] == pytest.approx(wanted, rel=1e-9)
+    if size > 1:
+        columns[:, 1] = 2.0 * columns[:, 0]
+        assert function((columns.T @ columns).ravel(), right)[0][0] < 1e-14
+        columns[:, 0] = 0.0
+        assert function((columns.T @ columns).ravel(), right)[0][0] == 0.0
