@@ -94,11 +94,17 @@ def build(
             sensor = _sensor(measured, model.dae.num_constraints)
     with _at("force or gains" if measured else "gains"):
         gain = _one_or_many(measured.gain) if measured else 0.0
-        law = TrackingLaw(model.dae, _gains(scenario.gains), structure, measured is not None, gain)
+        law = TrackingLaw(
+            model.dae,
+            _gains(scenario.gains),
+            structure=structure,
+            measured_force=measured is not None,
+            force_gain=gain,
+        )
     wanted = _references(scenario.references, law)
     with _at("force" if measured else "start.positions"):
         loop = make_closed_loop(
-            RobotPlant(model, structure),
+            RobotPlant(model, structure=structure),
             law,
             wanted,
             sensor=sensor,
@@ -226,6 +232,7 @@ def _structure(dae: DaeSystem) -> Structure:
         raise ScenarioError(f"constraints or start.positions: {_line(error)}") from error
     except AssumptionError as error:
         key = "constraints" if error.assumption <= 3 else "outputs"
+        error.system = dae
         raise ScenarioError(f"{key}: {_line(error)}") from error
 
 
@@ -298,8 +305,7 @@ def _start(
     signals = model.dae.output_signals
     degrees = loop.controller.law.degrees
     reference = loop.reference.reference(scenario.integrator.start_time)
-    starts = np.cumsum([0, *[degree + 1 for degree in degrees]])
-    wanted = reference[starts[:-1]]
+    wanted = loop.controller.law.layout.values(reference)
     with _at("start.errors"):
         for name, error in scenario.start.errors.items():
             index = _index(name, signals, "output")

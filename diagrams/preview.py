@@ -8,8 +8,9 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.analysis.report import Analysis, count_of
-from drake_dae.analysis.tables import Part, Table, digits, to_markdown, to_text
+from drake_dae.analysis.presentation import parts_of
+from drake_dae.analysis.report import Analysis
+from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.build import build
@@ -153,7 +154,7 @@ class Preview:
         }
 
     def _parts(self) -> list[Part]:
-        parts = self.analysis.parts()
+        parts = parts_of(self.analysis)
         for title, courses in (
             ("control needed", self.controls),
             ("joint force", self.joint_forces),
@@ -224,7 +225,7 @@ def preview(scenario: Scenario) -> Preview:
         loop, context = build(scenario)
     except ScenarioError as error:
         cause = error.__cause__
-        if isinstance(cause, AssumptionError) and cause.system is not None:
+        if isinstance(cause, AssumptionError):
             return Preview(analyze(cause.system), scenario.duration)
         raise
     plant = loop.plant

@@ -10,7 +10,8 @@ from importlib.metadata import version
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
-from drake_dae.dae.extension import Extension, dynamic_extension, extend
+from drake_dae.dae.dynamic_extension import dynamic_extension
+from drake_dae.dae.extension import Extension, extend
 from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
 from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.references import ExpressionSignal, constant, point_to_point, sinusoids

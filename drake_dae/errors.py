@@ -32,15 +32,21 @@ class AssumptionError(DrakeDaeError):
     Attributes:
         assumption: Number of the assumption in the paper, (1) to (5).
         state: A consistent state, shape (n,), where it fails, or None if it fails everywhere.
-        system: The `DaeSystem` that `find_structure` found it in, for `analyze`; else None.
+        violation: What was found, as a `dae.assumptions.Violation`; None where integrators were
+            looked for and none help.
     """
 
-    system: Any = None
-
-    def __init__(self, message: str, assumption: int, state: ArrayLike | None = None) -> None:
-        super().__init__(f"Assumption ({assumption}): {message}")
+    def __init__(
+        self,
+        message: str,
+        assumption: int,
+        state: ArrayLike | None = None,
+        violation: Any = None,
+    ) -> None:
+        super().__init__(message)
         self.assumption = assumption
         self.state = None if state is None else np.array(state, dtype=float)
+        self.violation = violation
 
 
 class InconsistentStateError(DrakeDaeError):

@@ -49,7 +49,7 @@ def run(actuation: list) -> tuple[dae.Record, np.ndarray]:
     )
     law = dae.TrackingLaw(model.dae, dae.poles(-5.0))
     references = [dae.sinusoids(0.3, 0.2, 1.5), dae.sinusoids(20.0, 5.0, 2.0)]
-    loop = dae.make_closed_loop(dae.RobotPlant(model, law.structure), law, references)
+    loop = dae.make_closed_loop(dae.RobotPlant(model, structure=law.structure), law, references)
     context = loop.diagram.CreateDefaultContext()
     q = model.configuration([0.32], guess=[1.2, -1.6])
     loop.plant.set_consistent_state(

@@ -42,7 +42,7 @@ def run(mass_factor: float, measured_force: bool) -> tuple[dae.Record, np.ndarra
     move = dae.point_to_point(0.3, 0.6, start_time=0.5, end_time=2.0, order=3)
     # Behind motors the force is a function of the state: it may be connected without a sensor.
     loop = dae.make_closed_loop(
-        dae.RobotPlant(model, law.structure), law, [move, dae.constant(20.0)]
+        dae.RobotPlant(model, structure=law.structure), law, [move, dae.constant(20.0)]
     )
     context = loop.diagram.CreateDefaultContext()
     believed = loop.controller.GetMyMutableContextFromRoot(context)

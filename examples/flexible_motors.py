@@ -46,7 +46,7 @@ def main(folder: Path) -> tuple[float, float]:
     )
     law = dae.TrackingLaw(model.dae, dae.poles({"wall.force": -12.0, "*": -6.0}))
     loop = dae.make_closed_loop(
-        dae.RobotPlant(model, law.structure),
+        dae.RobotPlant(model, structure=law.structure),
         law,
         references=[
             dae.sinusoids(0.0, 0.1, 1.5),

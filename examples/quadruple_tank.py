@@ -71,7 +71,7 @@ def main(folder: Path) -> tuple[float, float]:
     for column, (name, (levels, gains, down)) in zip(axes.T, SETTINGS.items(), strict=True):
         system = tanks(levels, gains, down)
         law = dae.TrackingLaw(system, dae.poles(-0.1))
-        stability = dae.ZeroDynamics(law.structure).stability()
+        stability = dae.ZeroDynamics(law.structure.system, structure=law.structure).stability()
         found = np.sort(stability.eigenvalues.real)
         expected = np.sort(zeros_of_johansson(stability.state, down))
         zeros.append(np.max(np.abs(found / expected - 1.0)))
@@ -82,7 +82,7 @@ def main(folder: Path) -> tuple[float, float]:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", NonMinimumPhaseWarning)
             loop = dae.make_closed_loop(
-                dae.DaePlant(law.structure),
+                dae.DaePlant(law.structure.system, structure=law.structure),
                 law,
                 references=[dae.constant([start[0] + 0.3, start[1] + 0.1])],
             )

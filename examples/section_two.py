@@ -47,21 +47,21 @@ def main(folder: Path) -> tuple[float, float, float]:
     x = structure.manifold.project([0.0, 0.8, -1.8, 0.0, 0.3, 0.0])
 
     # (20)-(22): the normal form, with the states that complete it, and its inverse.
-    form = dae.NormalForm(structure)
+    form = dae.NormalForm(structure.system, structure=structure)
     print("xi =", ", ".join(signal.name for signal in form.completion_signals))
     inverse = np.max(np.abs(form.state(form.coordinates(x)) - x))
     print(f"Phi and its inverse are off the identity by {inverse:.1e} (claim: 1e-12)")
 
     # (35): the zero dynamics about the load at rest.
-    zeros = dae.ZeroDynamics(structure).stability().eigenvalues
+    zeros = dae.ZeroDynamics(structure.system, structure=structure).stability().eigenvalues
     pendulum = np.roots([1.0, DRAG / LOAD, GRAVITY / ROPE])
     pole = np.max(np.abs(np.sort_complex(zeros) - np.sort_complex(pendulum)))
     print(f"poles of the zero dynamics off by {pole:.1e} 1/s (claim: 1e-9)")
 
     # (28): the law; (30): the error that it promises, and the one that it has.
-    law = dae.TrackingLaw(crane, dae.poles(-2.0), structure)
+    law = dae.TrackingLaw(crane, dae.poles(-2.0), structure=structure)
     move = dae.point_to_point(0.5, 2.5, 1.0, 4.0)
-    loop = dae.make_closed_loop(dae.DaePlant(structure), law, [move])
+    loop = dae.make_closed_loop(dae.DaePlant(structure.system, structure=structure), law, [move])
     context = loop.diagram.CreateDefaultContext()
     loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), x)
     fixed = SimulatorConfig(

@@ -48,7 +48,7 @@ def main(folder: Path) -> float:
     )
     law = dae.TrackingLaw(model.dae, dae.coefficients([36.0, 9.0]))
     loop = dae.make_closed_loop(
-        dae.DaePlant(law.structure),
+        dae.DaePlant(law.structure.system, structure=law.structure),
         law,
         references=[
             dae.point_to_point(0.6, 1.2, start_time=1.0, end_time=3.0),

@@ -51,7 +51,7 @@ def main(folder: Path) -> tuple[float, float]:
 
     # The blocks and their wires.
     builder = DiagramBuilder()
-    robot = builder.AddSystem(RobotPlant(model, law.structure))
+    robot = builder.AddSystem(RobotPlant(model, structure=law.structure))
     controller = builder.AddSystem(TrackingController(law))
     height, force = sinusoids(0.3, 0.3, 1.5), sinusoids(20.0, 5.0, 2.0)
     reference = builder.AddSystem(ReferenceGenerator([height, force], law.degrees))

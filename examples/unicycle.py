@@ -36,9 +36,9 @@ def main(folder: Path) -> float:
 
     # B(x) is singular again at rest: the nominal speed says that the unicycle moves.
     extension = dae.dynamic_extension(unicycle, nominal_control={"v": 2.0})
-    law = dae.TrackingLaw(extension.system, dae.poles(-2.0), extension.structure)
+    law = dae.TrackingLaw(extension.system, dae.poles(-2.0), structure=extension.structure)
     loop = dae.make_closed_loop(
-        dae.DaePlant(extension.structure),
+        dae.DaePlant(extension.structure.system, structure=extension.structure),
         law,
         references=[dae.sinusoids(0.0, 2.0, 1.0), dae.sinusoids(0.0, 1.0, 2.0)],
     )

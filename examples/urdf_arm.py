@@ -39,7 +39,7 @@ def main(folder: Path) -> tuple[float, float]:
     )
     law = dae.TrackingLaw(model.dae, dae.poles(-4.0))
     loop = dae.make_closed_loop(
-        dae.RobotPlant(model, law.structure),
+        dae.RobotPlant(model, structure=law.structure),
         law,
         references=[
             dae.sinusoids(0.0, 0.1, 2.0, np.pi / 2),

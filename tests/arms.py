@@ -74,7 +74,7 @@ def arm(name: str) -> Arm:
 
 
 def law(name: str, gains: GainDesign | None = None) -> TrackingLaw:
-    return TrackingLaw(arm(name).model.dae, gains or poles(-4.0), arm(name).structure)
+    return TrackingLaw(arm(name).model.dae, gains or poles(-4.0), structure=arm(name).structure)
 
 
 def fixed_step(step: float = 1e-3) -> SimulatorConfig:

@@ -125,7 +125,7 @@ def test_a_reference_that_leaves_the_workspace(capsys):
     words = " ".join(text.split())
     assert "the reference leaves what the system can reach at t = 0.147" in words
     found = preview(scenario("two_link_wall", move)).analysis.motion
-    assert found.failure_time == pytest.approx(when, abs=1e-4)
+    assert found.ending.time == pytest.approx(when, abs=1e-4)
     assert found.times[-1] < when < found.times[-1] + 0.01
     # On the way there, what is beyond the limits is told as well.
     assert re.search(r"PROBLEM  joint2_w goes from .* its limits are -3 and 3, left at 0\.0", text)

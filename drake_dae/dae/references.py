@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.smoothness import flaw
+from drake_dae.trace.smoothness import find_flaw
 
 
 class ReferenceSignal(Protocol):
@@ -82,11 +82,11 @@ class ExpressionSignal:
     def _check(self, degrees: Sequence[int]) -> None:
         """Refuses what lacks derivatives up to the degrees."""
         for i, degree in enumerate(degrees):
-            message = flaw(self.expression[i], self._time, ca.SX(0, 1), "the time")
-            if degree and message:
+            flaw = find_flaw(self.expression[i], self._time, ca.SX(0, 1))
+            if degree and flaw:
                 raise ReferenceSignalError(
-                    f"row {i} of the reference {message}. The law needs {degree} derivatives of "
-                    "it; a move from rest to rest is point_to_point"
+                    f"row {i} of the reference {flaw.describe('the time')}. The law needs {degree} "
+                    "derivatives of it; a move from rest to rest is point_to_point"
                 )
 
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:

@@ -77,7 +77,7 @@ def test_law_and_closed_loop(name, case, report):
     began = time.perf_counter()
     law = TrackingLaw(model.dae, poles(-8.0))
     traced = time.perf_counter() - began
-    plant = RobotPlant(model, law.structure)
+    plant = RobotPlant(model, structure=law.structure)
     loop = make_closed_loop(plant, law, REFERENCES[name])
     context = loop.diagram.CreateDefaultContext()
     starts = np.cumsum([0, *[degree + 1 for degree in law.degrees]])[:-1]

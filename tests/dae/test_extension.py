@@ -5,7 +5,8 @@ from arms import touching
 from problems import PROBLEMS, changed, double_integrator, hidden_normal_form
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.extension import Extension, dynamic_extension, extend
+from drake_dae.dae.dynamic_extension import dynamic_extension
+from drake_dae.dae.extension import Extension, extend
 from drake_dae.dae.gains import poles
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure import find_structure
@@ -498,7 +499,7 @@ def wave(center: float, size: float, rate: float, degree: int, phase: float = 0.
 def test_a_figure_of_eight(make, speed):
     """x = 2 sin t, y = sin 2t from beside it: the error is the closed form, over both lobes."""
     extension = dynamic_extension(make(), nominal_control=speed)
-    law = TrackingLaw(extension.system, poles(-2.0), extension.structure)
+    law = TrackingLaw(extension.system, poles(-2.0), structure=extension.structure)
     across, along = wave(0.0, 2.0, 1.0, 2), wave(0.0, 1.0, 2.0, 2)
 
     def reference(t: float) -> np.ndarray:
@@ -517,7 +518,7 @@ def test_a_figure_of_eight(make, speed):
 def test_a_load_on_a_crane():
     """The load moves on an ellipse with the predicted error, by trolley and winch."""
     extension = extension_of("crane")
-    law = TrackingLaw(extension.system, poles(-3.0), extension.structure)
+    law = TrackingLaw(extension.system, poles(-3.0), structure=extension.structure)
     across, up = wave(0.0, 0.3, 1.5, 4), wave(-1.0, 0.1, 1.5, 4, np.pi / 2)
 
     def reference(t: float) -> np.ndarray:

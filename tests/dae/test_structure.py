@@ -12,12 +12,14 @@ from problems import (
     in_other_units,
 )
 
-from drake_dae.dae import structure
+from drake_dae.dae import relative_degrees
+from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.lie import lie_derivative
 
 
 @pytest.fixture(params=PROBLEMS)
@@ -351,7 +353,8 @@ def test_2_redundant_constraints(k):
     """Exactly, by a factor, on N* alone, by an identity, and but for round-off."""
     error = violation(redundant(k))
     assert error.assumption == 2
-    assert "A(x) of (2) loses rank: the constraints are redundant" in str(error)
+    assert "A(x) of (2) loses rank at x = " in str(error)
+    assert "The constraints are redundant" in str(error)
 
 
 def test_2_forces_that_do_not_act_independently():
@@ -395,7 +398,7 @@ def test_2_more_constraints_than_states():
         )
     )
     assert error.assumption == 2
-    assert "m = 2 constraints on n = 1 states" in str(error)
+    assert "m = 2 constraints are more than the states" in str(error)
 
 
 @pytest.mark.parametrize(
@@ -446,7 +449,7 @@ def test_4_a_degree_that_is_not_defined_at_the_nominal_state():
     error = violation(double_integrator(l=lambda x: x[0] + x[1] ** 2))
     assert error.assumption == 4
     assert "output 'z0' is not defined at x = [0., 0.]" in str(error)
-    assert "acts on its derivative 1 in the neighbourhood" in str(error)
+    assert "acts on its derivative 1 around this state" in str(error)
     # An output that is met at once nearly everywhere.
     tension = PROBLEMS["pendulum_tension"]().system
     error = violation(changed(tension, nominal_state=[0.0, -0.8, 0.0, 0.0]))
@@ -476,7 +479,7 @@ def test_5_outputs_that_repeat():
     ):
         error = violation(changed(system, l=ca.vertcat(*one_more[:row], output), m=no_force))
         assert error.assumption == 5
-        assert "B(x) of (16) is singular: the controlled outputs v1, q3, v2, q4" in str(error)
+        assert "the controlled outputs v1, q3, v2, q4 cannot be steered" in str(error)
     for output in (q[0], 3 * q[0] + q[1], q[0] ** 2, (q[0] - 1) * q[2], q[4], ca.SX(0), ca.SX(7)):
         error = violation(changed(system, l=ca.vertcat(*one_more[:3], output), m=no_force))
         assert error.assumption == 5
@@ -506,8 +509,8 @@ def derivatives_taken(monkeypatch) -> list[int]:
 
         return count
 
-    monkeypatch.setattr(structure.Motion, "derivative", counted(structure.Motion.derivative))
-    monkeypatch.setattr(structure, "lie_derivative", counted(structure.lie_derivative))
+    monkeypatch.setattr(Derivatives, "derivative", counted(Derivatives.derivative))
+    monkeypatch.setattr(relative_degrees, "lie_derivative", counted(lie_derivative))
     return taken
 
 
@@ -598,7 +601,7 @@ def test_2_redundant_constraints_that_fill_the_state():
         )
     )
     assert error.assumption == 2
-    assert "repeat each other or fill the state (n = 3)" in str(error)
+    assert "repeat each other or fill the state" in str(error)
 
 
 def test_5_a_b_that_is_singular_between_the_sampled_states():
@@ -658,7 +661,7 @@ def test_the_structure_of_a_singular_b_is_complete():
     with pytest.raises(AssumptionError, match=r"B\(x\) of \(16\) is singular") as caught:
         find_structure(unicycle)
     assert str(caught.value) == str(violation)
-    assert caught.value.system is unicycle
+    assert caught.value.violation.names == tuple(signal.name for signal in unicycle.output_signals)
 
 
 def test_a_vanishing_row_of_b():

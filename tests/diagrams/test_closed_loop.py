@@ -62,7 +62,7 @@ def test_error_with_full_matrices_is_the_matrix_exponential():
     chosen = law("seven_joint", matrices([stiffness, damping]))
     found = arm("seven_joint")
     loop = make_closed_loop(
-        RobotPlant(found.model, found.structure),
+        RobotPlant(found.model, structure=found.structure),
         chosen,
         [
             sinusoids(0.0, 0.1, 1.0),
@@ -93,7 +93,7 @@ def test_error_with_full_matrices_is_the_matrix_exponential():
 def test_dynamics_are_those_of_multibody_plant(name):
     """The index-1 form [[M, -J'], [J, 0]] (v', lambda) = (B u - H, -Jdot v), solved densely."""
     found, random = arm(name), np.random.default_rng(2)
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     for state in consistent_states(name, 20):
         q, v = np.split(state, 2)
@@ -157,7 +157,7 @@ def test_residual_stays_at_zero_for_100_s_under_error_control():
     ends, largest = {}, {}
     for project in (True, False):
         found = arm("two_link")
-        plant = RobotPlant(found.model, found.structure, project=project)
+        plant = RobotPlant(found.model, structure=found.structure, project=project)
         chosen = law("two_link")
         loop = make_closed_loop(
             plant, chosen, [sinusoids(0.3, 0.3, 1.5), sinusoids(20.0, 5.0, 2.0)]
@@ -185,7 +185,7 @@ def test_free_constrained_motion_conserves_energy(name):
     drift = {}
     for step in (8e-3, 4e-3):
         builder = DiagramBuilder()
-        plant = builder.AddSystem(RobotPlant(found.model, found.structure))
+        plant = builder.AddSystem(RobotPlant(found.model, structure=found.structure))
         source = builder.AddSystem(ConstantVectorSource(np.zeros(plant.dae.num_controls)))
         builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
         states = LogVectorOutput(plant.GetOutputPort("state"), builder)

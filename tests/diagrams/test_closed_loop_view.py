@@ -379,7 +379,7 @@ def test_an_implicit_surface_is_left_out():
 
 
 def test_an_animation_needs_a_meshcat_and_a_robot():
-    robot = RobotPlant(arm("two_link").model, arm("two_link").structure)
+    robot = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
     references = [constant([0.3]), constant([20.0])]
     loop = make_closed_loop(robot, law("two_link"), references)
     context = loop.diagram.CreateDefaultContext()

@@ -497,7 +497,7 @@ def test_stages(form, stage):
 def test_force_gain(gain, matrix):
     force = f"force=!MeasuredForce {{time_constant: 0.01, gain: {gain}}}"
     loop, _ = build(load_scenario(find_scenario("five_bar"), [force]))
-    np.testing.assert_array_equal(loop.controller.law.force_gain, matrix)
+    np.testing.assert_array_equal(loop.controller.law.measured_force.gain, matrix)
 
 
 # Robots of one's own.

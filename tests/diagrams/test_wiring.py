@@ -7,6 +7,7 @@ from arms import arm, fixed_step, law, touching
 from drake_dae import (
     DcMotors,
     ForceSensor,
+    NormalForm,
     RobotPlant,
     StateRealization,
     TrackingLaw,
@@ -29,11 +30,11 @@ def rigid(sensor=None, gain=1.0, measured=True):
     law = TrackingLaw(
         found.model.dae,
         poles(-8.0),
-        found.structure,
+        structure=found.structure,
         measured_force=measured,
         force_gain=gain if measured else 0.0,
     )
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     return make_closed_loop(plant, law, REFERENCES, sensor=sensor)
 
 
@@ -70,13 +71,15 @@ def test_a_law_for_another_system_is_refused_with_both_sizes():
         match=r"for 'seven_joint' with 14 states, 7 controls and 1 constraints, the plant "
         r"'two_link' has 4 states, 2 controls and 1 constraints\. .*TrackingLaw\(plant.dae",
     ):
-        make_closed_loop(RobotPlant(found.model, found.structure), law("seven_joint"), REFERENCES)
+        make_closed_loop(
+            RobotPlant(found.model, structure=found.structure), law("seven_joint"), REFERENCES
+        )
 
 
 def test_behind_motors_the_force_may_be_connected_directly():
     model = touching("two_link", [MOTORS])
     law = TrackingLaw(model.dae, poles(-8.0), measured_force=True)
-    loop = make_closed_loop(RobotPlant(model, law.structure), law, REFERENCES)
+    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, REFERENCES)
     assert loop.sensor is None
     assert not loop.diagram.HasAnyDirectFeedthrough()
 
@@ -188,6 +191,6 @@ def test_a_gain_without_effect_is_refused():
 
 def test_a_state_realization_is_no_plant_for_the_closed_loop():
     chosen = law("two_link")
-    realization = StateRealization(chosen.structure)
+    realization = StateRealization(NormalForm(chosen.structure.system, structure=chosen.structure))
     with pytest.raises(WiringError, match="needs a DaePlant or RobotPlant, got StateRealization"):
         make_closed_loop(realization, chosen, [constant([0.2, 20.0])])

@@ -166,7 +166,7 @@ def test_law_is_the_explicit_law(name, kind, full):
     if full:
         gains, force_gains = coupled(degree, count, random), coupled(force_degree, 1, random)
         design = matrices(gains, force_gains)
-    law = TrackingLaw(found.model.dae, design, found.structure)
+    law = TrackingLaw(found.model.dae, design, structure=found.structure)
     for x in states(name, kind, 3, seed=6):
         reference = random.standard_normal(count * (degree + 1) + force_degree + 1)
         if kind == "flexible":
@@ -189,7 +189,7 @@ def test_error_obeys_the_assigned_equation(name, kind):
     degree, force_degree = DEGREES[kind]
     count = len(found.model.position_signals)
     gains, force_gains = coupled(degree, count, random), coupled(force_degree, 1, random)
-    law = TrackingLaw(found.model.dae, matrices(gains, force_gains), found.structure)
+    law = TrackingLaw(found.model.dae, matrices(gains, force_gains), structure=found.structure)
     d = drive(name, kind)
 
     for x in states(name, kind, 2, seed=8):
@@ -248,9 +248,9 @@ def track(name, kind, step, duration):
     found = actuated(name, kind)
     names = [signal.name for signal in found.model.dae.output_signals]
     poles_of = dict.fromkeys(names, -14.0) | {names[-1]: -20.0}
-    law = TrackingLaw(found.model.dae, poles(poles_of), found.structure)
+    law = TrackingLaw(found.model.dae, poles(poles_of), structure=found.structure)
     loop = make_closed_loop(
-        RobotPlant(found.model, found.structure), law, [*REFERENCES[name], PULL]
+        RobotPlant(found.model, structure=found.structure), law, [*REFERENCES[name], PULL]
     )
     context = loop.diagram.CreateDefaultContext()
     start = at_rest(name, kind, start_position(name), 14.0)[0]
@@ -307,7 +307,7 @@ def test_stiff_joints_do_not_make_the_closed_loop_stiff():
     def hold(step):
         """How far the shafts move under a constant control, 1 urad off their rest."""
         builder = DiagramBuilder()
-        plant = builder.AddSystem(RobotPlant(found.model, found.structure))
+        plant = builder.AddSystem(RobotPlant(found.model, structure=found.structure))
         source = builder.AddSystem(ConstantVectorSource(u))
         builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
         shafts = LogVectorOutput(plant.GetOutputPort("motor_state"), builder)

@@ -270,7 +270,7 @@ def test_support_carries_half_of_a_rod():
 def test_moving_arms_obey_newton_and_euler():
     """Inverse dynamics of MultibodyPlant with the multipliers as external forces gives u."""
     model, structure = arms()
-    plant, system = model.links.plant, RobotPlant(model, structure)
+    plant, system = model.links.plant, RobotPlant(model, structure=structure)
     a, b = frames("object", "right::tool")
     context, context_here = plant.CreateDefaultContext(), system.CreateDefaultContext()
     random = np.random.default_rng(6)
@@ -451,7 +451,7 @@ def test_four_bar_moves_as_its_one_degree_of_freedom():
     assert structure.constraint_degrees == (2, 2)
     assert structure.output_degrees == (2, 0, 0)
     assert structure.index == 3
-    plant, links = RobotPlant(model, structure), model.links
+    plant, links = RobotPlant(model, structure=structure), model.links
     angle, rate, duration = 1.0, 5.0, 1.5
     b, c, k2, k3, _, _ = linkage(angle)
     start = [angle, b - angle, c, rate, (k2 - 1.0) * rate, k3 * rate]
@@ -506,9 +506,9 @@ def test_two_arms_track_motion_and_squeeze():
     # Far from singular: no output nearly repeats another.
     assert structure.constraint_margin.relative > 0.3
     assert structure.control_margin.relative > 0.3
-    law = TrackingLaw(model.dae, poles(-4.0), structure)
+    law = TrackingLaw(model.dae, poles(-4.0), structure=structure)
     loop = make_closed_loop(
-        RobotPlant(model, structure),
+        RobotPlant(model, structure=structure),
         law,
         [
             sinusoids(APART / 2, 0.05, 2.0),

@@ -132,7 +132,7 @@ def test_law_commands_the_highest_derivatives():
     np.testing.assert_array_equal(model.links.actuation_matrix, np.eye(14))
     truth, random = Truth(model.links.plant), np.random.default_rng(11)
     gains, force_gains = coupled(4, 8, random), coupled(2, 6, random)
-    law = TrackingLaw(model.dae, matrices(gains, force_gains), structure)
+    law = TrackingLaw(model.dae, matrices(gains, force_gains), structure=structure)
     for _ in range(3):
         x = truth.state(model, structure, random)
         reference = random.standard_normal(8 * 5 + 6 * 3)
@@ -158,9 +158,9 @@ def test_errors_are_their_closed_forms():
     model, structure = flexible()
     names = [signal.name for signal in model.dae.output_signals]
     poles_of = dict.fromkeys(names, -14.0) | {name: -20.0 for name in names[8:]}
-    law = TrackingLaw(model.dae, poles(poles_of), structure)
+    law = TrackingLaw(model.dae, poles(poles_of), structure=structure)
     loop = make_closed_loop(
-        RobotPlant(model, structure),
+        RobotPlant(model, structure=structure),
         law,
         [
             sinusoids(APART / 2, 0.05, 2.0),

@@ -48,7 +48,7 @@ def run(
     """
     chosen = TrackingLaw(model.dae, poles(-10.0), measured_force=measured, force_gain=gain)
     builder = DiagramBuilder()
-    plant = builder.AddSystem(RobotPlant(model, chosen.structure))
+    plant = builder.AddSystem(RobotPlant(model, structure=chosen.structure))
     controller = builder.AddSystem(TrackingController(chosen))
     reference = builder.AddSystem(ReferenceGenerator(references, chosen.degrees))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
@@ -127,7 +127,7 @@ def test_measured_force_removes_the_misprediction_behind_springs():
         reference[0], reference[5] = 0.3, 20.0
         force = error[-1, 1] + 20.0
         given = {"measured_force": [force]} if measured else {}
-        u = chosen.control(state, reference, parameters, **given)
+        u = chosen.control(state, reference, parameters=parameters, **given)
         values = _evaluate(structure, state, parameters, u)
         predicted, second_rate = values
         stiffness = 100.0  # Lambda_5 of two poles at -10
@@ -161,8 +161,8 @@ def test_with_a_right_model_measured_force_changes_nothing():
     for stages in ([MOTORS], [FlexibleJoints(8000.0, inertia=1.0)]):
         model = touching("two_link", stages)
         plain = TrackingLaw(model.dae, poles(-4.0))
-        fed = TrackingLaw(model.dae, poles(-4.0), plain.structure, measured_force=True)
-        plant = RobotPlant(model, plain.structure)
+        fed = TrackingLaw(model.dae, poles(-4.0), structure=plain.structure, measured_force=True)
+        plant = RobotPlant(model, structure=plain.structure)
         context = plant.CreateDefaultContext()
         random = np.random.default_rng(5)
         for state in plain.structure.states[:4]:
@@ -180,7 +180,11 @@ def test_law_59_with_measured_force():
     """u of (59) less u without Gbar is J^T Gbar (lambda - r_2)."""
     found, gain = arm("two_link"), 3.0
     fed = TrackingLaw(
-        found.model.dae, poles(-4.0), found.structure, measured_force=True, force_gain=gain
+        found.model.dae,
+        poles(-4.0),
+        structure=found.structure,
+        measured_force=True,
+        force_gain=gain,
     )
     for state in consistent_states("two_link", 5):
         reference = np.array([0.1, 0.2, 0.3, 20.0])
