@@ -5,18 +5,15 @@ import re
 
 import numpy as np
 import pytest
+from runs import run, scenario
 from scipy.optimize import brentq
 
-from drake_dae import build, load_scenario, simulate
+from drake_dae import build
 from drake_dae.cli import main
 from drake_dae.diagrams import preview as preview_module
 from drake_dae.diagrams.preview import preview
-from drake_dae.diagrams.scenario import find_scenario, shipped_scenarios
+from drake_dae.diagrams.scenario import shipped_scenarios
 from drake_dae.simulation.summary import Limits
-
-
-def scenario(name, *settings):
-    return load_scenario(find_scenario(name), settings)
 
 
 def analyze(capsys, *arguments):
@@ -43,8 +40,7 @@ def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
     loop, context = build(case)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_state(own, told.analysis.motion.states[0])
-    simulate(loop.diagram, context, case.duration, case.integrator)
-    record = loop.record(context)
+    record = run(loop, context, case.duration, case.integrator)
     # What integration to 1e-8, or fixed steps of 5 ms, leave of the error.
     assert np.abs(record["tracking_error"]).max() < 1e-6
     groups = (("control", told.controls), ("constraint_force", told.constraint_forces))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from actuated import actuated, slope, states
 from arms import arm, consistent_states, numbers
-from problems import PROBLEMS, Problem, hidden_normal_form, knife_edge, pendulum, pendulum_tension
+from problems import PROBLEMS, hidden_normal_form, knife_edge, pendulum, pendulum_tension
 from two_arms import two_arms
 
 from drake_dae.dae.normal_form import NormalForm
@@ -27,11 +27,6 @@ ROBOTS = {
     },
     "seven_joint damped": lambda: actuated("seven_joint", "damped").structure,
 }
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
 
 
 @cache

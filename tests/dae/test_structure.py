@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 from problems import (
     PROBLEMS,
-    Problem,
     changed,
     double_integrator,
+    early_control,
     hidden_normal_form,
     in_other_units,
+    redundant,
+    system_of,
 )
 
 from drake_dae.dae import structure
@@ -18,15 +20,6 @@ from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
-def system_of(n: int, **fields: Callable) -> DaeSystem:
-    return DaeSystem.from_functions(n, **{"name": "test", **fields})
 
 
 def degrees(system: DaeSystem, **options) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -323,19 +316,6 @@ def test_1_a_degree_that_is_lost_between_the_sampled_states():
     assert error.state[0] == pytest.approx(0.03, abs=1e-12)
 
 
-def redundant(k: Callable, **fields) -> DaeSystem:
-    """Two constraints k on the point x'' = v1 + v2, beside z'' = u + v2."""
-    base = {
-        "f": lambda x: [x[1], 0, x[3], 0],
-        "g": lambda x: [[0, 0], [1, 1], [0, 0], [0, 1]],
-        "h": lambda x: [0, 0, 0, 1],
-        "k": k,
-        "l": lambda x: x[2],
-        "m": lambda x: [[0, 0]],
-    }
-    return system_of(4, **{**base, **fields})
-
-
 @pytest.mark.parametrize(
     "k",
     [
@@ -424,18 +404,7 @@ def test_2_no_force_keeps_the_constraint(k):
 
 
 def test_3_a_control_that_enters_before_the_force_does():
-    """x0' = x1 + u, x1' = v: u acts on k', v on k''."""
-    error = violation(
-        system_of(
-            3,
-            f=lambda x: [x[1], 0, 0],
-            g=lambda x: [0, 1, 0],
-            h=lambda x: [1, 0, 1],
-            k=lambda x: x[0],
-            l=lambda x: x[2],
-            m=lambda x: 0,
-        )
-    )
+    error = violation(early_control())
     assert error.assumption == 3
     assert "the control acts on derivative 1 of constraint 'y0', before any" in str(error)
     # At the same order it is allowed.

@@ -24,11 +24,6 @@ from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import GainError, ModelError
 
 
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
 def starts(problem: Problem) -> np.ndarray:
     """Where each output's entries of the reference start."""
     return np.cumsum([0, *(degree + 1 for degree in problem.output_degrees)])

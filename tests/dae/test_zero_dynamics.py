@@ -40,11 +40,6 @@ from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
 Array = np.ndarray
 
 
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
 def zero_dynamics(system: DaeSystem) -> ZeroDynamics:
     return ZeroDynamics(find_structure(system))
 

@@ -15,15 +15,11 @@ from arms import (
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from runs import run
 
-from drake_dae import RobotPlant, constant, make_closed_loop, matrices, simulate, sinusoids
+from drake_dae import RobotPlant, constant, make_closed_loop, matrices, sinusoids
 
 ARMS = ["two_link", "seven_joint"]
-
-
-def run(loop, context, duration, config):
-    simulate(loop.diagram, context, duration, config)
-    return loop.record(context)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_dump_typed
 from pydrake.systems.analysis import SimulatorConfig
+from runs import run_scenario
 from two_arms import GRASP, two_arms
 
 from drake_dae import (
@@ -22,7 +23,6 @@ from drake_dae import (
     constant,
     load_scenario,
     point_to_point,
-    simulate,
     sinusoids,
 )
 from drake_dae.diagrams import scenario as forms
@@ -75,9 +75,8 @@ def lever(folder, shape='<box size="1 0.1 0.1"/>', drive=DRIVE, scenario=LEVER):
 
 
 def run(scenario):
-    loop, context = build(scenario)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    record = loop.record(context)
+    """The loop, its record, and the largest distance of each error from the predicted one."""
+    loop, _, record = run_scenario(scenario)
     return loop, record, np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)
 
 

@@ -10,19 +10,17 @@ from actuated import slope
 from arms import fixed_step
 from pydrake.multibody.tree import JacobianWrtVariable
 from test_actuation_laws import closed_form, coupled, new_input
-from two_arms import APART, NOMINAL, two_arms
+from two_arms import APART, NOMINAL, REFERENCES, two_arms
 
 from drake_dae import (
     FlexibleJoints,
     RobotPlant,
     TrackingLaw,
-    constant,
     find_structure,
     make_closed_loop,
     matrices,
     poles,
     simulate,
-    sinusoids,
 )
 
 STIFFNESS = np.tile([2e4, 2e4, 1e4, 1e4, 5e3, 2e3, 2e3], 2)
@@ -162,18 +160,7 @@ def test_errors_are_their_closed_forms():
     loop = make_closed_loop(
         RobotPlant(model, structure),
         law,
-        [
-            sinusoids(APART / 2, 0.05, 2.0),
-            sinusoids(0.0, 0.05, 3.0),
-            sinusoids(0.4, 0.04, 2.5),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 0.1, 2.0),
-            constant([0.0, 0.0]),
-            sinusoids(40.0, 15.0, 4.0),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 1.0, 3.0),
-            constant([0.0, 0.0]),
-        ],
+        REFERENCES,
     )
     context = loop.diagram.CreateDefaultContext()
     q = model.configuration(START, NOMINAL)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, TriggerType
 from pydrake.systems.primitives import LogVectorOutput
+from runs import run_scenario, scenario
 
 from drake_dae import Record, build, load_scenario, simulate
 from drake_dae.dae.signals import Signal
@@ -17,10 +18,7 @@ from drake_dae.simulation.record import Recorded
 
 @pytest.fixture(scope="module")
 def run():
-    scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.5"])
-    loop, context = build(scenario)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    return loop, context, loop.record(context)
+    return run_scenario(scenario("two_link_wall", "duration=0.5"))
 
 
 def small():

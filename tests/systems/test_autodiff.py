@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from actuated import actuated, slope, states
 from arms import arm, consistent_states, fixed_step, law, shipped
-from problems import PROBLEMS
+from problems import PROBLEMS, hanging_pendulum
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import IpoptSolver, SnoptSolver
@@ -221,26 +221,9 @@ def test_a_time_that_moves_needs_one_more_derivative():
         converted.GetOutputPort("reference").Eval(context)
 
 
-def pendulum(**fields):
-    """A unit mass on a unit rod, pushed sideways, z = x."""
-    return DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        f=lambda s, p: [s[2], s[3], 0.0, -p.gravity],
-        g=lambda s, p: [0.0, 0.0, 2 * s[0], 2 * s[1]],
-        h=lambda s, p: [0.0, 0.0, 1.0, 0.0],
-        k=lambda s, p: [s[0] ** 2 + s[1] ** 2 - 1.0],
-        l=lambda s, p: [s[0]],
-        m=lambda s, p: [[0.0]],
-        parameters={"gravity": 9.81},
-        nominal_state=[0.0, -1.0, 0.0, 0.0],
-        name="pendulum",
-        **fields,
-    )
-
-
 def test_linearize_a_hanging_pendulum():
     """v = -(vx^2 + vy^2 + x u - g y) / (2 x^2 + 2 y^2): x'' = -g x + u, y'' = 0, z = x."""
-    plant = DaePlant(pendulum())
+    plant = DaePlant(hanging_pendulum())
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, [0.0])
     linear = Linearize(
@@ -372,7 +355,7 @@ def test_sensitivity_of_a_simulation():
         simulator.AdvanceTo(0.5)
         return context.get_continuous_state_vector().CopyToVector()
 
-    plant, point = DaePlant(pendulum(), project=False), np.array([0.4, 9.81])
+    plant, point = DaePlant(hanging_pendulum(), project=False), np.array([0.4, 9.81])
     moving = InitializeAutoDiff(point).reshape(-1)
     found = ExtractGradient(end(Simulator_[AutoDiffXd], plant.ToAutoDiffXd(), *moving))
     for column, direction in zip(found.T, np.eye(2), strict=True):
@@ -402,7 +385,7 @@ def test_direct_collocation(solver):
     polar = SymbolicVectorSystem(
         state=[phi, rate], input=[u], dynamics=[rate, -9.81 * sin(phi) + u * cos(phi)], output=[phi]
     )
-    plant, angle = DaePlant(pendulum()), 0.5
+    plant, angle = DaePlant(hanging_pendulum()), 0.5
     start = np.array([0.0, -1.0, 0.0, 0.0])
     end = np.array([np.sin(angle), -np.cos(angle), 0.0, 0.0])
     cost, control = collocate(plant, solver, start, end, [0, 2])
@@ -470,4 +453,4 @@ def test_what_does_not_convert_says_why():
             self.DeclareVectorOutputPort("energy", 1, lambda context, output: None)
 
     with pytest.raises(ModelError, match=r"its output port 'energy'; add it to _formulas"):
-        Watched(pendulum()).ToAutoDiffXd()
+        Watched(hanging_pendulum()).ToAutoDiffXd()
