@@ -32,6 +32,7 @@ def course(courses, name):
 # Against another route.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_wall", "two_link_flexible"])
 def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
     """A loop that starts on the reference stays on it."""
@@ -293,6 +294,7 @@ def test_help_tells_the_exit_codes(capsys):
     assert "exit code: 0 if no problem was found, 2 if one was" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_shipped_scenarios_have_no_problems(name):
     told = preview(scenario(name))

@@ -333,6 +333,7 @@ def test_found_and_asked_for_are_the_same():
         np.testing.assert_array_equal(left, right)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_hidden_integrators_are_found(seed):
     """Integrators before some controls of a random system, behind a feedback, want the others too.

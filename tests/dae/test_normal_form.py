@@ -43,6 +43,7 @@ def chain_ends(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
     return ends[:m], ends[m:][dynamic]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*PROBLEMS, *ROBOTS])
 def test_phi_and_its_inverse_compose_to_the_identity(name):
     """Both ways, on N* and off it, from the nominal state as the guess."""

@@ -109,6 +109,7 @@ def test_spread_and_count():
             find_structure(system, spread=wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(30))
 def test_hidden_normal_forms_are_found(seed):
     """Systems of random degrees behind a diffeomorphism, a feedback, mixed inputs and orders."""
@@ -136,6 +137,7 @@ def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_units_do_not_matter(problem, seed):
     """Every state, input and output in its own unit, from 1e-4 to 1e4 of the original one.
@@ -584,6 +586,7 @@ def test_5_a_b_that_is_singular_between_the_sampled_states():
     assert error.state[2] == pytest.approx(0.02, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 15, 40, 46])
 def test_5_a_singular_b_hidden_in_a_random_system(seed):
     """In place of a second output of degree mu >= 1, a function of the first one and of k."""

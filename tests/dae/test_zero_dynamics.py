@@ -281,6 +281,7 @@ def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
         np.testing.assert_allclose(el[:, 0] + em @ force, wanted, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     """The law (28) without an initial error moves the same way; integrated by DOP853."""
     _, times, motion = following(problem)
@@ -354,6 +355,7 @@ def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
     np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 @pytest.mark.parametrize("kind", ["flexible", "damped", "motor"])
 def test_motions_of_robots_agree_with_multibody_plant(name, kind):
@@ -477,6 +479,7 @@ def test_stiff_zero_dynamics_take_few_steps(monkeypatch):
     np.testing.assert_allclose(motion.states[1:, 1], np.sin(motion.times[1:] - 1e-6), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_long_motion_does_not_drift(monkeypatch):
     """With errors of 1e-3 a step: outputs and rod to round-off, and the angle to a few steps."""
     monkeypatch.setattr(module, "TOLERANCE", 1e-3)

@@ -22,6 +22,7 @@ from drake_dae import RobotPlant, constant, make_closed_loop, matrices, sinusoid
 ARMS = ["two_link", "seven_joint"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "position", "force", "residual"),
     [("two_link_wall", 1e-12, 1e-11, 1e-12), ("seven_joint_wall", 1e-9, 1e-8, 1e-12)],
@@ -47,6 +48,7 @@ def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
     assert np.max(np.abs(record["constraint_residual"])) < residual
 
 
+@pytest.mark.slow
 def test_error_with_full_matrices_is_the_matrix_exponential():
     """(60) with coupled outputs: (e, e')' = [[0, 1], [-Lambda_1, -Lambda_2]] (e, e')."""
     random = np.random.default_rng(1)

@@ -86,6 +86,7 @@ def run(scenario):
 RIGID = ["two_link_wall", "seven_joint_wall", "seven_joint_dome", "two_arms", "five_bar"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGID)
 def test_rigid_scenario_has_the_predicted_error(name):
     """In 3 s all outputs move and the start errors decay by 1e-4.
@@ -120,6 +121,7 @@ ACTUATED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ACTUATED)
 def test_actuated_scenario_has_the_predicted_error(name):
     """In 1 s, relative to the start errors of some cm and 5 N.
@@ -138,6 +140,7 @@ def test_actuated_scenario_has_the_predicted_error(name):
     assert np.abs(record["tracking_error"][-1, -1]) < 0.3 * 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_shipped_scenario_runs_from_its_start_errors(name):
     scenario = load_scenario(find_scenario(name), ["duration=0.3"])
@@ -603,6 +606,7 @@ SPRINGS = "actuation=[!FlexibleJoints {inertia: 1, stiffness:"
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

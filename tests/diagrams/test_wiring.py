@@ -90,6 +90,7 @@ def test_the_noise_follows_its_seed():
     assert np.max(np.abs(records[0] - records[2])) > 0.1
 
 
+@pytest.mark.slow
 def test_a_scenario_with_another_mass_in_the_plant():
     """Feedback shrinks the force error to 1 / (1 + 4) of what it is without, within 5 %."""
     quiet = (
@@ -108,6 +109,7 @@ def test_a_scenario_with_another_mass_in_the_plant():
     assert "measured_force" in record.signals
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["two_link_flexible", "two_link_motors", "two_link_hydraulics", "two_link_flexible_motors"],

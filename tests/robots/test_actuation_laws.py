@@ -147,6 +147,7 @@ def explicit_actuator(name, kind, x, reference, gains, force_gains):
     return inertia @ np.linalg.solve(b(q), -a + np.concatenate([wanted, pressed]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", [False, True], ids=["poles", "Lambda"])
 @pytest.mark.parametrize("kind", ["flexible", "motor", "hydraulic"])
 @pytest.mark.parametrize("name", ARMS)
@@ -177,6 +178,7 @@ def test_law_is_the_explicit_law(name, kind, full):
         assert np.linalg.norm(control - explicit) < tolerance * np.linalg.norm(explicit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flexible motor", "flexible hydraulic", "damped"])
 @pytest.mark.parametrize("name", ARMS)
 def test_error_obeys_the_assigned_equation(name, kind):
@@ -272,6 +274,7 @@ def track(name, kind, step, duration):
     return relative, record
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DEGREES)
 @pytest.mark.parametrize("name", ARMS)
 def test_errors_are_their_closed_forms(name, kind):

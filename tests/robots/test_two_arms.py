@@ -6,6 +6,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 from actuated import slope
 from arms import fixed_step
 from pydrake.multibody.tree import JacobianWrtVariable
@@ -118,6 +119,7 @@ class Truth:
         return np.concatenate([q, v, q + torque / STIFFNESS, v + rate])
 
 
+@pytest.mark.slow
 def test_law_commands_the_highest_derivatives():
     """z^(4) and lambda'' under u are r^(mu) - sum Lambda_k+1 (z^(k) - r^(k)), for full Lambda.
 
@@ -148,6 +150,7 @@ def test_law_commands_the_highest_derivatives():
             np.testing.assert_allclose(found[-1], wanted, rtol=0, atol=1e-7 * scale)
 
 
+@pytest.mark.slow
 def test_errors_are_their_closed_forms():
     """All positions off by cm, all forces off by some N, poles at -14 and -20.
 

@@ -150,6 +150,7 @@ RUNS = {
 """Amplitude and mean of the control, and for how many s the motion stays in the coordinates."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_simulation_agrees_with_the_plant(name):
     """State, force and output over time by two vector fields, of n and of n - sum r_i states."""
