@@ -46,7 +46,7 @@ test: lint
 	$(PYTEST)
 
 benchmark: $(VENV)/installed-dev
-	$(BIN)/python -m pytest tests/benchmarks -s
+	$(BIN)/python -m pytest tests/benchmarks -q
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)
