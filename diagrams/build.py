@@ -35,7 +35,7 @@ from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
 
 
-def build(
+def build_scenario(
     scenario: forms.Scenario, meshcat: Meshcat | None = None, live: bool = True
 ) -> tuple[ClosedLoop, Context]:
     """The closed loop of a scenario, and its context at the start.
@@ -235,10 +235,10 @@ def _gains(form: typing.Any) -> designs.GainDesign:
             for matrix in group:
                 if len({len(row) for row in matrix}) != 1:
                     raise ScenarioError(f"groups: the rows of {matrix} have different lengths")
-        return designs.matrices(*form.groups)
+        return designs.gain_matrices(*form.groups)
     if form.all and form.outputs:
         raise ScenarioError("give either 'all' or 'outputs', not both")
-    design = designs.poles if isinstance(form, forms.Poles) else designs.coefficients
+    design = designs.poles if isinstance(form, forms.Poles) else designs.gain_coefficients
     return design(form.all or form.outputs)
 
 
@@ -246,12 +246,18 @@ def _references(given: Sequence[typing.Any], law: TrackingLaw) -> list[typing.An
     signals = law.system.output_signals
     result: list[typing.Any] = []
     first = 0
+    names = {
+        "Constant": "ConstantReference",
+        "Sinusoids": "SinusoidReference",
+        "PointToPoint": "PointToPointReference",
+    }
     for index, form in enumerate(given):
         with _at(f"references.{index}"):
             if isinstance(form, forms.Sinusoids) and not form.phases:
                 form = replace(form, phases=[0.0] * len(form.amplitudes))
             _check_lengths(form)
-            reference = _make(references, form)
+            values = {item.name: getattr(form, item.name) for item in fields(form)}
+            reference = getattr(references, names[type(form).__name__])(**values)
             degrees = law.degrees[first : first + reference.size]
             if len(degrees) < reference.size:
                 raise ScenarioError(

@@ -12,7 +12,7 @@ from drake_dae.analysis.report import Analysis, count_of
 from drake_dae.analysis.tables import Part, Table, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.build import build
+from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
@@ -221,7 +221,7 @@ def preview(scenario: Scenario) -> Preview:
             analysis tells it.
     """
     try:
-        loop, context = build(scenario)
+        loop, context = build_scenario(scenario)
     except ScenarioError as error:
         cause = error.__cause__
         if isinstance(cause, AssumptionError) and cause.system is not None:

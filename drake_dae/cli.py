@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.diagrams.build import build
+from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation
 from drake_dae.diagrams.preview import preview
 from drake_dae.diagrams.scenario import (
@@ -155,7 +155,7 @@ def _simulate(options: argparse.Namespace) -> int:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat or scenario.write.animation else None
     began = time.perf_counter()
-    loop, context = build(scenario, meshcat, live=options.meshcat)
+    loop, context = build_scenario(scenario, meshcat, live=options.meshcat)
     print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
     folder = _prepare(options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"))
     save_scenario(scenario, folder / "scenario.yaml", f"{_MARK} {drake_dae.__version__}")

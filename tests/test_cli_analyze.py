@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from drake_dae import build, load_scenario, simulate
+from drake_dae import build_scenario, load_scenario, simulate
 from drake_dae.cli import main
 from drake_dae.diagrams import preview as preview_module
 from drake_dae.diagrams.preview import preview
@@ -40,7 +40,7 @@ def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
     """A loop that starts on the reference stays on it."""
     case = scenario(name, "start.errors={}", "duration=1.5")
     told = preview(case)
-    loop, context = build(case)
+    loop, context = build_scenario(case)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_state(own, told.analysis.motion.states[0])
     simulate(loop.diagram, context, case.duration, case.integrator)
@@ -200,9 +200,9 @@ def test_a_pin_may_pull():
     told = preview(scenario("five_bar", "references.2.offset=-15"))
     assert course(told.constraint_forces, "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
     assert not any("pulls" in problem for problem in told.problems)
-    loop, _ = build(scenario("five_bar"))
+    loop, _ = build_scenario(scenario("five_bar"))
     assert all(Limits.of(loop.plant.model).can_pull(s) for s in loop.plant.dae.output_signals[2:])
-    loop, _ = build(scenario("two_link_wall"))
+    loop, _ = build_scenario(scenario("two_link_wall"))
     (force,) = loop.plant.dae.constraint_input_signals
     assert not Limits.of(loop.plant.model).can_pull(force)
     assert not Limits().can_pull(force)
@@ -278,7 +278,7 @@ def test_an_error_as_json(capsys):
 def test_objects_are_one_line_at_the_prompt():
     case = scenario("two_link_wall", "duration=0.1")
     assert repr(preview(case)) == "Preview('two_link_arm': no problem found)"
-    loop, _ = build(case)
+    loop, _ = build_scenario(case)
     assert repr(loop).startswith("ClosedLoop('two_link_arm', logs state, constraint_force, ")
 
 

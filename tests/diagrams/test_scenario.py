@@ -10,20 +10,20 @@ from two_arms import GRASP, two_arms
 
 from drake_dae import (
     CoincidentPoints,
+    ConstantReference,
     Cylinder,
     DcMotors,
     ElectrohydraulicServos,
     Ellipsoid,
     FlexibleJoints,
     Plane,
+    PointToPointReference,
+    SinusoidReference,
     Sphere,
     Torus,
-    build,
-    constant,
+    build_scenario,
     load_scenario,
-    point_to_point,
     simulate,
-    sinusoids,
 )
 from drake_dae.diagrams import scenario as forms
 from drake_dae.diagrams.scenario import find_scenario, save_scenario, shipped_scenarios
@@ -61,7 +61,7 @@ def two_link(*settings):
 def refusal(*settings):
     """The message about a changed two_link_wall."""
     with pytest.raises(ScenarioError) as caught:
-        build(two_link(*settings))
+        build_scenario(two_link(*settings))
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -75,7 +75,7 @@ def lever(folder, shape='<box size="1 0.1 0.1"/>', drive=DRIVE, scenario=LEVER):
 
 
 def run(scenario):
-    loop, context = build(scenario)
+    loop, context = build_scenario(scenario)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     return loop, record, np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)
@@ -254,7 +254,7 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
 def test_packages_of_a_robot(tmp_path):
     path = lever(tmp_path / "robots")
     settings = ["robot.file=package://mine/lever.urdf", "robot.packages.mine=."]
-    assert build(load_scenario(path, settings))[0].plant.dae.name == "lever"
+    assert build_scenario(load_scenario(path, settings))[0].plant.dae.name == "lever"
 
 
 @pytest.mark.parametrize(
@@ -330,7 +330,7 @@ def test_surfaces(form, surface):
     ],
 )
 def test_gains(form, poles):
-    loop, _ = build(two_link(f"gains={form}"))
+    loop, _ = build_scenario(two_link(f"gains={form}"))
     # A double pole is found to the root of the round-off.
     found = np.sort_complex(loop.controller.law.gains.poles)
     np.testing.assert_allclose(found, poles, atol=1e-6)
@@ -339,27 +339,27 @@ def test_gains(form, poles):
 @pytest.mark.parametrize(
     ("form", "signal"),
     [
-        ("!Constant {values: [0.4]}", constant([0.4])),
+        ("!Constant {values: [0.4]}", ConstantReference([0.4])),
         (
             "!Sinusoids {offset: 0.3, amplitudes: [0.1, 0.2], frequencies: [1, 2]}",
-            sinusoids(0.3, [0.1, 0.2], [1, 2]),
+            SinusoidReference(0.3, [0.1, 0.2], [1, 2]),
         ),
         (
             "!Sinusoids {offset: 0.3, amplitudes: [0.1], frequencies: [1], phases: [0.5]}",
-            sinusoids(0.3, [0.1], [1], [0.5]),
+            SinusoidReference(0.3, [0.1], [1], [0.5]),
         ),
         (
             "!PointToPoint {start: [0.2], end: [0.4], start_time: 0.5, end_time: 2, order: 3}",
-            point_to_point([0.2], [0.4], 0.5, 2, 3),
+            PointToPointReference([0.2], [0.4], 0.5, 2, 3),
         ),
         (
             "!PointToPoint {start: [0.2], end: [0.4], end_time: 2}",
-            point_to_point([0.2], [0.4], 0, 2),
+            PointToPointReference([0.2], [0.4], 0, 2),
         ),
     ],
 )
 def test_references(form, signal):
-    loop, _ = build(two_link(f"references.0={form}"))
+    loop, _ = build_scenario(two_link(f"references.0={form}"))
     truth = signal.derivatives([2])
     for time in (0.0, 0.7, 1.3):
         np.testing.assert_allclose(loop.reference.reference(time)[:3], truth(time), atol=1e-15)
@@ -369,7 +369,9 @@ def test_outputs():
     """The outputs of seven_joint_wall in other words."""
     change = "outputs.0=!SurfaceCoordinates {constraint: wall}"
     errors = "start.errors={wall.across: 0.02}"
-    loop, context = build(load_scenario(find_scenario("seven_joint_wall"), [change, errors]))
+    loop, context = build_scenario(
+        load_scenario(find_scenario("seven_joint_wall"), [change, errors])
+    )
     names = [signal.name for signal in loop.plant.dae.output_signals]
     assert names[:3] == ["wall.along", "wall.across", "tool.z_axis.y"]
     assert names[3:] == ["tool.z_axis.z", "joint3", "joint7", "wall.force"]
@@ -389,7 +391,7 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
 
 
 def test_a_start_is_at_rest():
-    loop, context = build(two_link("integrator.start_time=3"))
+    loop, context = build_scenario(two_link("integrator.start_time=3"))
     assert context.get_time() == 3.0
     state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
     np.testing.assert_array_equal(state[2:], 0.0)
@@ -400,13 +402,13 @@ def test_build_leaves_the_scenario_alone():
         "references.0={_tag: '!Sinusoids', offset: 0.3, amplitudes: [0.1], frequencies: [1]}"
     )
     before = yaml_dump_typed(scenario)
-    build(scenario)
+    build_scenario(scenario)
     assert yaml_dump_typed(scenario) == before
 
 
 def test_weld():
     """The shipped scenario is the model of tests/two_arms.py."""
-    loop, _ = build(load_scenario(find_scenario("two_arms")))
+    loop, _ = build_scenario(load_scenario(find_scenario("two_arms")))
     (weld,) = loop.plant.model.constraints
     assert (weld.frame_a, weld.frame_b, weld.name) == (GRASP.frame_a, GRASP.frame_b, "grasp")
     np.testing.assert_allclose(
@@ -425,7 +427,7 @@ def test_weld():
 
 
 def test_coincident_points():
-    loop, context = build(load_scenario(find_scenario("five_bar")))
+    loop, context = build_scenario(load_scenario(find_scenario("five_bar")))
     (pin,) = loop.plant.model.constraints
     assert pin == CoincidentPoints("left2", (0.5, 0, 0), "right2", (0.5, 0, 0), "xz", "pin")
     # The ends meet, by Drake's kinematics.
@@ -471,7 +473,7 @@ def test_stages(form, stage):
     The rows of G = [[0.05, 0.01], [0, 0.04]] and its columns differ, so that a transposed matrix
     would show.
     """
-    loop, context = build(two_link(f"actuation=[{form}]"))
+    loop, context = build_scenario(two_link(f"actuation=[{form}]"))
     model = loop.plant.model
     rebuilt = type(model)(model.links, model.constraints, model.positions, actuation=[stage])
     assert [p.name for p in rebuilt.dae.parameters] == [p.name for p in model.dae.parameters]
@@ -496,7 +498,7 @@ def test_stages(form, stage):
 )
 def test_force_gain(gain, matrix):
     force = f"force=!MeasuredForce {{time_constant: 0.01, gain: {gain}}}"
-    loop, _ = build(load_scenario(find_scenario("five_bar"), [force]))
+    loop, _ = build_scenario(load_scenario(find_scenario("five_bar"), [force]))
     np.testing.assert_array_equal(loop.controller.law.force_gain, matrix)
 
 
@@ -515,7 +517,7 @@ def test_a_lever_has_nothing_to_move_but_presses(tmp_path):
 def test_a_robot_with_a_mesh(tmp_path):
     path = lever(tmp_path, shape='<mesh filename="shape.obj"/>')
     (tmp_path / "shape.obj").write_text(MESH)
-    loop, _ = build(load_scenario(path))
+    loop, _ = build_scenario(load_scenario(path))
     links = loop.plant.model.links
     assert len(links.plant.GetVisualGeometriesForBody(links.plant.GetBodyByName("arm"))) == 1
 
@@ -541,7 +543,7 @@ def test_a_robot_that_does_not_fit(change, words, tmp_path):
         )
         (tmp_path / "lever.urdf").write_text(text.replace('link="world"', 'link="base"'))
     with pytest.raises(ScenarioError) as caught:
-        build(load_scenario(path))
+        build_scenario(load_scenario(path))
     message = str(caught.value)
     assert "\n" not in message
     assert [word for word in words if word not in message] == [], message

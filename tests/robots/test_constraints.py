@@ -26,6 +26,7 @@ from two_arms import APART, GRASP, NOMINAL, two_arms
 
 from drake_dae import (
     CoincidentPoints,
+    ConstantReference,
     JointPositions,
     LinkExpressions,
     MultibodyExpressions,
@@ -33,15 +34,14 @@ from drake_dae import (
     PointOnSurface,
     RobotModel,
     RobotPlant,
+    SinusoidReference,
     Sphere,
     TrackingLaw,
     WeldedFrames,
-    constant,
     find_structure,
     make_closed_loop,
     poles,
     simulate,
-    sinusoids,
 )
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -511,16 +511,16 @@ def test_two_arms_track_motion_and_squeeze():
         RobotPlant(model, structure),
         law,
         [
-            sinusoids(APART / 2, 0.05, 2.0),
-            sinusoids(0.0, 0.05, 3.0),
-            sinusoids(0.4, 0.04, 2.5),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 0.1, 2.0),
-            constant([0.0, 0.0]),
-            sinusoids(40.0, 15.0, 4.0),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 1.0, 3.0),
-            constant([0.0, 0.0]),
+            SinusoidReference(APART / 2, 0.05, 2.0),
+            SinusoidReference(0.0, 0.05, 3.0),
+            SinusoidReference(0.4, 0.04, 2.5),
+            ConstantReference([0.0, 0.0]),
+            SinusoidReference(0.0, 0.1, 2.0),
+            ConstantReference([0.0, 0.0]),
+            SinusoidReference(40.0, 15.0, 4.0),
+            ConstantReference([0.0, 0.0]),
+            SinusoidReference(0.0, 1.0, 3.0),
+            ConstantReference([0.0, 0.0]),
         ],
     )
     context = loop.diagram.CreateDefaultContext()

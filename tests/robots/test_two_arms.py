@@ -13,16 +13,16 @@ from test_actuation_laws import closed_form, coupled, new_input
 from two_arms import APART, NOMINAL, two_arms
 
 from drake_dae import (
+    ConstantReference,
     FlexibleJoints,
     RobotPlant,
+    SinusoidReference,
     TrackingLaw,
-    constant,
     find_structure,
+    gain_matrices,
     make_closed_loop,
-    matrices,
     poles,
     simulate,
-    sinusoids,
 )
 
 STIFFNESS = np.tile([2e4, 2e4, 1e4, 1e4, 5e3, 2e3, 2e3], 2)
@@ -132,7 +132,7 @@ def test_law_commands_the_highest_derivatives():
     np.testing.assert_array_equal(model.links.actuation_matrix, np.eye(14))
     truth, random = Truth(model.links.plant), np.random.default_rng(11)
     gains, force_gains = coupled(4, 8, random), coupled(2, 6, random)
-    law = TrackingLaw(model.dae, matrices(gains, force_gains), structure)
+    law = TrackingLaw(model.dae, gain_matrices(gains, force_gains), structure)
     for _ in range(3):
         x = truth.state(model, structure, random)
         reference = random.standard_normal(8 * 5 + 6 * 3)
@@ -163,16 +163,16 @@ def test_errors_are_their_closed_forms():
         RobotPlant(model, structure),
         law,
         [
-            sinusoids(APART / 2, 0.05, 2.0),
-            sinusoids(0.0, 0.05, 3.0),
-            sinusoids(0.4, 0.04, 2.5),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 0.1, 2.0),
-            constant([0.0, 0.0]),
-            sinusoids(40.0, 15.0, 4.0),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 1.0, 3.0),
-            constant([0.0, 0.0]),
+            SinusoidReference(APART / 2, 0.05, 2.0),
+            SinusoidReference(0.0, 0.05, 3.0),
+            SinusoidReference(0.4, 0.04, 2.5),
+            ConstantReference([0.0, 0.0]),
+            SinusoidReference(0.0, 0.1, 2.0),
+            ConstantReference([0.0, 0.0]),
+            SinusoidReference(40.0, 15.0, 4.0),
+            ConstantReference([0.0, 0.0]),
+            SinusoidReference(0.0, 1.0, 3.0),
+            ConstantReference([0.0, 0.0]),
         ],
     )
     context = loop.diagram.CreateDefaultContext()
