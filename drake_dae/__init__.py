@@ -27,7 +27,7 @@ from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation, make_closed_loop
-from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.diagrams.scenario import load_scenario, scenario_schema
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.actuation.dc_motors import DcMotors
 from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
@@ -123,6 +123,7 @@ __all__ = [
     "make_animation",
     "make_closed_loop",
     "poles",
+    "scenario_schema",
     "simulate",
     "start_meshcat",
 ]

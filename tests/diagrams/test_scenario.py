@@ -1,14 +1,16 @@
 """Scenario files: read, refused with one line that names the key, built, and written."""
 
+from copy import deepcopy
 from dataclasses import fields
 
+import jsonschema
 import numpy as np
 import pytest
-from pydrake.common.yaml import yaml_dump_typed
 from pydrake.systems.analysis import SimulatorConfig
 from two_arms import GRASP, two_arms
 
 from drake_dae import (
+    AxisCoordinates,
     CoincidentPoints,
     ConstantReference,
     Cylinder,
@@ -16,7 +18,10 @@ from drake_dae import (
     ElectrohydraulicServos,
     Ellipsoid,
     FlexibleJoints,
+    JointPositions,
     Plane,
+    PointCoordinates,
+    PointOnSurface,
     PointToPointReference,
     SinusoidReference,
     Sphere,
@@ -26,7 +31,13 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.diagrams import scenario as forms
-from drake_dae.diagrams.scenario import find_scenario, save_scenario, shipped_scenarios
+from drake_dae.diagrams.scenario import (
+    find_scenario,
+    save_scenario,
+    scenario_schema,
+    shipped_scenarios,
+)
+from drake_dae.diagrams.typed_yaml import load_yaml
 from drake_dae.errors import ScenarioError
 from drake_dae.trace.functions import TracedFunction
 
@@ -63,7 +74,8 @@ def refusal(*settings):
     with pytest.raises(ScenarioError) as caught:
         build_scenario(two_link(*settings))
     message = str(caught.value)
-    assert "\n" not in message
+    lines = [f"{key}: {text}" for key, text in caught.value.problems]
+    assert message.splitlines() == lines
     return message
 
 
@@ -166,45 +178,55 @@ def test_a_saved_scenario_reads_back_equal(name, tmp_path):
     assert copy != scenario
 
 
+@pytest.mark.parametrize("name", shipped_scenarios())
+def test_the_json_schema_holds_for_shipped_scenarios(name, tmp_path):
+    """As they are written, and with all keys and tags."""
+    path = find_scenario(name)
+    save_scenario(load_scenario(path), tmp_path / "full.yaml")
+    for file in (path, tmp_path / "full.yaml"):
+        data = load_yaml(file.read_text(), name)
+        jsonschema.validate(data, scenario_schema())
+        data["constraints"][0]["nmae"] = "wall"
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(data, scenario_schema())
+
+
 def test_every_form_reads_back_equal(tmp_path):
+    surfaces = [
+        Plane((1, 2, 3), (0.2, 0.3, 0.7)),
+        Sphere((1, 2, 3), 0.1, (1, 0, 0), True),
+        Cylinder((1, 2, 3), (0, 1, 0), 1 / 3),
+        Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)),
+        Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1),
+    ]
     scenario = forms.Scenario(
         description="on: ä # 'quoted'\nsecond line",
         robot=forms.Robot("/some/where.urdf", {"other": "/else/where"}),
         constraints=[
             *[
-                forms.PointOnSurface("a", surface, [0.1, 1e-17, -0.0], f"c{i}")
-                for i, surface in enumerate(
-                    [
-                        forms.Plane([1, 2, 3], [0, 0, 1]),
-                        forms.Sphere([1, 2, 3], 0.1, [1, 0, 0], True),
-                        forms.Cylinder([1, 2, 3], [0, 1, 0], 1 / 3),
-                        forms.Ellipsoid([1, 2, 3], [0.1, 0.2, 0.3]),
-                        forms.Torus([1, 2, 3], [0, 0, 1], 0.5, 0.1),
-                    ]
-                )
+                PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
+                for i, surface in enumerate(surfaces)
             ],
-            forms.WeldedFrames("a", "b::c", forms.Pose([0.1, 0.2, 0.3], [90.0, 0.0, -45.0]), "w"),
-            forms.CoincidentPoints("a", [1, 2, 3], "b", [4, 5, 6], "zx", "p"),
+            forms.WeldedFrames("a", "b::c", forms.Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
+            CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
         ],
         outputs=[
-            forms.PointCoordinates("yes", "xy"),
-            forms.AxisCoordinates("b", "z", "xy"),
+            PointCoordinates("yes", "xy"),
+            AxisCoordinates("b", "z", "xy"),
             forms.SurfaceCoordinates("c0"),
-            forms.JointPositions(["joint1", "2"]),
+            JointPositions(["joint1", "2"]),
         ],
         actuation=[
-            forms.FlexibleJoints(
-                np.array([[8e3, 5e2], [5e2, 6e3]]), np.array([1.0, 1 / 3]), np.array(2.0)
-            ),
-            forms.DcMotors(np.array(0.1), np.array([1e-3, 2e-3]), np.array([0.5])),
-            forms.ElectrohydraulicServos(np.array(1e6), np.diag([1e-6, 2e-6]), np.eye(2)),
+            FlexibleJoints([[8e3, 5e2], [5e2, 6e3]], [1.0, 1 / 3], 2.0),
+            DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
+            ElectrohydraulicServos(1e6, np.diag([1e-6, 2e-6]), np.eye(2)),
         ],
-        force=forms.MeasuredForce(0.005, 0.001, np.array([1.0, -1.0]), gain=np.eye(2)),
+        force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0], gain=np.eye(2)),
         gains=forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
         references=[
-            forms.Constant([1.0]),
-            forms.Sinusoids(1.0, [2.0], [3.0], [4.0]),
-            forms.PointToPoint([0.0], [1.0], 0.5, 2.0, 4),
+            ConstantReference([1.0]),
+            SinusoidReference(1.0, [2.0], [3.0], [4.0]),
+            PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
         ],
         start=forms.Start({"joint1": 1e-9}, {"a.b": -1e300}),
         duration=1e-3,
@@ -214,17 +236,17 @@ def test_every_form_reads_back_equal(tmp_path):
     save_scenario(scenario, tmp_path / "all.yaml")
     copy = load_scenario(tmp_path / "all.yaml")
     assert copy == scenario
-    # Not only equal as text: the objects are of their classes.
+    # Not only equal as data: the objects are of their classes.
     assert copy.constraints == scenario.constraints
+    assert copy.outputs == scenario.outputs
     assert copy.references == scenario.references
     assert copy.gains == scenario.gains
+    assert copy.force.sensor(2).sample_period == 0.001
     pairs = list(zip(copy.actuation, scenario.actuation, strict=True))
     for one, other in [*pairs, (copy.force, scenario.force)]:
         assert type(one) is type(other)
         for item in fields(one):
-            np.testing.assert_array_equal(
-                getattr(one, item.name), getattr(other, item.name), strict=item.type is np.ndarray
-            )
+            np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
     for key in ("integration_scheme", "max_step_size", "accuracy", "use_error_control"):
         assert getattr(copy.integrator, key) == getattr(scenario.integrator, key)
 
@@ -266,9 +288,10 @@ def test_packages_of_a_robot(tmp_path):
         ("constraints.0.surface.point.0=1.1", lambda s: s.constraints[0].surface.point[0] == 1.1),
         ("constraints.0.surface.point=[1, 0, 0]", lambda s: s.constraints[0].surface.point[0] == 1),
         ("gains=!Coefficients {all: [16, 8]}", lambda s: s.gains == forms.Coefficients([16, 8])),
-        ("references.1=!Constant {values: [9]}", lambda s: s.references[1].values == [9]),
+        ("references.1=!Constant {values: [9]}", lambda s: s.references[1].values == (9,)),
         ("start.errors.tool.z=0.01", lambda s: s.start.errors == {"tool.z": 0.01}),
-        ("gains.outputs.tool.z=[-3]", lambda s: s.gains.outputs == {"tool.z": [-3]}),
+        ("gains={outputs: {tool.z: [-3]}}", lambda s: s.gains.outputs == {"tool.z": [-3]}),
+        ("plant_parameters.link2.mass=[5]", lambda s: s.plant_parameters == {"link2.mass": [5]}),
         ("description=a b", lambda s: s.description == "a b"),
         ("description=", None),
     ],
@@ -284,7 +307,7 @@ def test_settings(setting, read):
 def test_later_settings_see_earlier_ones():
     change = ["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1}"]
     change.append("constraints.0.surface.radius=2")
-    assert two_link(*change).constraints[0].surface == forms.Sphere([0, 0, 0], 2.0)
+    assert two_link(*change).constraints[0].surface == Sphere((0, 0, 0), 2.0)
 
 
 @pytest.mark.parametrize(
@@ -401,9 +424,9 @@ def test_build_leaves_the_scenario_alone():
     scenario = two_link(
         "references.0={_tag: '!Sinusoids', offset: 0.3, amplitudes: [0.1], frequencies: [1]}"
     )
-    before = yaml_dump_typed(scenario)
+    before = deepcopy(scenario)
     build_scenario(scenario)
-    assert yaml_dump_typed(scenario) == before
+    assert scenario == before
 
 
 def test_weld():
@@ -568,11 +591,11 @@ def test_a_robot_that_does_not_fit(change, words, tmp_path):
         (TWO_LINK + "3: 4\n", ["s.yaml: line 34: ", "'3' is not text"]),
         (TWO_LINK.replace("joint1: 1.2", "on: 1.2"), ["s.yaml: line 26: ", "'on' is not text"]),
         (TWO_LINK + "---\na: 1\n", ["s.yaml: line 34: ", "another document"]),
-        ("!Foo\n" + TWO_LINK, ["s.yaml: ", "takes no tag, got !Foo"]),
+        ("!Foo\n" + TWO_LINK, ["scenario: takes no tag, got !Foo"]),
         (TWO_LINK.replace("start:", "start: !Foo"), ["start: takes no tag, got !Foo"]),
         (TWO_LINK.replace("references:", "references: !Foo"), ["s.yaml: line 16: ", "!Foo"]),
         (TWO_LINK.replace("duration: 10.0", "duration: !Foo 1"), ["s.yaml: line 29: ", "!Foo"]),
-        (TWO_LINK + "x: !!python/object/apply:os.getcwd []", ["s.yaml: line 34: ", "mapping"]),
+        (TWO_LINK + "x: !!python/object/apply:os.getcwd []", ["s.yaml: line 34: ", "os.getcwd"]),
         (TWO_LINK.replace("!Poles", "!Pole"), ["gains: expected one of !Poles, ", "got !Pole"]),
         (TWO_LINK.replace("!Plane", ""), None),
         ("\ufeff" + TWO_LINK, None),
@@ -592,7 +615,7 @@ def test_texts(text, words, tmp_path):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
     message = str(caught.value)
-    assert "\n" not in message
+    assert len(message.splitlines()) == len(caught.value.problems)
     assert [word for word in words if word not in message] == [], message
 
 
@@ -656,7 +679,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("robot.file=two_link_wall.yaml", ["robot.file: ", "two_link_wall.yaml", ".urdf"]),
         # Constraints.
         ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "did you mean tool?", "link2"]),
-        ("constraints.0.point=[1, 2]", ["constraints.0: ", "point", "(1.0, 2.0)"]),
+        ("constraints.0.point=[1, 2]", ["constraints.0.point: expected 3 numbers, got [1, 2]"]),
         ("constraints.0.name=", ["constraints.0.name: expected text"]),
         ("constraints.0.name=''", ["constraints.0.name: ", "name of its own"]),
         (f"constraints=[{WALL}, {WALL}]", ["constraints.1.name: ", "'wall'"]),
@@ -665,7 +688,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["constraints: Assumption (2)"],
         ),
         ("constraints.0.surface.normal=[0, 0, 0]", ["constraints.0.surface: normal", "zero"]),
-        ("constraints.0.surface.normal=[0, 1]", ["constraints.0.surface: normal", "three"]),
+        ("constraints.0.surface.normal=[0, 1]", ["0.surface.normal: expected 3 numbers"]),
         (f"{SPHERE} {{center: [0, 0, 0], radius: -1}}", ["constraints.0.surface: radius", "-1"]),
         ("constraints.0.surface.point=[3, 0, 0]", ["start.positions: ", "wall.distance"]),
         # Welds and pins.
@@ -676,18 +699,18 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         (f"{WELD} frame_b: tool, name: ''}}", ["constraints.0.name: ", "name of its own"]),
         (
             f"{WELD} frame_b: tool, pose: {{rpy_deg: [0, 90]}}}}",
-            ["constraints.0.pose: rpy_deg: 3 numbers", "[0.0, 90.0]"],
+            ["constraints.0.pose.rpy_deg: expected 3 numbers, got [0, 90]"],
         ),
         (
             f"{WELD} frame_b: tool, pose: {{translation: []}}}}",
-            ["constraints.0.pose: translation: 3 numbers", "[]"],
+            ["constraints.0.pose.translation: expected 3 numbers, got []"],
         ),
         (
             f"{WELD} frame_b: tool, pose: {{rpy: [0, 0, 0]}}}}",
             ["constraints.0.pose: has no key 'rpy'", "keys: translation, rpy_deg"],
         ),
         (f"{WELD} frame_b: tool}}", ["outputs: ", "6 constraint forces", "2 actuators"]),
-        (f"{PIN} point_b: [1, 0]}}", ["constraints.0: ", "point", "(1.0, 0.0)"]),
+        (f"{PIN} point_b: [1, 0]}}", ["constraints.0.point_b: expected 3 numbers, got [1, 0]"]),
         (f"{PIN} point_b: [1, 0, 0], axes: xx}}", ["constraints.0: axes", "'xx'"]),
         (f"{PIN} axes: x}}", ["constraints.0: !CoincidentPoints needs the key 'point_b'"]),
         (
@@ -696,7 +719,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         (
             (f"{PIN} point_b: [1, 0, 0], axes: x}}", f"{ALONG} {{constraint: pin}}"),
-            ["outputs.0: no point on a surface 'pin'; there are none"],
+            ["outputs.0: ", "'pin'", "no coordinates"],
         ),
         # Outputs.
         ("outputs=[]", ["outputs: ", "2 actuators", "1 position output", "0 (none)"]),
@@ -737,7 +760,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         (f"{MOVE} {{start: [1], end: [2], end_time: 0}}", ["references.0: end_time 0"]),
         (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["0: ", "order=2"]),
         # Actuation and force.
-        ("actuation=[!FlexibleJoints {stiffness: []}]", ["actuation.0: stiffness: empty"]),
+        ("actuation=[!FlexibleJoints {stiffness: []}]", ["actuation.0.stiffness: empty"]),
         (
             "actuation=[!FlexibleJoints {stiffness: [1, 2, 3], inertia: [1]}]",
             ["actuation.0: ", "stiffness"],
@@ -779,6 +802,38 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
 def test_refused_with_key_value_and_remedy(settings, words):
     message = refusal(*([settings] if isinstance(settings, str) else settings))
     assert [word for word in words if word not in message] == [], message
+
+
+def test_all_problems_are_told_at_once():
+    """Also below a wrong key, in several entries of a list, and beside a missing key."""
+    message = refusal(
+        "outputs.0.axs=z",
+        "outputs.0.frame=3",
+        "start.errors={tool.z: a, b: c}",
+        "duration=.nan",
+        "write.plots=maybe",
+    )
+    assert [line.split(": ")[0] for line in message.splitlines()] == [
+        *["outputs.0.frame", "outputs.0"],
+        *["start.errors.tool.z", "start.errors.b"],
+        *["duration", "write.plots"],
+    ]
+    message = refusal(f"{SPHERE} {{center: [0, 0], radius: big, side: 1, inside: 0}}")
+    assert message.splitlines() == [
+        "constraints.0.surface.center: expected 3 numbers, got [0, 0]",
+        "constraints.0.surface.radius: expected a number, got 'big'",
+        "constraints.0.surface.inside: expected true or false, got 0",
+        "constraints.0.surface: !Sphere has no key 'side'; did you mean 'inside'? keys: center, "
+        "radius, axis, inside",
+    ]
+    # What a class refuses itself, in several places.
+    message = refusal(
+        f"{SPHERE} {{center: [0, 0, 0], radius: -1}}",
+        "outputs.0.axes=zz",
+        f"{MOVE} {{start: [1], end: [2], end_time: 0}}",
+    )
+    keys = [line.split(": ")[0] for line in message.splitlines()]
+    assert keys == ["constraints.0.surface", "outputs.0", "references.0"]
 
 
 def test_a_file_that_is_not_there(tmp_path):
