@@ -3,7 +3,7 @@
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
-from drake_dae import ClosedLoop, Record, build, load_scenario, simulate
+from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
 from drake_dae.diagrams.scenario import Scenario, find_scenario
 
 
@@ -19,5 +19,5 @@ def run(loop: ClosedLoop, context: Context, duration: float, config: SimulatorCo
 
 def run_scenario(chosen: Scenario) -> tuple[ClosedLoop, Context, Record]:
     """A scenario from its start to its end, without Meshcat."""
-    loop, context = build(chosen)
+    loop, context = build_scenario(chosen)
     return loop, context, run(loop, context, chosen.duration, chosen.integrator)

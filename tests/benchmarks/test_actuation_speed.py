@@ -13,16 +13,16 @@ from arms import fixed_step, touching
 from two_arms import APART, two_arms
 
 from drake_dae import (
+    ConstantReference,
     DcMotors,
     ElectrohydraulicServos,
     FlexibleJoints,
     RobotPlant,
+    SinusoidReference,
     TrackingLaw,
-    constant,
     make_closed_loop,
     poles,
     simulate,
-    sinusoids,
 )
 
 SPRINGS = FlexibleJoints(8000.0, inertia=1.0)
@@ -39,22 +39,22 @@ MODELS = {
     "seven_joint": lambda stages: touching("seven_joint", stages),
     "two_arms": two_arms,
 }
-FORCE = sinusoids(20.0, 5.0, 2.0)
+FORCE = SinusoidReference(20.0, 5.0, 2.0)
 REFERENCES = {
-    "two_link": [sinusoids(0.3, 0.1, 1.5), FORCE],
+    "two_link": [SinusoidReference(0.3, 0.1, 1.5), FORCE],
     "seven_joint": [
-        sinusoids(0.0, 0.1, 1.5),
-        sinusoids(0.6, 0.1, 1.5),
-        constant(np.zeros(4)),
+        SinusoidReference(0.0, 0.1, 1.5),
+        SinusoidReference(0.6, 0.1, 1.5),
+        ConstantReference(np.zeros(4)),
         FORCE,
     ],
     "two_arms": [
-        sinusoids(APART / 2, 0.05, 1.5),
-        sinusoids(0.0, 0.1, 1.5),
-        sinusoids(0.4, 0.05, 1.5),
-        constant(np.zeros(5)),
+        SinusoidReference(APART / 2, 0.05, 1.5),
+        SinusoidReference(0.0, 0.1, 1.5),
+        SinusoidReference(0.4, 0.05, 1.5),
+        ConstantReference(np.zeros(5)),
         FORCE,
-        constant(np.zeros(5)),
+        ConstantReference(np.zeros(5)),
     ],
 }
 LAW_TARGETS = {("seven_joint", "flexible"): 80.0, ("two_arms", "flexible"): 150.0}

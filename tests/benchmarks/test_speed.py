@@ -12,7 +12,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_dae import build, load_scenario, simulate
+from drake_dae import build_scenario, load_scenario, simulate
 from drake_dae.diagrams.scenario import find_scenario
 
 SCENARIOS = ["two_link_wall", "seven_joint_wall"]
@@ -80,7 +80,7 @@ def empty_loop(states, references, controls):
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_derivative_evaluation(name, report):
-    loop, context = build(load_scenario(find_scenario(name)))
+    loop, context = build_scenario(load_scenario(find_scenario(name)))
     law = loop.controller.law
     empty = empty_loop(law.system.num_states, len(law.reference_signals), law.system.num_controls)
     ours, drake = microseconds(loop.diagram, context), microseconds(*empty)
@@ -100,7 +100,7 @@ def test_derivative_evaluation(name, report):
 def test_building_and_running(name, report):
     began = time.perf_counter()
     scenario = load_scenario(find_scenario(name), ["integrator.accuracy=1e-6"])
-    loop, context = build(scenario)
+    loop, context = build_scenario(scenario)
     built = time.perf_counter() - began
     run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     report(

@@ -22,7 +22,7 @@ from problems import (
 from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pinned_motion as module
-from drake_dae import DaePlant, ExpressionSignal, analyze, constant, make_closed_loop
+from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
 from drake_dae.dae.gains import poles
 from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
@@ -1070,19 +1070,19 @@ def test_the_force_that_is_asked_for_decides(force, rate):
     law = TrackingLaw(system, poles(-3.0), structure)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        make_closed_loop(DaePlant(structure), law, [constant(outputs)])
+        make_closed_loop(DaePlant(structure), law, [ConstantReference(outputs)])
     assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
 
 
 def test_a_loop_is_judged_when_it_begins():
     """The force grows from 20 to 60 N in 2 s: unstable above 40 N."""
     law = TrackingLaw(slider(), poles(-3.0))
-    force = ExpressionSignal(lambda t: [20 + 20 * t])
+    force = ExpressionReference(lambda t: [20 + 20 * t])
     for start, unstable in ((0.0, False), (2.0, True)):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             make_closed_loop(
-                DaePlant(law.structure), law, [constant([0.0]), force], start_time=start
+                DaePlant(law.structure), law, [ConstantReference([0.0]), force], start_time=start
             )
         assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
 

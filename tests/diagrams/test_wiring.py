@@ -6,19 +6,19 @@ from arms import arm, fixed_step, law, touching
 from runs import run, run_scenario, scenario
 
 from drake_dae import (
+    ConstantReference,
     DcMotors,
     ForceSensor,
     RobotPlant,
     StateRealization,
     TrackingLaw,
-    build,
-    constant,
+    build_scenario,
     make_closed_loop,
     poles,
 )
 from drake_dae.errors import ScenarioError, WiringError
 
-REFERENCES = [constant(0.3), constant(20.0)]
+REFERENCES = [ConstantReference(0.3), ConstantReference(20.0)]
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 
 
@@ -145,7 +145,7 @@ def test_scenarios_of_actuation_follow_their_prediction(name):
 )
 def test_refusals_name_the_key(name, setting, message):
     with pytest.raises(ScenarioError, match=message):
-        build(scenario(name, setting))
+        build_scenario(scenario(name, setting))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_refusals_name_the_key(name, setting, message):
 )
 def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
     """The tip is on the plant's wall at the wanted height, at rest, with the wanted force."""
-    loop, context = build(scenario("two_link_flexible", setting))
+    loop, context = build_scenario(scenario("two_link_flexible", setting))
     own = loop.plant.GetMyContextFromRoot(context)
     state = loop.plant.state(own)
     q = state[:2]
@@ -172,11 +172,13 @@ def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
 
 def test_a_gain_without_effect_is_refused():
     with pytest.raises(ScenarioError, match=r"force or gains: .*degree 2 and takes the measured"):
-        build(scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}"))
+        build_scenario(
+            scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}")
+        )
 
 
 def test_a_state_realization_is_no_plant_for_the_closed_loop():
     chosen = law("two_link")
     realization = StateRealization(chosen.structure)
     with pytest.raises(WiringError, match="needs a DaePlant or RobotPlant, got StateRealization"):
-        make_closed_loop(realization, chosen, [constant([0.2, 20.0])])
+        make_closed_loop(realization, chosen, [ConstantReference([0.2, 20.0])])

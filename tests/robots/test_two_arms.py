@@ -18,8 +18,8 @@ from drake_dae import (
     RobotPlant,
     TrackingLaw,
     find_structure,
+    gain_matrices,
     make_closed_loop,
-    matrices,
     poles,
     simulate,
 )
@@ -132,7 +132,7 @@ def test_law_commands_the_highest_derivatives():
     np.testing.assert_array_equal(model.links.actuation_matrix, np.eye(14))
     truth, random = Truth(model.links.plant), np.random.default_rng(11)
     gains, force_gains = coupled(4, 8, random), coupled(2, 6, random)
-    law = TrackingLaw(model.dae, matrices(gains, force_gains), structure)
+    law = TrackingLaw(model.dae, gain_matrices(gains, force_gains), structure)
     for _ in range(3):
         x = truth.state(model, structure, random)
         reference = random.standard_normal(8 * 5 + 6 * 3)

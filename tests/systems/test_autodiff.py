@@ -30,20 +30,20 @@ from pydrake.systems.primitives import (
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import (
+    ConstantReference,
     DaePlant,
     DaeSystem,
-    ExpressionSignal,
+    ExpressionReference,
     ForceSensor,
+    PointToPointReference,
     ReferenceGenerator,
     RobotPlant,
+    SinusoidReference,
     TrackingController,
     TrackingLaw,
-    TrajectorySignal,
-    constant,
+    TrajectoryReference,
     make_closed_loop,
-    point_to_point,
     poles,
-    sinusoids,
 )
 from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError, SingularityError
 
@@ -160,7 +160,7 @@ def test_a_force_sensor():
         lambda: plant_of("two_link hydraulic")[0],
         lambda: plant_of("pendulum_tension")[0],
         lambda: TrackingController(law("seven_joint")),
-        lambda: ReferenceGenerator([constant([1.0, 2.0])], [2, 0]),
+        lambda: ReferenceGenerator([ConstantReference([1.0, 2.0])], [2, 0]),
         lambda: ForceSensor(1, time_constant=0.1, noise_deviation=1.0),
     ],
 )
@@ -187,13 +187,13 @@ def test_ports_parameters_and_feedthrough_are_kept(make):
 def test_references_move_with_the_time(as_trajectory):
     """dR/dt is the table of the next higher derivatives: of t^4, 24 t follows 12 t^2."""
     t = 0.7
-    quartic = ExpressionSignal(lambda t: t**4)
+    quartic = ExpressionReference(lambda t: t**4)
     if as_trajectory:
         line = PiecewisePolynomial.LagrangeInterpolatingPolynomial(
             np.linspace(0, 1, 5), (np.linspace(0, 1, 5) ** 4)[None]
         )
-        quartic = TrajectorySignal(line)
-    generator = ReferenceGenerator([quartic, sinusoids(0.0, 1.0, 2.0)], [2, 1])
+        quartic = TrajectoryReference(line)
+    generator = ReferenceGenerator([quartic, SinusoidReference(0.0, 1.0, 2.0)], [2, 1])
     converted = generator.ToAutoDiffXd()
     context = converted.CreateDefaultContext()
     context.SetTime(AutoDiffXd(t, [3.0]))
@@ -211,7 +211,7 @@ def test_references_move_with_the_time(as_trajectory):
 
 
 def test_a_time_that_moves_needs_one_more_derivative():
-    generator = ReferenceGenerator([point_to_point(0.0, 1.0, 0.0, 1.0, order=2)], [2])
+    generator = ReferenceGenerator([PointToPointReference(0.0, 1.0, 0.0, 1.0, order=2)], [2])
     converted = generator.ToAutoDiffXd()
     context = converted.CreateDefaultContext()
     context.SetTime(0.5)
@@ -266,7 +266,7 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
     loop = make_closed_loop(
         plant,
         TrackingLaw(model.dae, gains, structure, **force_feedback),
-        [constant(outputs[:-1]), constant(20.0)],
+        [ConstantReference(outputs[:-1]), ConstantReference(20.0)],
         sensor=sensor,
     )
     whole = loop.diagram.CreateDefaultContext()
@@ -307,7 +307,7 @@ def test_a_closed_loop_keeps_its_zero_dynamics():
     mass, length, gravity, angle = 2.0, 0.8, 9.81, 0.6
     force = -mass * gravity / (length * np.cos(angle))
     design = TrackingLaw(problem.system, poles(-1.0))
-    loop = make_closed_loop(DaePlant(problem.system), design, [constant(force)])
+    loop = make_closed_loop(DaePlant(problem.system), design, [ConstantReference(force)])
     context = loop.diagram.CreateDefaultContext()
     context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
     swing = 1j * np.sqrt(-force / mass)

@@ -9,24 +9,24 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
 
 from drake_dae import (
+    ConstantReference,
     DcMotors,
     ElectrohydraulicServos,
     FlexibleJoints,
     ForceSensor,
     ReferenceGenerator,
     RobotPlant,
+    SinusoidReference,
     TrackingController,
     TrackingLaw,
-    constant,
     poles,
-    sinusoids,
 )
 from drake_dae.errors import GainError, ModelError
 
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 SERVOS = ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
-MOVE = [sinusoids(0.3, 0.1, 1.5), sinusoids(20.0, 5.0, 2.0)]
-HOLD = [constant(0.3), constant(20.0)]
+MOVE = [SinusoidReference(0.3, 0.1, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
+HOLD = [ConstantReference(0.3), ConstantReference(20.0)]
 
 
 def run(
@@ -90,7 +90,7 @@ def run(
 def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     """(61) with a wrong mass: within 5 %, of which the lag takes about 1 %; position untouched."""
     model = arm("two_link").model
-    slow, sensor = [MOVE[0], sinusoids(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
+    slow, sensor = [MOVE[0], SinusoidReference(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
     times, without, *_ = run(model, slow)
     _, feedback, *_ = run(model, slow, measured=True, gain=gain, sensor=sensor)
     later = times > 1.0
