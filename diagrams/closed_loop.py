@@ -11,7 +11,7 @@ from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogS
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ReferenceSignal
+from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, WiringError
@@ -100,7 +100,7 @@ class ClosedLoop:
 def make_closed_loop(
     system: DaePlant,
     law: TrackingLaw,
-    references: Sequence[ReferenceSignal],
+    references: Sequence[Reference],
     *,
     sensor: ForceSensor | None = None,
     scene_graph: SceneGraph | None = None,

@@ -1,31 +1,54 @@
 """Scenario files: a robot in contact, what it shall do, and how to simulate it.
 
-A scenario is YAML, read by Drake's typed loader into the dataclasses below. A choice between
-several forms is written with the form's name as a tag, for example `surface: !Sphere`.
+A scenario is YAML. What the library has as a dataclass is written with the keys of that dataclass;
+a choice between several is written with the name as a tag, for example `surface: !Sphere`. The
+classes here are what has no such dataclass.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from difflib import get_close_matches
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import SimulatorConfig
 
-from drake_dae.diagrams.typed_yaml import REQUIRED, Numbers, read_typed
-from drake_dae.errors import ScenarioError
+from drake_dae.arrays import unknown_name
+from drake_dae.dae import references
+from drake_dae.dae.gains import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
+from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
+from drake_dae.errors import GainError, ModelError, ScenarioError
+from drake_dae.robots import actuation, contact, outputs
+from drake_dae.robots.contact import surfaces
+from drake_dae.systems.sensors import ForceSensor
 
 FOLDER = Path(__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
 
-
-def _none() -> Numbers:
-    """No numbers: the key was left out."""
-    return np.zeros(0)
+T = TypeVar("T")
 
 
-@dataclass
+class Written(ABC, Generic[T]):
+    """What a scenario writes in another way than the library holds it."""
+
+    @abstractmethod
+    def made(self, constraints: Sequence[contact.Constraint]) -> T:
+        """What the library holds.
+
+        Args:
+            constraints: Those of the scenario, as far as they are made.
+
+        Raises:
+            ModelError: What does not fit.
+        """
+
+
+@dataclass(frozen=True)
 class Robot:
     """A robot that Drake's Parser reads.
 
@@ -35,184 +58,67 @@ class Robot:
         packages: Name -> folder, relative to the scenario, for other "package://<name>/...".
     """
 
-    file: str = field(default="", metadata=REQUIRED)
+    file: str
     packages: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass
-class Plane:
-    """`robots.surfaces.Plane`."""
-
-    point: list[float] = field(default_factory=list, metadata=REQUIRED)
-    normal: list[float] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass
-class Sphere:
-    """`robots.surfaces.Sphere`."""
-
-    center: list[float] = field(default_factory=list, metadata=REQUIRED)
-    radius: float = field(default=0.0, metadata=REQUIRED)
-    axis: list[float] = field(default_factory=lambda: [0.0, 0.0, 1.0])
-    inside: bool = False
-
-
-@dataclass
-class Cylinder:
-    """`robots.surfaces.Cylinder`."""
-
-    point: list[float] = field(default_factory=list, metadata=REQUIRED)
-    axis: list[float] = field(default_factory=list, metadata=REQUIRED)
-    radius: float = field(default=0.0, metadata=REQUIRED)
-    inside: bool = False
-
-
-@dataclass
-class Ellipsoid:
-    """`robots.surfaces.Ellipsoid`."""
-
-    center: list[float] = field(default_factory=list, metadata=REQUIRED)
-    semi_axes: list[float] = field(default_factory=list, metadata=REQUIRED)
-    inside: bool = False
-
-
-@dataclass
-class Torus:
-    """`robots.surfaces.Torus`."""
-
-    center: list[float] = field(default_factory=list, metadata=REQUIRED)
-    axis: list[float] = field(default_factory=list, metadata=REQUIRED)
-    major_radius: float = field(default=0.0, metadata=REQUIRED)
-    minor_radius: float = field(default=0.0, metadata=REQUIRED)
-    inside: bool = False
-
-
-@dataclass
-class PointOnSurface:
-    """`robots.constraints.PointOnSurface`."""
-
-    frame: str = field(default="", metadata=REQUIRED)
-    surface: Plane | Sphere | Cylinder | Ellipsoid | Torus = field(
-        default_factory=Plane, metadata=REQUIRED
-    )
-    point: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    name: str = "surface"
-
-
-@dataclass
+@dataclass(frozen=True)
 class Pose:
     """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
 
-    translation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    translation: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
 
 
-@dataclass
-class WeldedFrames:
-    """`robots.constraints.WeldedFrames`."""
+@dataclass(frozen=True)
+class WeldedFrames(Written[contact.Constraint]):
+    """`robots.contact.WeldedFrames`, its pose by angles."""
 
-    frame_a: str = field(default="", metadata=REQUIRED)
-    frame_b: str = field(default="", metadata=REQUIRED)
-    pose: Pose = field(default_factory=Pose)
+    frame_a: str
+    frame_b: str
+    pose: Pose = Pose()
     name: str = "weld"
 
-
-@dataclass
-class CoincidentPoints:
-    """`robots.constraints.CoincidentPoints`."""
-
-    frame_a: str = field(default="", metadata=REQUIRED)
-    point_a: list[float] = field(default_factory=list, metadata=REQUIRED)
-    frame_b: str = field(default="", metadata=REQUIRED)
-    point_b: list[float] = field(default_factory=list, metadata=REQUIRED)
-    axes: str = "xyz"
-    name: str = "pin"
+    def made(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
+        pose = RigidTransform(rotation, self.pose.translation)
+        return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
 
 
-@dataclass
-class PointCoordinates:
-    """`robots.outputs.PointCoordinates`."""
-
-    frame: str = field(default="", metadata=REQUIRED)
-    axes: str = "xyz"
-    point: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    name: str = ""
-
-
-@dataclass
-class AxisCoordinates:
-    """`robots.outputs.AxisCoordinates`."""
-
-    frame: str = field(default="", metadata=REQUIRED)
-    axis: str = field(default="", metadata=REQUIRED)
-    components: str = field(default="", metadata=REQUIRED)
-
-
-@dataclass
-class SurfaceCoordinates:
+@dataclass(frozen=True)
+class SurfaceCoordinates(Written[outputs.PositionOutput]):
     """`robots.outputs.SurfaceCoordinates` of the constraint with a name."""
 
-    constraint: str = field(default="", metadata=REQUIRED)
+    constraint: str
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        named = {constraint.name: constraint for constraint in constraints}
+        if self.constraint not in named:
+            raise ModelError(unknown_name("constraint", self.constraint, named))
+        return outputs.SurfaceCoordinates(cast(contact.PointOnSurface, named[self.constraint]))
 
 
-@dataclass
-class JointPositions:
-    """`robots.outputs.JointPositions`."""
-
-    joints: list[str] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass(eq=False)
-class FlexibleJoints:
-    """`robots.actuation.FlexibleJoints`; one number serves all actuators.
-
-    Each is a number, one per actuator, or a matrix row by row, `[[8000, 500], [500, 6000]]`. An
-    inertia that is left out is what the URDF declares.
-    """
-
-    stiffness: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    inertia: Numbers = field(default_factory=_none)
-    damping: Numbers = field(default_factory=lambda: np.array(0.0))
-
-
-@dataclass(eq=False)
-class DcMotors:
-    """`robots.actuation.DcMotors`; one number serves all actuators.
-
-    Each is a number, or one per actuator. A gear ratio that is left out is what the URDF declares.
-    """
-
-    torque_constant: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    inductance: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    resistance: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    gear_ratio: Numbers = field(default_factory=_none)
-
-
-@dataclass(eq=False)
-class ElectrohydraulicServos:
-    """`robots.actuation.ElectrohydraulicServos`; one number serves all, G(q) is for Python.
-
-    Each is a number or one per actuator; leakage and geometry may be matrices, row by row.
-    """
-
-    stiffness: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    leakage: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    geometry: Numbers = field(default_factory=lambda: np.array(1.0))
-
-
-@dataclass
+@dataclass(frozen=True)
 class ModelForce:
     """The law uses the force of its model: (28)."""
 
+    is_measured: ClassVar = False
+    seed: ClassVar = 0
+    gain: ClassVar = 0.0
 
-@dataclass(eq=False)
+    def sensor(self, size: int) -> ForceSensor | None:
+        """None is needed."""
+        return None
+
+
+@dataclass(frozen=True)
 class MeasuredForce:
     """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
 
     Attributes:
-        time_constant: Of the sensor's lag, s.
-        sample_period: s; 0 for none.
-        bias: N (N m for a moment), one number for all forces or one each.
+        time_constant: Of the sensor's lag, in s.
+        sample_period: In s; 0 for none.
+        bias: In N (N m for a moment), one number for all forces or one each.
         noise_deviation: Likewise.
         seed: Of the noise.
         gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
@@ -220,72 +126,75 @@ class MeasuredForce:
 
     time_constant: float = 0.0
     sample_period: float = 0.0
-    bias: Numbers = field(default_factory=lambda: np.array(0.0))
-    noise_deviation: Numbers = field(default_factory=lambda: np.array(0.0))
+    bias: Numbers = 0.0
+    noise_deviation: Numbers = 0.0
     seed: int = 0
-    gain: Numbers = field(default_factory=lambda: np.array(0.0))
+    gain: Numbers = 0.0
+    is_measured: ClassVar = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**32:
+            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
+
+    def sensor(self, size: int) -> ForceSensor | None:
+        """The sensor of a number of forces."""
+        return ForceSensor(
+            size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
+        )
 
 
-@dataclass
-class Poles:
-    """`dae.gains.poles`: real poles for all outputs, or per output name ("*" for all others).
-
-    Complex ones are written as Coefficients.
-    """
+@dataclass(frozen=True)
+class PerOutput:
+    """Numbers for all outputs, or per output name ("*" for all others)."""
 
     all: list[float] = field(default_factory=list)
     outputs: dict[str, list[float]] = field(default_factory=dict)
 
-
-@dataclass
-class Coefficients:
-    """`dae.gains.coefficients`: K_i1, ..., K_i mu_i for all outputs, or per output name."""
-
-    all: list[float] = field(default_factory=list)
-    outputs: dict[str, list[float]] = field(default_factory=dict)
+    def __post_init__(self) -> None:
+        if self.all and self.outputs:
+            raise GainError("give either 'all' or 'outputs', not both")
 
 
-@dataclass
+@dataclass(frozen=True)
+class Poles(PerOutput):
+    """`dae.gains.poles`; complex ones are written as Coefficients."""
+
+    def design(self) -> GainDesign:
+        """The gains."""
+        return poles(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Coefficients(PerOutput):
+    """`dae.gains.gain_coefficients`: K_i1, ..., K_i mu_i."""
+
+    def design(self) -> GainDesign:
+        """The gains."""
+        return gain_coefficients(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
 class Matrices:
-    """`dae.gains.matrices`: for each degree, highest first, its Lambda_1, Lambda_2, ..."""
+    """`dae.gains.gain_matrices`: for each degree, highest first, its Lambda_1, Lambda_2, ..."""
 
-    groups: list[list[list[list[float]]]] = field(default_factory=list, metadata=REQUIRED)
+    groups: list[list[list[list[float]]]]
 
+    def __post_init__(self) -> None:
+        for matrix in (matrix for group in self.groups for matrix in group):
+            if len({len(row) for row in matrix}) != 1:
+                raise GainError(f"groups: the rows of {matrix} have different lengths")
 
-@dataclass
-class Constant:
-    """`systems.references.constant`."""
-
-    values: list[float] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass
-class Sinusoids:
-    """`systems.references.sinusoids`; the phases are 0 where none are given."""
-
-    offset: float = field(default=0.0, metadata=REQUIRED)
-    amplitudes: list[float] = field(default_factory=list, metadata=REQUIRED)
-    frequencies: list[float] = field(default_factory=list, metadata=REQUIRED)
-    phases: list[float] = field(default_factory=list)
+    def design(self) -> GainDesign:
+        """The gains."""
+        return gain_matrices(*self.groups)
 
 
-@dataclass
-class PointToPoint:
-    """`systems.references.point_to_point`."""
-
-    start: list[float] = field(default_factory=list, metadata=REQUIRED)
-    end: list[float] = field(default_factory=list, metadata=REQUIRED)
-    start_time: float = 0.0
-    end_time: float = field(default=0.0, metadata=REQUIRED)
-    order: int = 2
-
-
-@dataclass
+@dataclass(frozen=True)
 class Start:
     """At rest, on the constraint, with given errors of the position outputs.
 
     Attributes:
-        positions: Joint name -> position near which the robot starts, rad or m; the robot's
+        positions: Joint name -> position near which the robot starts, in rad or m; the robot's
             default where not given.
         errors: Output name -> z - r at the start; 0 where not given. Forces can start off their
             references where actuators have dynamics.
@@ -295,7 +204,7 @@ class Start:
     errors: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Write:
     """What a run leaves in its folder, beside the scenario and the summary."""
 
@@ -304,7 +213,43 @@ class Write:
     animation: bool = True
 
 
-@dataclass(eq=False)
+# The families that a tag chooses from, and what stands in a file for the types of their fields. A
+# new member is one line here.
+
+Surface = Annotated[
+    surfaces.Plane | surfaces.Sphere | surfaces.Cylinder | surfaces.Ellipsoid | surfaces.Torus,
+    Choice({surfaces.Vector: Triple}),
+]
+Constraint = Annotated[
+    contact.PointOnSurface | WeldedFrames | contact.CoincidentPoints,
+    Choice({surfaces.Vector: Triple, surfaces.Surface: Surface}),
+]
+Output = Annotated[
+    outputs.PointCoordinates
+    | outputs.AxisCoordinates
+    | SurfaceCoordinates
+    | outputs.JointPositions,
+    Choice({surfaces.Vector: Triple}),
+]
+Stage = Annotated[
+    actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
+    Choice({ArrayLike: Numbers}),
+]
+Reference = Annotated[
+    Annotated[references.ConstantReference, Form(tag="!Constant")]
+    | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
+    | Annotated[
+        references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
+    ],
+    Choice({ArrayLike: Row}),
+]
+Force = Annotated[ModelForce | MeasuredForce, Choice()]
+Gains = Annotated[Poles | Coefficients | Matrices, Choice()]
+
+_INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
+
+
+@dataclass(frozen=True, eq=False)
 class Scenario:
     """A robot in contact, what it shall do, and how to simulate it.
 
@@ -319,40 +264,40 @@ class Scenario:
         gains: Of the tracking law (28).
         references: One below the other, in the order of the outputs, the forces last.
         start: Where it starts.
-        duration: s.
+        duration: In s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
         write: What to keep.
     """
 
-    description: str = ""
-    robot: Robot = field(default_factory=Robot, metadata=REQUIRED)
-    constraints: list[PointOnSurface | WeldedFrames | CoincidentPoints] = field(
-        default_factory=list
-    )
-    outputs: list[PointCoordinates | AxisCoordinates | SurfaceCoordinates | JointPositions] = field(
-        default_factory=list
-    )
-    actuation: list[FlexibleJoints | DcMotors | ElectrohydraulicServos] = field(
-        default_factory=list
-    )
-    force: ModelForce | MeasuredForce = field(default_factory=ModelForce)
+    description: str = field(default="", kw_only=True)
+    robot: Robot
+    constraints: list[Constraint] = field(default_factory=list)
+    outputs: list[Output] = field(default_factory=list)
+    actuation: list[Stage] = field(default_factory=list)
+    force: Force = ModelForce()
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
-    gains: Poles | Coefficients | Matrices = field(default_factory=Poles)
-    references: list[Constant | Sinusoids | PointToPoint] = field(
-        default_factory=list, metadata=REQUIRED
-    )
-    start: Start = field(default_factory=Start)
+    gains: Gains = Poles()
+    references: list[Reference] = field(kw_only=True)
+    start: Start = Start()
     duration: float = 10.0
-    integrator: SimulatorConfig = field(
-        default_factory=lambda: SimulatorConfig(
-            integration_scheme="runge_kutta5", accuracy=1e-6, use_error_control=True
-        )
+    integrator: Annotated[SimulatorConfig, Form(defaults=_INTEGRATOR)] = field(
+        default_factory=lambda: SimulatorConfig(**_INTEGRATOR)
     )
-    write: Write = field(default_factory=Write)
+    write: Write = Write()
 
     def __eq__(self, other: object) -> bool:
-        # Drake's SimulatorConfig compares by identity.
-        return isinstance(other, Scenario) and yaml_dump_typed(self) == yaml_dump_typed(other)
+        # Arrays, and Drake's SimulatorConfig, do not compare as a whole.
+        return isinstance(other, Scenario) and _reader().write(self) == _reader().write(other)
+
+
+@cache
+def _reader() -> Reader[Scenario]:
+    return Reader(Scenario)
+
+
+def scenario_schema() -> dict[str, Any]:
+    """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
+    return _reader().schema
 
 
 def shipped_scenarios() -> dict[str, Path]:
@@ -372,9 +317,8 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    near = get_close_matches(name, shipped, n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
-    raise ScenarioError(f"no scenario file '{name}'; {hint}shipped scenarios: {', '.join(shipped)}")
+    message = unknown_name("scenario file", name, shipped)
+    raise ScenarioError(("", message.replace("there are", "shipped scenarios:")))
 
 
 def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
@@ -386,23 +330,29 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
             "constraints.0.surface.point=[0.7, 0, 0]".
 
     Raises:
-        ScenarioError: No such file, broken YAML, a key that is unknown, missing or given twice, or
-            a value of a wrong type.
+        ScenarioError: No such file, broken YAML, or keys that are unknown, missing or given twice
+            and values that cannot be used, all at once.
     """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: {error}") from None
-    scenario = read_typed(Scenario, text, settings, str(path))
+        raise ScenarioError((str(path), str(error))) from None
+    data = load_yaml(text, str(path))
+    data = {} if data is None else data
+    if isinstance(data, dict):
+        # As Drake has it: a place for anchors.
+        data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
+    for setting in settings:
+        set_entry(data, setting, _reader().free_names)
+    scenario = _reader().read(data)
     # Absolute, so that the scenario as run means the same wherever it is written.
     robot, here = scenario.robot, path.resolve().parent
-    if robot.file and not robot.file.startswith("package://"):
-        robot.file = str((here / robot.file).resolve())
-    robot.packages = {
-        name: str((here / folder).resolve()) for name, folder in robot.packages.items()
-    }
-    return scenario
+    file = robot.file
+    if file and not file.startswith("package://"):
+        file = str((here / file).resolve())
+    packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
+    return replace(scenario, robot=Robot(file, packages))
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
@@ -414,4 +364,4 @@ def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> No
         comment: A first line, with its "#".
     """
     head = f"{comment}\n" if comment else ""
-    Path(path).write_text(head + yaml_dump_typed(scenario), encoding="utf-8")
+    Path(path).write_text(head + dump_yaml(_reader().write(scenario)), encoding="utf-8")

@@ -23,7 +23,17 @@ class ReferenceSignalError(DrakeDaeError, ValueError):
 
 
 class ScenarioError(DrakeDaeError, ValueError):
-    """A scenario file that cannot be used; the message names the key."""
+    """A scenario that cannot be used; the message has a line "key: text" for each problem.
+
+    Attributes:
+        problems: (dotted key, text) of each; the key is "" where the problem has none.
+    """
+
+    def __init__(self, *problems: tuple[str, str]) -> None:
+        self.problems = tuple((key, " ".join(text.split())) for key, text in problems)
+        super().__init__(
+            "\n".join(f"{key}: {text}" if key else text for key, text in self.problems)
+        )
 
 
 class AssumptionError(DrakeDaeError):

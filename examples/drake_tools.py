@@ -24,6 +24,7 @@ from pydrake.systems.primitives import Linearize, LogVectorOutput, TrajectorySou
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import (
+    ConstantReference,
     ForceSensor,
     Plane,
     PointCoordinates,
@@ -31,7 +32,6 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     TrackingLaw,
-    constant,
     find_structure,
     make_closed_loop,
     poles,
@@ -96,7 +96,7 @@ def linearize(model: RobotModel, structure: Structure) -> float:
         model.dae, poles([-3.0, -5.0]), structure=structure, measured_force=True, force_gain=gain
     )
     sensor = ForceSensor(1, time_constant=lag)
-    references = [constant(height), constant(force)]
+    references = [ConstantReference(height), ConstantReference(force)]
     loop = make_closed_loop(RobotPlant(model, structure=structure), law, references, sensor=sensor)
 
     # Linearize takes equilibria alone: at rest at the reference, with the sensor settled.

@@ -98,6 +98,7 @@ def test_the_page_holds_the_animation(demo):
     assert np.ptp(hand[:, 1]) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "link", "force"),
     [("two_arms", "right/link7", "grasp.fx"), ("five_bar", "five_bar/right2", "pin.fx")],
@@ -251,6 +252,7 @@ def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
 # Ctrl-C.
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
     """The run would last a minute; it is interrupted after about half a second."""
     process = command(
@@ -316,6 +318,7 @@ def test_a_wrong_command_line(arguments, capsys):
     assert "usage: drake-dae" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_enough():
     """`drake-dae list | head -1`"""
     with command("list") as process:
@@ -335,6 +338,7 @@ def test_meshcat_tells_where_and_runs_in_real_time(tmp_path, capsys):
     assert load_scenario(tmp_path / "scenario.yaml").integrator.target_realtime_rate == 1.0
 
 
+@pytest.mark.slow
 def test_a_bar_on_a_terminal(tmp_path):
     """One that does not know its width, as in some containers."""
     ours, theirs = pty.openpty()

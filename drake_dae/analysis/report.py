@@ -100,11 +100,11 @@ class Analysis:
         return f"Analysis('{self.system.name}': {found})"
 
     def __str__(self) -> str:
-        return to_text(self._parts())
+        return to_text([*self.parts(), *([problem] for problem in self.problems)])
 
     def to_markdown(self) -> str:
         """The same with Markdown tables."""
-        return to_markdown(self._parts())
+        return to_markdown([*self.parts(), *([problem] for problem in self.problems)])
 
     def _repr_markdown_(self) -> str:
         """For notebooks."""
@@ -114,5 +114,6 @@ class Analysis:
         """What is printed as plain numbers, lists and texts, with the states of the margins."""
         return as_dict(self)
 
-    def _parts(self) -> list[Part]:
-        return [*parts_of(self), *([problem] for problem in self.problems)]
+    def parts(self) -> list[Part]:
+        """Paragraphs and tables, without the problems."""
+        return parts_of(self)

@@ -89,6 +89,10 @@ class SurfaceCoordinates:
 
     contact: PointOnSurface
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.contact, PointOnSurface):
+            raise ModelError(f"constraint '{self.contact.name}' has no coordinates along it")
+
     def expression(self, links: Links) -> ca.SX:
         return self.contact.surface.coordinates(self.contact.offset(links))
 

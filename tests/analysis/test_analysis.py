@@ -2,12 +2,19 @@
 
 import json
 import re
-from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS, Problem, changed, double_integrator
+from problems import (
+    PROBLEMS,
+    changed,
+    double_integrator,
+    early_control,
+    hanging_pendulum,
+    redundant,
+    system_of,
+)
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis, Finding
@@ -17,15 +24,6 @@ from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.zero_dynamics import Verdict
 from drake_dae.errors import InconsistentStateError, ModelError
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
-def system_of(n: int, **fields: Callable) -> DaeSystem:
-    return DaeSystem.from_functions(n, **{"name": "test", **fields})
 
 
 def findings(analysis: Analysis) -> list[Finding]:
@@ -137,21 +135,8 @@ def test_1_a_degree_that_is_not_defined():
     assert analysis.structure is not None
 
 
-def redundant() -> DaeSystem:
-    """The same constraint twice, on x'' = v1 + v2, beside z'' = u + v2."""
-    return system_of(
-        4,
-        f=lambda x: [x[1], 0, x[3], 0],
-        g=lambda x: [[0, 0], [1, 1], [0, 0], [0, 1]],
-        h=lambda x: [0, 0, 0, 1],
-        k=lambda x: [x[0], x[0]],
-        l=lambda x: x[2],
-        m=lambda x: [[0, 0]],
-    )
-
-
 def test_2_redundant_constraints():
-    analysis = analyze(redundant())
+    analysis = analyze(redundant(lambda x: [x[0], x[0]]))
     assert findings(analysis) == [YES, NO, YES, OPEN, OPEN]
     assert (analysis.constraint_degrees, analysis.index) == ((2, 2), None)
     assert (analysis.output_degrees, analysis.structure) == (None, None)
@@ -177,17 +162,7 @@ def test_2_more_constraints_than_states():
 
 
 def test_3_a_control_that_enters_before_the_force_does():
-    analysis = analyze(
-        system_of(
-            3,
-            f=lambda x: [x[1], 0, 0],
-            g=lambda x: [0, 1, 0],
-            h=lambda x: [1, 0, 1],
-            k=lambda x: x[0],
-            l=lambda x: x[2],
-            m=lambda x: 0,
-        )
-    )
+    analysis = analyze(early_control())
     assert findings(analysis) == [OPEN, OPEN, NO, OPEN, OPEN]
     assert "add an actuator state in front of it" in analysis.problems[0]
 
@@ -416,23 +391,10 @@ def test_a_region_is_covered_whatever_the_constraints_move():
 
 def test_consistency_does_not_depend_on_units():
     """A pendulum of a micrometre that is 30 % off N*, and one of 1e9 m that is on it."""
-
-    def pendulum(length: float) -> DaeSystem:
-        return DaeSystem.from_functions(
-            ["x", "y", "vx", "vy"],
-            f=lambda s: [s[2], s[3], 0, -9.81],
-            g=lambda s: [0, 0, 2 * s[0], 2 * s[1]],
-            h=lambda s: [0, 0, 1, 0],
-            k=lambda s: [s[0] ** 2 + s[1] ** 2 - length**2],
-            l=lambda s: [s[0]],
-            m=lambda s: [[0]],
-            nominal_state=[0, -length, 0, 0],
-        )
-
     with pytest.raises(InconsistentStateError, match=r"states\[0\] is not consistent"):
-        analyze(pendulum(1e-6), states=[[0.0, -1.3e-6, 0.0, 0.0]])
+        analyze(hanging_pendulum(1e-6), states=[[0.0, -1.3e-6, 0.0, 0.0]])
     on = [1e9 * np.sin(0.3), -1e9 * np.cos(0.3), 0.0, 0.0]
-    assert analyze(pendulum(1e9), states=[on]).index == 3
+    assert analyze(hanging_pendulum(1e9), states=[on]).index == 3
 
 
 def test_redundant_constraints_have_no_index():
@@ -595,7 +557,8 @@ def test_markdown_has_the_same_words(problem):
 
 @pytest.mark.parametrize("name", [*PROBLEMS, "redundant"])
 def test_the_dictionary_is_json(name):
-    system = redundant() if name == "redundant" else PROBLEMS[name]().system
+    twice = redundant(lambda x: [x[0], x[0]])
+    system = twice if name == "redundant" else PROBLEMS[name]().system
     analysis = analyze(system, count=3)
     found = json.loads(json.dumps(analysis.to_dict(), allow_nan=False))
     assert found == analysis.to_dict()

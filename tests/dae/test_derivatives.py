@@ -1,7 +1,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS, Problem, changed
+from problems import PROBLEMS, changed
 
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
@@ -10,11 +10,6 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
 
 
 def motion_of(system: DaeSystem) -> Derivatives:

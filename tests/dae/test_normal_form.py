@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from actuated import actuated, slope, states
 from arms import arm, consistent_states, numbers
-from problems import PROBLEMS, Problem, hidden_normal_form, knife_edge, pendulum, pendulum_tension
+from problems import PROBLEMS, hidden_normal_form, knife_edge, pendulum, pendulum_tension
 from two_arms import two_arms
 
 from drake_dae.dae.normal_form import NormalForm
@@ -29,11 +29,6 @@ ROBOTS = {
 }
 
 
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
 @cache
 def form(name: str) -> NormalForm:
     structure = ROBOTS[name]() if name in ROBOTS else find_structure(PROBLEMS[name]().system)
@@ -48,6 +43,7 @@ def chain_ends(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
     return ends[:m], ends[m:][dynamic]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*PROBLEMS, *ROBOTS])
 def test_phi_and_its_inverse_compose_to_the_identity(name):
     """Both ways, on N* and off it, from the nominal state as the guess."""

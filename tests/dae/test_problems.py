@@ -147,6 +147,7 @@ def test_linear_problems_by_matrices(name):
     assert len(invariant_zeros(a, longest)) == problem.zero_dynamics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_linear_systems_by_matrices(seed):
     """Degrees as built, index and zeros as the pencils have them, by the library and by SciPy."""
@@ -227,6 +228,7 @@ def test_the_verdict_is_that_of_the_literature(decided):
 # ---- systems made from their normal form
 
 
+@pytest.mark.slow
 def test_hidden_normal_forms_are_of_all_kinds():
     """The property tests over them see every kind of degree and of output."""
     systems = [hidden_normal_form(seed) for seed in range(60)]
@@ -246,6 +248,7 @@ def test_hidden_normal_forms_are_of_all_kinds():
     assert len(felt) > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(30, 60))
 def test_hidden_normal_forms_are_found(seed):
     """As in test_structure.py, with other seeds."""

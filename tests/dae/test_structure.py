@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 from problems import (
     PROBLEMS,
-    Problem,
     changed,
     double_integrator,
+    early_control,
     hidden_normal_form,
     in_other_units,
+    redundant,
+    system_of,
 )
 
 from drake_dae.dae import relative_degrees
@@ -20,15 +22,6 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
-def system_of(n: int, **fields: Callable) -> DaeSystem:
-    return DaeSystem.from_functions(n, **{"name": "test", **fields})
 
 
 def degrees(system: DaeSystem, **options) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -118,6 +111,7 @@ def test_spread_and_count():
             find_structure(system, spread=wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(30))
 def test_hidden_normal_forms_are_found(seed):
     """Systems of random degrees behind a diffeomorphism, a feedback, mixed inputs and orders."""
@@ -145,6 +139,7 @@ def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_units_do_not_matter(problem, seed):
     """Every state, input and output in its own unit, from 1e-4 to 1e4 of the original one.
@@ -325,19 +320,6 @@ def test_1_a_degree_that_is_lost_between_the_sampled_states():
     assert error.state[0] == pytest.approx(0.03, abs=1e-12)
 
 
-def redundant(k: Callable, **fields) -> DaeSystem:
-    """Two constraints k on the point x'' = v1 + v2, beside z'' = u + v2."""
-    base = {
-        "f": lambda x: [x[1], 0, x[3], 0],
-        "g": lambda x: [[0, 0], [1, 1], [0, 0], [0, 1]],
-        "h": lambda x: [0, 0, 0, 1],
-        "k": k,
-        "l": lambda x: x[2],
-        "m": lambda x: [[0, 0]],
-    }
-    return system_of(4, **{**base, **fields})
-
-
 @pytest.mark.parametrize(
     "k",
     [
@@ -427,18 +409,7 @@ def test_2_no_force_keeps_the_constraint(k):
 
 
 def test_3_a_control_that_enters_before_the_force_does():
-    """x0' = x1 + u, x1' = v: u acts on k', v on k''."""
-    error = violation(
-        system_of(
-            3,
-            f=lambda x: [x[1], 0, 0],
-            g=lambda x: [0, 1, 0],
-            h=lambda x: [1, 0, 1],
-            k=lambda x: x[0],
-            l=lambda x: x[2],
-            m=lambda x: 0,
-        )
-    )
+    error = violation(early_control())
     assert error.assumption == 3
     assert "the control acts on derivative 1 of constraint 'y0', before any" in str(error)
     # At the same order it is allowed.
@@ -618,6 +589,7 @@ def test_5_a_b_that_is_singular_between_the_sampled_states():
     assert error.state[2] == pytest.approx(0.02, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 15, 40, 46])
 def test_5_a_singular_b_hidden_in_a_random_system(seed):
     """In place of a second output of degree mu >= 1, a function of the first one and of k."""

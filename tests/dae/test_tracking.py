@@ -16,17 +16,12 @@ from problems import (
     wanted_outputs,
 )
 
-from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import GainError, ModelError
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
 
 
 def starts(problem: Problem) -> np.ndarray:
@@ -71,7 +66,7 @@ LAMBDA_2 = np.array([[11.0, 2.0], [-1.0, 9.0]])
 def test_full_gain_matrices():
     """e'' + Lambda_2 e' + Lambda_1 e = 0 (60), against a matrix exponential made here."""
     problem = PROBLEMS["gantry"]()
-    law = TrackingLaw(problem.system, matrices([LAMBDA_1, LAMBDA_2]))
+    law = TrackingLaw(problem.system, gain_matrices([LAMBDA_1, LAMBDA_2]))
     start = problem.consistent(np.random.default_rng(4))
     times = np.linspace(0.0, 1.0, 6)
     outputs, _ = closed_loop_outputs(problem, law, start, times)
@@ -140,7 +135,7 @@ def test_the_reference_is_output_major():
 
 def test_control_by_hand():
     """Cart: u = m (r'' - K_2 (x' - r') - K_1 (x - r)) + c x'."""
-    law = TrackingLaw(PROBLEMS["cart"]().system, coefficients([6.0, 5.0]))
+    law = TrackingLaw(PROBLEMS["cart"]().system, gain_coefficients([6.0, 5.0]))
     x, r = np.array([2.0, -1.0]), np.array([1.5, 0.5, 3.0])
     expected = 4.0 * (3.0 - 5.0 * (-1.0 - 0.5) - 6.0 * (2.0 - 1.5)) + 0.3 * -1.0
     # Three operations.
@@ -189,8 +184,8 @@ def test_changed_parameters_need_no_new_trace():
 def test_gains_are_parameters_of_the_traced_law():
     """They are those that are not zero: a study changes them without tracing."""
     system = PROBLEMS["gantry"]().system
-    first = matrices([np.diag([2.0, 3.0]), LAMBDA_2])
-    second = matrices([np.diag([5.0, 7.0]), 2 * LAMBDA_2])
+    first = gain_matrices([np.diag([2.0, 3.0]), LAMBDA_2])
+    second = gain_matrices([np.diag([5.0, 7.0]), 2 * LAMBDA_2])
     law = TrackingLaw(system, first)
     changed = TrackingLaw(system, second, structure=law.structure)
     # The diagonals of Lambda_1 and all of Lambda_2.

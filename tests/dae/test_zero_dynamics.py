@@ -21,8 +21,8 @@ from problems import (
 )
 from scipy.integrate import solve_ivp
 
-import drake_dae.dae.zero_dynamics.pursuit as module
-from drake_dae import DaePlant, ExpressionSignal, analyze, constant, make_closed_loop
+import drake_dae.dae.zero_dynamics.pinned_motion as module
+from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
 from drake_dae.dae.gains import poles
 from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
@@ -38,11 +38,6 @@ from drake_dae.errors import (
 from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
 
 Array = np.ndarray
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
 
 
 def zero_dynamics(system: DaeSystem) -> ZeroDynamics:
@@ -286,6 +281,7 @@ def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
         np.testing.assert_allclose(el[:, 0] + em @ force, wanted, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     """The law (28) without an initial error moves the same way; integrated by DOP853."""
     _, times, motion = following(problem)
@@ -359,6 +355,7 @@ def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
     np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 @pytest.mark.parametrize("kind", ["flexible", "damped", "motor"])
 def test_motions_of_robots_agree_with_multibody_plant(name, kind):
@@ -484,6 +481,7 @@ def test_stiff_zero_dynamics_take_few_steps(monkeypatch):
     np.testing.assert_allclose(motion.states[1:, 1], np.sin(motion.times[1:] - 1e-6), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_long_motion_does_not_drift(monkeypatch):
     """With errors of 1e-3 a step: outputs and rod to round-off, and the angle to a few steps."""
     monkeypatch.setattr(module, "TOLERANCE", 1e-3)
@@ -1076,21 +1074,23 @@ def test_the_force_that_is_asked_for_decides(force, rate):
     law = TrackingLaw(system, poles(-3.0), structure=structure)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        make_closed_loop(DaePlant(structure.system, structure=structure), law, [constant(outputs)])
+        make_closed_loop(
+            DaePlant(structure.system, structure=structure), law, [ConstantReference(outputs)]
+        )
     assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
 
 
 def test_a_loop_is_judged_when_it_begins():
     """The force grows from 20 to 60 N in 2 s: unstable above 40 N."""
     law = TrackingLaw(slider(), poles(-3.0))
-    force = ExpressionSignal(lambda t: [20 + 20 * t])
+    force = ExpressionReference(lambda t: [20 + 20 * t])
     for start, unstable in ((0.0, False), (2.0, True)):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             make_closed_loop(
                 DaePlant(law.structure.system, structure=law.structure),
                 law,
-                [constant([0.0]), force],
+                [ConstantReference([0.0]), force],
                 start_time=start,
             )
         assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable

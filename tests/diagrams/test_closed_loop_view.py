@@ -13,6 +13,7 @@ from pydrake.systems.analysis import Simulator
 from recordings import animation, objects, transforms, vertices
 
 from drake_dae import (
+    ConstantReference,
     DaePlant,
     DaeSystem,
     ImplicitSurface,
@@ -20,8 +21,7 @@ from drake_dae import (
     Record,
     RobotPlant,
     TrackingLaw,
-    build,
-    constant,
+    build_scenario,
     load_scenario,
     make_animation,
     make_closed_loop,
@@ -48,7 +48,7 @@ NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 def recorded(name, *settings):
     """A run of a scenario, and the page of its animation."""
     scenario = load_scenario(find_scenario(name), settings)
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     return loop, record, make_animation(loop, record, context)
@@ -187,7 +187,7 @@ def test_a_run_that_begins_later_is_shown_from_its_start():
 def test_a_parameter_moves_the_surface():
     """The wall stands where the context of the run has it, not where the scenario put it."""
     scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25", "start.errors={}"])
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     loop.plant.set_parameter(own, "wall.position", [1.1, 0.0, 0.0])
@@ -204,7 +204,7 @@ def test_a_parameter_moves_the_surface():
 def test_a_parameter_turns_the_arrow():
     """Of the normal of a dome that stands elsewhere."""
     scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     center = np.array([0.45, 0.02, 0.2])
@@ -233,7 +233,7 @@ def test_one_moment_is_an_animation_too():
 
 def test_an_animation_changes_nothing():
     scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25"])
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     state = context.get_continuous_state_vector().CopyToVector()
@@ -257,7 +257,7 @@ def test_frames():
 def test_live_view_draws_while_it_runs():
     meshcat = start_meshcat()
     scenario = load_scenario(find_scenario("two_link_wall"))
-    loop, context = build(scenario, meshcat, live=True)
+    loop, context = build_scenario(scenario, meshcat, live=True)
     simulator = Simulator(loop.diagram, context)
     simulator.AdvanceTo(0.5)
     page = meshcat.StaticHtml()
@@ -279,7 +279,7 @@ def test_without_live_view_the_steps_are_those_without_any():
     times = []
     for meshcat, live in ((None, True), (start_meshcat(), False), (start_meshcat(), True)):
         scenario = load_scenario(find_scenario("two_link_wall"), ["duration=1"])
-        loop, context = build(scenario, meshcat, live)
+        loop, context = build_scenario(scenario, meshcat, live)
         simulate(loop.diagram, context, 1.0, scenario.integrator)
         times.append(loop.record(context).time)
     np.testing.assert_array_equal(times[0], times[1])
@@ -380,7 +380,7 @@ def test_an_implicit_surface_is_left_out():
 
 def test_an_animation_needs_a_meshcat_and_a_robot():
     robot = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
-    references = [constant([0.3]), constant([20.0])]
+    references = [ConstantReference([0.3]), ConstantReference([20.0])]
     loop = make_closed_loop(robot, law("two_link"), references)
     context = loop.diagram.CreateDefaultContext()
     simulate(loop.diagram, context, 0.01, fixed_step())
@@ -388,7 +388,9 @@ def test_an_animation_needs_a_meshcat_and_a_robot():
         make_animation(loop, loop.record(context), context)
     system = DaeSystem.from_functions(1, f=lambda x: [0.0], h=lambda x: [1.0], l=lambda x: [x[0]])
     plain = TrackingLaw(system, poles(-1.0))
-    loop = make_closed_loop(DaePlant(system), plain, [constant([1.0])], meshcat=start_meshcat())
+    loop = make_closed_loop(
+        DaePlant(system), plain, [ConstantReference([1.0])], meshcat=start_meshcat()
+    )
     context = loop.diagram.CreateDefaultContext()
     simulate(loop.diagram, context, 0.01, fixed_step())
     with pytest.raises(ModelError, match="RobotPlant"):

@@ -113,6 +113,7 @@ def test_motor_law_tends_to_the_rigid_law_at_rate_l(name):
         assert left < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "parameter", "matrix", "operation"),
     [

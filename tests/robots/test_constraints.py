@@ -22,7 +22,7 @@ from pydrake.multibody.tree import (
     RpyFloatingJoint,
     SpatialInertia,
 )
-from two_arms import APART, GRASP, NOMINAL, two_arms
+from two_arms import APART, GRASP, NOMINAL, REFERENCES, two_arms
 
 from drake_dae import (
     CoincidentPoints,
@@ -36,12 +36,10 @@ from drake_dae import (
     Sphere,
     TrackingLaw,
     WeldedFrames,
-    constant,
     find_structure,
     make_closed_loop,
     poles,
     simulate,
-    sinusoids,
 )
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -510,18 +508,7 @@ def test_two_arms_track_motion_and_squeeze():
     loop = make_closed_loop(
         RobotPlant(model, structure=structure),
         law,
-        [
-            sinusoids(APART / 2, 0.05, 2.0),
-            sinusoids(0.0, 0.05, 3.0),
-            sinusoids(0.4, 0.04, 2.5),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 0.1, 2.0),
-            constant([0.0, 0.0]),
-            sinusoids(40.0, 15.0, 4.0),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 1.0, 3.0),
-            constant([0.0, 0.0]),
-        ],
+        REFERENCES,
     )
     context = loop.diagram.CreateDefaultContext()
     away = [APART / 2 + 0.03, -0.04, 0.42, 0.05, -0.04, 0.03, 0.1, -0.15]

@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_dae import DaePlant, DaeSystem, build, load_scenario
+from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation import simulate as module
@@ -196,7 +196,7 @@ def test_what_drake_says_gets_time_and_state():
 
 def two_link(*settings):
     scenario = load_scenario(find_scenario("two_link_wall"), settings)
-    return *build(scenario), scenario
+    return *build_scenario(scenario), scenario
 
 
 def test_a_projection_that_fails_gets_time_and_state():

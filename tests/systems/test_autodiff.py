@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from actuated import actuated, slope, states
 from arms import arm, consistent_states, fixed_step, law, shipped
-from problems import PROBLEMS
+from problems import PROBLEMS, hanging_pendulum
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import IpoptSolver, SnoptSolver
@@ -30,20 +30,20 @@ from pydrake.systems.primitives import (
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import (
+    ConstantReference,
     DaePlant,
     DaeSystem,
-    ExpressionSignal,
+    ExpressionReference,
     ForceSensor,
+    PointToPointReference,
     ReferenceGenerator,
     RobotPlant,
+    SinusoidReference,
     TrackingController,
     TrackingLaw,
-    TrajectorySignal,
-    constant,
+    TrajectoryReference,
     make_closed_loop,
-    point_to_point,
     poles,
-    sinusoids,
 )
 from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError, SingularityError
 
@@ -178,7 +178,7 @@ def test_a_force_sensor():
         lambda: plant_of("two_link hydraulic")[0],
         lambda: plant_of("pendulum_tension")[0],
         lambda: TrackingController(law("seven_joint")),
-        lambda: ReferenceGenerator([constant([1.0, 2.0])], [2, 0]),
+        lambda: ReferenceGenerator([ConstantReference([1.0, 2.0])], [2, 0]),
         lambda: ForceSensor(1, time_constant=0.1, noise_deviation=1.0),
     ],
 )
@@ -205,13 +205,13 @@ def test_ports_parameters_and_feedthrough_are_kept(make):
 def test_references_move_with_the_time(as_trajectory):
     """dR/dt is the table of the next higher derivatives: of t^4, 24 t follows 12 t^2."""
     t = 0.7
-    quartic = ExpressionSignal(lambda t: t**4)
+    quartic = ExpressionReference(lambda t: t**4)
     if as_trajectory:
         line = PiecewisePolynomial.LagrangeInterpolatingPolynomial(
             np.linspace(0, 1, 5), (np.linspace(0, 1, 5) ** 4)[None]
         )
-        quartic = TrajectorySignal(line)
-    generator = ReferenceGenerator([quartic, sinusoids(0.0, 1.0, 2.0)], [2, 1])
+        quartic = TrajectoryReference(line)
+    generator = ReferenceGenerator([quartic, SinusoidReference(0.0, 1.0, 2.0)], [2, 1])
     converted = generator.ToAutoDiffXd()
     context = converted.CreateDefaultContext()
     context.SetTime(AutoDiffXd(t, [3.0]))
@@ -229,7 +229,7 @@ def test_references_move_with_the_time(as_trajectory):
 
 
 def test_a_time_that_moves_needs_one_more_derivative():
-    generator = ReferenceGenerator([point_to_point(0.0, 1.0, 0.0, 1.0, order=2)], [2])
+    generator = ReferenceGenerator([PointToPointReference(0.0, 1.0, 0.0, 1.0, order=2)], [2])
     converted = generator.ToAutoDiffXd()
     context = converted.CreateDefaultContext()
     context.SetTime(0.5)
@@ -239,26 +239,9 @@ def test_a_time_that_moves_needs_one_more_derivative():
         converted.GetOutputPort("reference").Eval(context)
 
 
-def pendulum(**fields):
-    """A unit mass on a unit rod, pushed sideways, z = x."""
-    return DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        f=lambda s, p: [s[2], s[3], 0.0, -p.gravity],
-        g=lambda s, p: [0.0, 0.0, 2 * s[0], 2 * s[1]],
-        h=lambda s, p: [0.0, 0.0, 1.0, 0.0],
-        k=lambda s, p: [s[0] ** 2 + s[1] ** 2 - 1.0],
-        l=lambda s, p: [s[0]],
-        m=lambda s, p: [[0.0]],
-        parameters={"gravity": 9.81},
-        nominal_state=[0.0, -1.0, 0.0, 0.0],
-        name="pendulum",
-        **fields,
-    )
-
-
 def test_linearize_a_hanging_pendulum():
     """v = -(vx^2 + vy^2 + x u - g y) / (2 x^2 + 2 y^2): x'' = -g x + u, y'' = 0, z = x."""
-    plant = DaePlant(pendulum())
+    plant = DaePlant(hanging_pendulum())
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, [0.0])
     linear = Linearize(
@@ -301,7 +284,7 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
     loop = make_closed_loop(
         plant,
         TrackingLaw(model.dae, gains, structure=structure, **force_feedback),
-        [constant(outputs[:-1]), constant(20.0)],
+        [ConstantReference(outputs[:-1]), ConstantReference(20.0)],
         sensor=sensor,
     )
     whole = loop.diagram.CreateDefaultContext()
@@ -342,7 +325,7 @@ def test_a_closed_loop_keeps_its_zero_dynamics():
     mass, length, gravity, angle = 2.0, 0.8, 9.81, 0.6
     force = -mass * gravity / (length * np.cos(angle))
     design = TrackingLaw(problem.system, poles(-1.0))
-    loop = make_closed_loop(DaePlant(problem.system), design, [constant(force)])
+    loop = make_closed_loop(DaePlant(problem.system), design, [ConstantReference(force)])
     context = loop.diagram.CreateDefaultContext()
     context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
     swing = 1j * np.sqrt(-force / mass)
@@ -390,7 +373,7 @@ def test_sensitivity_of_a_simulation():
         simulator.AdvanceTo(0.5)
         return context.get_continuous_state_vector().CopyToVector()
 
-    plant, point = DaePlant(pendulum(), project=False), np.array([0.4, 9.81])
+    plant, point = DaePlant(hanging_pendulum(), project=False), np.array([0.4, 9.81])
     moving = InitializeAutoDiff(point).reshape(-1)
     found = ExtractGradient(end(Simulator_[AutoDiffXd], plant.ToAutoDiffXd(), *moving))
     for column, direction in zip(found.T, np.eye(2), strict=True):
@@ -420,7 +403,7 @@ def test_direct_collocation(solver):
     polar = SymbolicVectorSystem(
         state=[phi, rate], input=[u], dynamics=[rate, -9.81 * sin(phi) + u * cos(phi)], output=[phi]
     )
-    plant, angle = DaePlant(pendulum()), 0.5
+    plant, angle = DaePlant(hanging_pendulum()), 0.5
     start = np.array([0.0, -1.0, 0.0, 0.0])
     end = np.array([np.sin(angle), -np.cos(angle), 0.0, 0.0])
     cost, control = collocate(plant, solver, start, end, [0, 2])
@@ -488,4 +471,4 @@ def test_what_does_not_convert_says_why():
             self.DeclareVectorOutputPort("energy", 1, lambda context, output: None)
 
     with pytest.raises(ModelError, match=r"its output port 'energy'; add it to _formulas"):
-        Watched(pendulum()).ToAutoDiffXd()
+        Watched(hanging_pendulum()).ToAutoDiffXd()

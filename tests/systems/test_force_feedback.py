@@ -9,24 +9,24 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
 
 from drake_dae import (
+    ConstantReference,
     DcMotors,
     ElectrohydraulicServos,
     FlexibleJoints,
     ForceSensor,
     ReferenceGenerator,
     RobotPlant,
+    SinusoidReference,
     TrackingController,
     TrackingLaw,
-    constant,
     poles,
-    sinusoids,
 )
 from drake_dae.errors import GainError, ModelError
 
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 SERVOS = ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
-MOVE = [sinusoids(0.3, 0.1, 1.5), sinusoids(20.0, 5.0, 2.0)]
-HOLD = [constant(0.3), constant(20.0)]
+MOVE = [SinusoidReference(0.3, 0.1, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
+HOLD = [ConstantReference(0.3), ConstantReference(20.0)]
 
 
 def run(
@@ -85,11 +85,12 @@ def run(
     return times, log.data().T - wanted, chosen, state, parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 4.0])
 def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     """(61) with a wrong mass: within 5 %, of which the lag takes about 1 %; position untouched."""
     model = arm("two_link").model
-    slow, sensor = [MOVE[0], sinusoids(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
+    slow, sensor = [MOVE[0], SinusoidReference(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
     times, without, *_ = run(model, slow)
     _, feedback, *_ = run(model, slow, measured=True, gain=gain, sensor=sensor)
     later = times > 1.0
@@ -101,6 +102,7 @@ def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [MOTORS, SERVOS], ids=["motors", "servos"])
 def test_measured_force_removes_the_static_error_behind_motors(stage):
     """At rest I_a' = 0 and the model's lambda' is 0, so (81) leaves Lambda_4 (lambda - r_2) = 0."""
@@ -113,6 +115,7 @@ def test_measured_force_removes_the_static_error_behind_motors(stage):
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_measured_force_removes_the_misprediction_behind_springs():
     """At rest (71) leaves Lambda_5 (lambda - r_2) = -lambda'' of the model, not 0.
 
@@ -259,6 +262,7 @@ def test_sampling_holds():
     np.testing.assert_allclose(values[0, middle], np.sin(3.0 * (times[middle] - 0.05)), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_has_its_deviation_and_its_seed():
     sensor = lambda: ForceSensor(2, 0.01, noise_deviation=[0.5, 2.0])  # noqa: E731
     still = ConstantVectorSource([0.0, 0.0])

@@ -4,28 +4,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, consistent_states, error_controlled, fixed_step
+from problems import bead, hanging_pendulum
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_dae import DaePlant, DaeSystem, RobotPlant
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SingularityError
-
-
-def pendulum():
-    """A unit mass on a unit rod in Cartesian coordinates, pushed sideways; z = x, index 3."""
-    return DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        f=lambda s, p: [s[2], s[3], 0.0, -p.gravity],
-        g=lambda s, p: [0.0, 0.0, 2 * s[0], 2 * s[1]],
-        h=lambda s, p: [0.0, 0.0, 1.0, 0.0],
-        k=lambda s, p: [s[0] ** 2 + s[1] ** 2 - 1.0],
-        l=lambda s, p: [s[0]],
-        m=lambda s, p: [[0.0]],
-        parameters={"gravity": 9.81},
-        nominal_state=[0.6, -0.8, 0.0, 0.0],
-        name="pendulum",
-    )
 
 
 def two_link(project=True):
@@ -61,7 +46,7 @@ def test_direct_feedthrough_is_exact():
     """With rigid joints the force feeds through; z = x of the pendulum does not."""
     for plant, through in (
         (two_link(), {"constraint_force", "controlled_output"}),
-        (DaePlant(pendulum()), {"constraint_force"}),
+        (DaePlant(hanging_pendulum()), {"constraint_force"}),
     ):
         control = plant.GetInputPort("control").get_index()
         found = {
@@ -107,7 +92,9 @@ def test_pendulum_swings_as_in_polar_coordinates():
     """phi'' = -g sin phi by an independent integrator; both to about 1e-9."""
     from scipy.integrate import solve_ivp
 
-    simulator, context = driven(DaePlant(pendulum()), 0.0)
+    simulator, context = driven(
+        DaePlant(hanging_pendulum(nominal_state=[0.6, -0.8, 0.0, 0.0])), 0.0
+    )
     plant = simulator.get_system().GetSubsystemByName("pendulum")
     ApplySimulatorConfig(error_controlled(1e-11), simulator)
     simulator.AdvanceTo(2.0)
@@ -185,18 +172,7 @@ def test_a_control_that_is_not_finite_raises_instead_of_looping(bad):
 
 
 def test_a_singular_constraint_matrix_raises_with_time_and_state():
-    """A bead with k = x2 - x1^2 / 2, forced along x1 alone: A = -x1 vanishes at x1 = 0."""
-    system = DaeSystem.from_functions(
-        ["x1", "x2"],
-        f=lambda x: [-1.0, x[0]],
-        g=lambda x: [1.0, 0.0],
-        h=lambda x: [0.0, 1.0],
-        k=lambda x: [x[1] - x[0] ** 2 / 2],
-        l=lambda x: [0.0],
-        m=lambda x: [[1.0]],
-        nominal_state=[1.0, 0.5],
-    )
-    plant = DaePlant(system)
+    plant = DaePlant(bead())
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, [0.0])
     plant.set_state(context, [0.0, 0.0])

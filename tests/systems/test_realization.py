@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from actuated import actuated
 from arms import arm, consistent_states, error_controlled, fixed_step, law
-from problems import PROBLEMS, pendulum_tension
+from problems import PROBLEMS, bead, pendulum_tension
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Sine
@@ -152,6 +152,7 @@ RUNS = {
 """Amplitude and mean of the control, and for how many s the motion stays in the coordinates."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_simulation_agrees_with_the_plant(name):
     """State, force and output over time by two vector fields, of n and of n - sum r_i states."""
@@ -352,17 +353,7 @@ def test_numbers_that_are_not_finite_raise_instead_of_looping(bad):
 
 
 def test_a_singular_constraint_matrix_raises_with_time_and_state():
-    """A bead with k = x2 - x1^2/2, forced along x1 alone: A = -x1 vanishes at x1 = 0."""
-    system = DaeSystem.from_functions(
-        ["x1", "x2"],
-        f=lambda x: [-1.0, x[0]],
-        g=lambda x: [1.0, 0.0],
-        h=lambda x: [0.0, 1.0],
-        k=lambda x: [x[1] - x[0] ** 2 / 2],
-        l=lambda x: [0.0],
-        m=lambda x: [[1.0]],
-        nominal_state=[1.0, 0.5],
-    )
+    system = bead()
     structure = find_structure(system)
     minimal = StateRealization(NormalForm(structure.system, system.state[0], structure=structure))
     context = minimal.CreateDefaultContext()

@@ -12,10 +12,14 @@ class Constraint(Protocol):
     """phi(q) = 0 with its multiplier lambda: J^T lambda acts on the robot (37).
 
     Attributes:
+        name: Of the constraint.
         parameters: What of it can be changed without tracing again.
         force_signals: Name and unit of each multiplier.
         residual_signals: Name and unit of each component of phi.
     """
+
+    @property
+    def name(self) -> str: ...
 
     @property
     def parameters(self) -> tuple[Parameter, ...]: ...
