@@ -30,8 +30,9 @@ from drake_dae import (
     load_scenario,
     simulate,
 )
-from drake_dae.diagrams import scenario as forms
+from drake_dae.diagrams import scenario_parts as forms
 from drake_dae.diagrams.scenario import (
+    Scenario,
     find_scenario,
     save_scenario,
     scenario_schema,
@@ -199,7 +200,7 @@ def test_every_form_reads_back_equal(tmp_path):
         Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)),
         Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1),
     ]
-    scenario = forms.Scenario(
+    scenario = Scenario(
         description="on: ä # 'quoted'\nsecond line",
         robot=forms.Robot("/some/where.urdf", {"other": "/else/where"}),
         constraints=[
