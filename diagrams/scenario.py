@@ -145,8 +145,7 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    message = unknown_name("scenario file", name, shipped)
-    raise ScenarioError(("", message.replace("there are", "shipped scenarios:")))
+    raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
 
 
 def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
