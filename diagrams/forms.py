@@ -1,11 +1,10 @@
 """Dataclasses as forms of plain data: checked by pydantic, all that is wrong told at once.
 
-A dataclass is its own form: its fields, defaults and checks are those that the data must keep. What
-a field is annotated with can be written in another way, `written`; what belongs to a family is
-chosen by a tag.
+A dataclass is its own form: its fields, defaults and checks are those that data must keep. A type
+that is no data is `written` as another one; a member of a family is chosen by a tag.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from types import UnionType
@@ -174,8 +173,8 @@ class Reader(Generic[T]):
     def __init__(self, form: type[T]) -> None:
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
         self.schema: dict[str, Any] = self._adapter.json_schema()
+        #: Dotted keys of the dictionaries with any names.
         self.free_names = set(_free_names(self.schema, ""))
-        """Dotted keys of the dictionaries with any names."""
 
     def read(self, data: Any) -> T:
         """The dataclass.
@@ -195,52 +194,76 @@ class Reader(Generic[T]):
 
     def _problem(self, details: ErrorDetails, data: Any) -> tuple[str, str]:
         """Dotted key and text."""
-        kind, value = details["type"], details["input"]
-        last = str(details["loc"][-1]) if details["loc"] else ""
-        absent = kind in ("missing", "extra_forbidden")
-        loc = details["loc"][:-1] if absent else details["loc"]
-        schema, key, title, choices = self.schema, "", "", ""
-        for part in loc:
-            if isinstance(part, str) and "oneOf" in schema:
-                choices = ", ".join(map(_tag, schema["oneOf"]))
-                schema = next(one for one in schema["oneOf"] if _tag(one) == part)
-                title = f"{part} "
-                continue
-            key, title = f"{key}.{part}" if key else str(part), ""
-            data = data[part]
+        kind, loc, value = details["type"], details["loc"], details["input"]
+        if kind in ("missing", "extra_forbidden"):
+            place = _place(loc[:-1], self.schema, data)
+            return place.key, _wrong_key(place, str(loc[-1]), value, kind == "missing")
+        place = _place(loc, self.schema, data)
+        if kind == "value_error":
+            return place.key, str(details["ctx"]["error"])
+        return place.key, _wrong_value(place.schema, value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A place in data: its dotted key, its schema, and the tag that chose it, with all tags."""
+
+    key: str
+    schema: Mapping[str, Any]
+    data: Any
+    tag: str = ""
+    tags: str = ""
+
+
+def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _Place:
+    """Where pydantic's location is, in which a chosen tag is a part."""
+    keys: list[str] = []
+    tag = tags = ""
+    for part in loc:
+        if "oneOf" in schema:
+            tag, tags = str(part), _tags(schema)
+            schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
+        else:
+            keys.append(str(part))
             inner = schema.get("items", schema.get("additionalProperties"))
             schema = schema.get("properties", {}).get(part, inner)
-        key = key or "scenario"
-        keys = [name for name in schema.get("properties", {}) if name != TAG]
-        known = f"keys: {', '.join(keys) or 'none'}"
-        if kind == "missing":
-            return key, f"{title}needs the key '{last}'; {known}"
-        if absent and last == TAG:
-            return key, f"takes no tag, got {value}"
-        if absent:
-            near = get_close_matches(last, keys, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            text = f"{title}has no key '{last}'; {hint}{known}"
-            if title and TAG not in data:
-                text += f". No tag is given; there are {choices}"
-            return key, text
-        if kind == "value_error":
-            return key, str(details["ctx"]["error"])
-        if "oneOf" in schema:
-            expected = f"one of {', '.join(map(_tag, schema['oneOf']))}"
-        elif "properties" in schema:
-            expected = f"keys {', '.join(keys)}"
-        elif "minItems" in schema:
-            expected = f"{schema['minItems']} numbers"
-        else:
-            expected = _EXPECTED[schema["type"]]
-        got = f"expected {expected}, got {_show(value)}"
-        if kind == "string_type" and isinstance(value, (bool, int, float)):
-            got += "; text that reads as something else goes in quotes"
-        return key, got
+            data, tag = data[part], ""
+    return _Place(".".join(keys) or "scenario", schema, data, tag, tags)
 
 
-_EXPECTED = {
+def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
+    """What is wrong about a key that is missing or should not be there."""
+    if name == TAG:
+        return f"takes no tag, got {value}"
+    names = [name for name in place.schema["properties"] if name != TAG]
+    title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
+    if is_missing:
+        return f"{title}needs the key '{name}'; {known}"
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    text = f"{title}has no key '{name}'; {hint}{known}"
+    if place.tag and TAG not in place.data:
+        text += f". No tag is given; there are {place.tags}"
+    return text
+
+
+def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
+    """What a schema expects instead of a value."""
+    if "oneOf" in schema:
+        expected = f"one of {_tags(schema)}"
+    elif "properties" in schema:
+        expected = f"keys {', '.join(schema['properties'])}"
+    elif "minItems" in schema:
+        expected = f"{schema['minItems']} numbers"
+    else:
+        expected = _IN_WORDS[schema["type"]]
+    text = f"expected {expected}, got {_show(value)}"
+    if schema.get("type") == "string" and isinstance(value, (bool, int, float)):
+        text += "; text that reads as something else goes in quotes"
+    return text
+
+
+_IN_WORDS = {
     "number": "a number",
     "integer": "a whole number",
     "boolean": "true or false",
@@ -248,11 +271,14 @@ _EXPECTED = {
     "array": "a list",
     "object": "names with values",
 }
-"""Type in the JSON Schema -> in words."""
 
 
 def _tag(schema: Mapping[str, Any]) -> str:
     return str(schema["properties"][TAG]["const"])
+
+
+def _tags(schema: Mapping[str, Any]) -> str:
+    return ", ".join(map(_tag, schema["oneOf"]))
 
 
 def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:
