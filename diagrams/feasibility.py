@@ -9,9 +9,10 @@ from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.build import scenario_model, scenario_structure, wire_scenario
+from drake_dae.diagrams.build import wire_scenario
 from drake_dae.diagrams.feasibility_report import Feasibility, SignalRange
 from drake_dae.diagrams.scenario import Scenario
+from drake_dae.diagrams.scenario_model import scenario_model, scenario_structure
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.summary import Limits

@@ -1,27 +1,17 @@
 """Dataclasses as forms of plain data: checked by pydantic, all that is wrong told at once.
 
-A dataclass is its own form: its fields, defaults and checks are those that the data must keep. What
-a field is annotated with can be written in another way, `written`; what belongs to a family is
-chosen by a tag.
+A dataclass is its own form: its fields, defaults and checks are those that data must keep. A type
+that is no data is `written` as another one; a member of a family is chosen by a tag.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from types import UnionType
 from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import (
-    Field,
-    GetCoreSchemaHandler,
-    PlainSerializer,
-    PlainValidator,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-    WithJsonSchema,
-)
+import pydantic
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drake_dae.diagrams.typed_yaml import TAG
@@ -47,7 +37,7 @@ class Form:
     needs_tag: bool = False
 
     def __get_pydantic_core_schema__(
-        self, source: type[Any], handler: GetCoreSchemaHandler
+        self, source: type[Any], handler: pydantic.GetCoreSchemaHandler
     ) -> CoreSchema:
         entries = {
             name: core_schema.typed_dict_field(
@@ -122,7 +112,7 @@ class Choice:
     written: Mapping[Any, Any] = field(default_factory=dict)
 
     def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
+        self, source: Any, handler: pydantic.GetCoreSchemaHandler
     ) -> CoreSchema:
         forms: dict[type[Any], Form] = {}
         for member in get_args(source):
@@ -145,15 +135,13 @@ class Choice:
 def _numbers(value: Any) -> Any:
     """A number, a list of numbers or a list of rows; a list of one number is that number."""
     rows = value if isinstance(value, list) else [value]
-    matrix = bool(rows) and all(isinstance(row, list) for row in rows)
-    entries = [entry for row in rows for entry in row] if matrix else rows
+    is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if is_matrix else rows
     for entry in entries:
-        if isinstance(entry, bool) or not isinstance(entry, (int, float)) or not np.isfinite(entry):
-            raise ValueError(
-                "expected a number, a list of numbers, or a matrix as a list of rows, got "
-                f"{_show(entry)}"
-            )
-    if matrix and len({len(row) for row in rows}) > 1:
+        if type(entry) not in (int, float) or not np.isfinite(entry):
+            wanted = "a number, a list of numbers, or a matrix as a list of rows"
+            raise ValueError(f"expected {wanted}, got {_show(entry)}")
+    if is_matrix and len({len(row) for row in rows}) > 1:
         raise ValueError(f"the rows of {_show(value)} have different lengths")
     if not entries:
         raise ValueError("empty; give one number, or one for each")
@@ -166,16 +154,16 @@ _LIST = {"type": "array", "items": _NUMBER}
 
 Numbers = Annotated[
     Any,
-    PlainValidator(_numbers),
-    PlainSerializer(lambda value: np.asarray(value, dtype=float).tolist()),
-    WithJsonSchema({"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]}),
+    pydantic.PlainValidator(_numbers),
+    pydantic.PlainSerializer(lambda value: np.asarray(value, dtype=float).tolist()),
+    pydantic.WithJsonSchema({"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]}),
 ]
 """A number, a list of numbers, or a matrix row by row."""
 
-Row = Annotated[tuple[float, ...], Strict(False)]
+Row = Annotated[tuple[float, ...], pydantic.Strict(False)]
 """A list of numbers."""
 
-Triple = Annotated[Row, Field(min_length=3, max_length=3)]
+Triple = Annotated[Row, pydantic.Field(min_length=3, max_length=3)]
 """Three numbers."""
 
 
@@ -183,10 +171,10 @@ class Reader(Generic[T]):
     """Reads a dataclass from plain data, and writes it as such."""
 
     def __init__(self, form: type[T]) -> None:
-        self._adapter: TypeAdapter[T] = TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
+        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
         self.schema: dict[str, Any] = self._adapter.json_schema()
+        #: Dotted keys of the dictionaries with any names.
         self.free_names = set(_free_names(self.schema, ""))
-        """Dotted keys of the dictionaries with any names."""
 
     def read(self, data: Any) -> T:
         """The dataclass.
@@ -196,7 +184,7 @@ class Reader(Generic[T]):
         """
         try:
             return self._adapter.validate_python(data)
-        except ValidationError as error:
+        except pydantic.ValidationError as error:
             problems = [self._problem(details, data) for details in error.errors()]
             raise ScenarioError(*problems) from None
 
@@ -206,70 +194,91 @@ class Reader(Generic[T]):
 
     def _problem(self, details: ErrorDetails, data: Any) -> tuple[str, str]:
         """Dotted key and text."""
-        kind, value = details["type"], details["input"]
-        last = str(details["loc"][-1]) if details["loc"] else ""
-        absent = kind in ("missing", "extra_forbidden")
-        loc = details["loc"][:-1] if absent else details["loc"]
-        schema, key, title, choices = self.schema, "", "", ""
-        for part in loc:
-            if isinstance(part, str) and "oneOf" in schema:
-                choices = ", ".join(map(_tag, schema["oneOf"]))
-                schema = next(one for one in schema["oneOf"] if _tag(one) == part)
-                title = f"{part} "
-                continue
-            key, title = f"{key}.{part}" if key else str(part), ""
-            data = data[part]
+        kind, loc, value = details["type"], details["loc"], details["input"]
+        if kind in ("missing", "extra_forbidden"):
+            place = _place(loc[:-1], self.schema, data)
+            return place.key, _wrong_key(place, str(loc[-1]), value, kind == "missing")
+        place = _place(loc, self.schema, data)
+        if kind == "value_error":
+            return place.key, str(details["ctx"]["error"])
+        return place.key, _wrong_value(place.schema, value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A place in data: its dotted key, its schema, and the tag that chose it, with all tags."""
+
+    key: str
+    schema: Mapping[str, Any]
+    data: Any
+    tag: str = ""
+    tags: str = ""
+
+
+def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _Place:
+    """Where pydantic's location is, in which a chosen tag is a part."""
+    keys: list[str] = []
+    tag = tags = ""
+    for part in loc:
+        if "oneOf" in schema:
+            tag, tags = str(part), _tags(schema)
+            schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
+        else:
+            keys.append(str(part))
             inner = schema.get("items", schema.get("additionalProperties"))
             schema = schema.get("properties", {}).get(part, inner)
-        key = key or "scenario"
-        keys = [name for name in schema.get("properties", {}) if name != TAG]
-        known = f"keys: {', '.join(keys) or 'none'}"
-        if kind == "missing":
-            return key, f"{title}needs the key '{last}'; {known}"
-        if absent and last == TAG:
-            return key, f"takes no tag, got {value}"
-        if absent:
-            near = get_close_matches(last, keys, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            text = f"{title}has no key '{last}'; {hint}{known}"
-            if title and TAG not in data:
-                text += f". No tag is given; there are {choices}"
-            return key, text
-        if kind == "value_error":
-            return key, str(details["ctx"]["error"])
-        if kind.startswith("union_tag"):
-            expected = f"one of {', '.join(map(_tag, schema['oneOf']))}"
-        elif "properties" in schema:
-            expected = f"keys {', '.join(keys)}"
-        elif "minItems" in schema:
-            expected = f"{schema['minItems']} numbers"
-        else:
-            expected = next(
-                (text for start, text in _EXPECTED.items() if kind.startswith(start)),
-                details["msg"],
-            )
-        got = f"expected {expected}, got {_show(value)}"
-        if kind == "string_type" and isinstance(value, (bool, int, float)):
-            got += "; text that reads as something else goes in quotes"
-        return key, got
+            data, tag = data[part], ""
+    return _Place(".".join(keys) or "scenario", schema, data, tag, tags)
 
 
-_EXPECTED = {
-    "float": "a number",
-    "finite": "a number",
-    "int": "a whole number",
-    "bool": "true or false",
+def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
+    """What is wrong about a key that is missing or should not be there."""
+    if name == TAG:
+        return f"takes no tag, got {value}"
+    names = [name for name in place.schema["properties"] if name != TAG]
+    title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
+    if is_missing:
+        return f"{title}needs the key '{name}'; {known}"
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    text = f"{title}has no key '{name}'; {hint}{known}"
+    if place.tag and TAG not in place.data:
+        text += f". No tag is given; there are {place.tags}"
+    return text
+
+
+def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
+    """What a schema expects instead of a value."""
+    if "oneOf" in schema:
+        expected = f"one of {_tags(schema)}"
+    elif "properties" in schema:
+        expected = f"keys {', '.join(schema['properties'])}"
+    elif "minItems" in schema:
+        expected = f"{schema['minItems']} numbers"
+    else:
+        expected = _IN_WORDS[schema["type"]]
+    text = f"expected {expected}, got {_show(value)}"
+    if schema.get("type") == "string" and isinstance(value, (bool, int, float)):
+        text += "; text that reads as something else goes in quotes"
+    return text
+
+
+_IN_WORDS = {
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
     "string": "text",
-    "list": "a list",
-    "sequence": "a list",
-    "dict": "names with values",
-    "tuple": "a list",
+    "array": "a list",
+    "object": "names with values",
 }
-"""Beginning of pydantic's kind of an error -> what would be right."""
 
 
 def _tag(schema: Mapping[str, Any]) -> str:
     return str(schema["properties"][TAG]["const"])
+
+
+def _tags(schema: Mapping[str, Any]) -> str:
+    return ", ".join(map(_tag, schema["oneOf"]))
 
 
 def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:

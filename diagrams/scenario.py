@@ -1,216 +1,33 @@
 """Scenario files: a robot in contact, what it shall do, and how to simulate it.
 
 A scenario is YAML. What the library has as a dataclass is written with the keys of that dataclass;
-a choice between several is written with the name as a tag, for example `surface: !Sphere`. The
-classes here are what has no such dataclass.
+a choice between several is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
+from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae import references
-from drake_dae.dae.gains import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
-from drake_dae.errors import GainError, ModelError, ScenarioError
+from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, outputs
 from drake_dae.robots.contact import surfaces
-from drake_dae.systems.sensors import ForceSensor
+from drake_dae.simulation.simulate import check_config, check_duration
 
 FOLDER = Path(__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
 
 T = TypeVar("T")
-
-
-class Written(ABC, Generic[T]):
-    """What a scenario writes in another way than the library holds it."""
-
-    @abstractmethod
-    def made(self, constraints: Sequence[contact.Constraint]) -> T:
-        """What the library holds.
-
-        Args:
-            constraints: Those of the scenario, as far as they are made.
-
-        Raises:
-            ModelError: What does not fit.
-        """
-
-
-@dataclass(frozen=True)
-class Robot:
-    """A robot that Drake's Parser reads.
-
-    Attributes:
-        file: A URDF, SDFormat or model-directives file, relative to the scenario, or
-            "package://drake_dae_models/<file>" for a shipped one.
-        packages: Name -> folder, relative to the scenario, for other "package://<name>/...".
-    """
-
-    file: str
-    packages: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Pose:
-    """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
-
-    translation: Triple = (0.0, 0.0, 0.0)
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class WeldedFrames(Written[contact.Constraint]):
-    """`robots.contact.WeldedFrames`, its pose by angles."""
-
-    frame_a: str
-    frame_b: str
-    pose: Pose = Pose()
-    name: str = "weld"
-
-    def made(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
-        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
-        pose = RigidTransform(rotation, self.pose.translation)
-        return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
-
-
-@dataclass(frozen=True)
-class SurfaceCoordinates(Written[outputs.PositionOutput]):
-    """`robots.outputs.SurfaceCoordinates` of the constraint with a name."""
-
-    constraint: str
-
-    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
-        named = {constraint.name: constraint for constraint in constraints}
-        if self.constraint not in named:
-            raise ModelError(unknown_name("constraint", self.constraint, named))
-        return outputs.SurfaceCoordinates(cast(contact.PointOnSurface, named[self.constraint]))
-
-
-@dataclass(frozen=True)
-class ModelForce:
-    """The law uses the force of its model: (28)."""
-
-    is_measured: ClassVar = False
-    seed: ClassVar = 0
-    gain: ClassVar = 0.0
-
-    def sensor(self, size: int) -> ForceSensor | None:
-        """None is needed."""
-        return None
-
-
-@dataclass(frozen=True)
-class MeasuredForce:
-    """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
-
-    Attributes:
-        time_constant: Of the sensor's lag, in s.
-        sample_period: In s; 0 for none.
-        bias: In N (N m for a moment), one number for all forces or one each.
-        noise_deviation: Likewise.
-        seed: Of the noise.
-        gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
-    """
-
-    time_constant: float = 0.0
-    sample_period: float = 0.0
-    bias: Numbers = 0.0
-    noise_deviation: Numbers = 0.0
-    seed: int = 0
-    gain: Numbers = 0.0
-    is_measured: ClassVar = True
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**32:
-            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
-
-    def sensor(self, size: int) -> ForceSensor | None:
-        """The sensor of a number of forces."""
-        return ForceSensor(
-            size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
-        )
-
-
-@dataclass(frozen=True)
-class PerOutput:
-    """Numbers for all outputs, or per output name ("*" for all others)."""
-
-    all: list[float] = field(default_factory=list)
-    outputs: dict[str, list[float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.all and self.outputs:
-            raise GainError("give either 'all' or 'outputs', not both")
-
-
-@dataclass(frozen=True)
-class Poles(PerOutput):
-    """`dae.gains.poles`; complex ones are written as Coefficients."""
-
-    def design(self) -> GainDesign:
-        """The gains."""
-        return poles(self.all or self.outputs)
-
-
-@dataclass(frozen=True)
-class Coefficients(PerOutput):
-    """`dae.gains.gain_coefficients`: K_i1, ..., K_i mu_i."""
-
-    def design(self) -> GainDesign:
-        """The gains."""
-        return gain_coefficients(self.all or self.outputs)
-
-
-@dataclass(frozen=True)
-class Matrices:
-    """`dae.gains.gain_matrices`: for each degree, highest first, its Lambda_1, Lambda_2, ..."""
-
-    groups: list[list[list[list[float]]]]
-
-    def __post_init__(self) -> None:
-        for matrix in (matrix for group in self.groups for matrix in group):
-            if len({len(row) for row in matrix}) != 1:
-                raise GainError(f"groups: the rows of {matrix} have different lengths")
-
-    def design(self) -> GainDesign:
-        """The gains."""
-        return gain_matrices(*self.groups)
-
-
-@dataclass(frozen=True)
-class Start:
-    """At rest, on the constraint, with given errors of the position outputs.
-
-    Attributes:
-        positions: Joint name -> position near which the robot starts, in rad or m; the robot's
-            default where not given.
-        errors: Output name -> z - r at the start; 0 where not given. Forces can start off their
-            references where actuators have dynamics.
-    """
-
-    positions: dict[str, float] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Write:
-    """What a run leaves in its folder, beside the scenario and the summary."""
-
-    record: bool = True
-    plots: bool = True
-    animation: bool = True
 
 
 # The families that a tag chooses from, and what stands in a file for the types of their fields. A
@@ -221,13 +38,13 @@ Surface = Annotated[
     Choice({surfaces.Vector: Triple}),
 ]
 Constraint = Annotated[
-    contact.PointOnSurface | WeldedFrames | contact.CoincidentPoints,
+    contact.PointOnSurface | parts.WeldedFrames | contact.CoincidentPoints,
     Choice({surfaces.Vector: Triple, surfaces.Surface: Surface}),
 ]
 Output = Annotated[
     outputs.PointCoordinates
     | outputs.AxisCoordinates
-    | SurfaceCoordinates
+    | parts.SurfaceCoordinates
     | outputs.JointPositions,
     Choice({surfaces.Vector: Triple}),
 ]
@@ -243,8 +60,19 @@ Reference = Annotated[
     ],
     Choice({ArrayLike: Row}),
 ]
-Force = Annotated[ModelForce | MeasuredForce, Choice()]
-Gains = Annotated[Poles | Coefficients | Matrices, Choice()]
+Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
+Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
+
+
+def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
+    """A check that passes the value on."""
+
+    def passed_on(value: T) -> T:
+        check(value)
+        return value
+
+    return passed_on
+
 
 _INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
 
@@ -270,20 +98,20 @@ class Scenario:
     """
 
     description: str = field(default="", kw_only=True)
-    robot: Robot
+    robot: parts.Robot
     constraints: list[Constraint] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)
-    force: Force = ModelForce()
+    force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
-    gains: Gains = Poles()
+    gains: Gains = field(default_factory=parts.Poles)
     references: list[Reference] = field(kw_only=True)
-    start: Start = Start()
-    duration: float = 10.0
-    integrator: Annotated[SimulatorConfig, Form(defaults=_INTEGRATOR)] = field(
-        default_factory=lambda: SimulatorConfig(**_INTEGRATOR)
-    )
-    write: Write = Write()
+    start: parts.Start = field(default_factory=parts.Start)
+    duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
+    integrator: Annotated[
+        SimulatorConfig, Form(defaults=_INTEGRATOR), AfterValidator(_checked(check_config))
+    ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
+    write: parts.Write = field(default_factory=parts.Write)
 
     def __eq__(self, other: object) -> bool:
         # Arrays, and Drake's SimulatorConfig, do not compare as a whole.
@@ -317,8 +145,7 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    message = unknown_name("scenario file", name, shipped)
-    raise ScenarioError(("", message.replace("there are", "shipped scenarios:")))
+    raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
 
 
 def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
@@ -352,7 +179,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     if file and not file.startswith("package://"):
         file = str((here / file).resolve())
     packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
-    return replace(scenario, robot=Robot(file, packages))
+    return replace(scenario, robot=parts.Robot(file, packages))
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

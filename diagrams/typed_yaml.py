@@ -44,16 +44,14 @@ _Loader.add_implicit_resolver(
 
 
 class _Dumper(yaml.SafeDumper):
-    """Keeps the order of keys, and writes lists of plain values in one line."""
+    """Keeps the order of keys, and writes tags."""
 
-    def represent_mapping(
-        self, tag: str, mapping: dict[str, Any], flow_style: bool | None = None
-    ) -> yaml.MappingNode:
-        entries = [(key, value) for key, value in mapping.items() if key != TAG]
-        return super().represent_mapping(mapping.get(TAG, tag), entries, flow_style)
+    def represent_tagged(self, data: dict[str, Any]) -> yaml.MappingNode:
+        entries = [(key, value) for key, value in data.items() if key != TAG]
+        return self.represent_mapping(data.get(TAG, "tag:yaml.org,2002:map"), entries)
 
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
+
+_Dumper.add_representer(dict, _Dumper.represent_tagged)
 
 
 def load_yaml(text: str, name: str) -> Any:

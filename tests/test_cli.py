@@ -223,6 +223,13 @@ def test_a_mistake_is_one_line_and_leaves_nothing(arguments, line, tmp_path, mon
     assert list(tmp_path.iterdir()) == []
 
 
+def test_each_mistake_in_a_scenario_has_its_line(capsys):
+    assert main(["simulate", "two_link_wall", "--set", "duration=0", "--set", "foo=1"]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: duration: ")
+    assert second.startswith("error: scenario: has no key 'foo'; ")
+
+
 def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, capsys):
     """The arm is stretched out at z = 1.6 m, which the reference passes after 0.13 s."""
     move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"

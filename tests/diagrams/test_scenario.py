@@ -30,8 +30,9 @@ from drake_dae import (
     build_scenario,
     load_scenario,
 )
-from drake_dae.diagrams import scenario as forms
+from drake_dae.diagrams import scenario_parts as forms
 from drake_dae.diagrams.scenario import (
+    Scenario,
     find_scenario,
     save_scenario,
     scenario_schema,
@@ -201,7 +202,7 @@ def test_every_form_reads_back_equal(tmp_path):
         Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)),
         Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1),
     ]
-    scenario = forms.Scenario(
+    scenario = Scenario(
         description="on: ä # 'quoted'\nsecond line",
         robot=forms.Robot("/some/where.urdf", {"other": "/else/where"}),
         constraints=[
@@ -840,7 +841,7 @@ def test_all_problems_are_told_at_once():
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(ScenarioError, match="no scenario file 'nowhere'; shipped scenarios: five"):
+    with pytest.raises(ScenarioError, match="no scenario file 'nowhere'; there are five_bar,"):
         find_scenario("nowhere")
     with pytest.raises(ScenarioError, match=r"did you mean 'two_link_wall'\?"):
         find_scenario("two_link_wal")
