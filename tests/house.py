@@ -38,6 +38,7 @@ WITHOUT_DRAKE = ("errors", "arrays", "trace", "dae", "analysis")
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
     "signals",
+    "expressions",
     "system",
     "layout",
     "manifold",
@@ -45,7 +46,6 @@ PAPER = (
     "elimination",
     "states",
     "structure",
-    "completion",
     "normal_form",
     "gains",
     "references",

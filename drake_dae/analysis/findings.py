@@ -1,11 +1,17 @@
-"""What an examination finds of one assumption."""
+"""What an examination finds of a system, as values."""
 
 from dataclasses import dataclass
 from enum import StrEnum
 
+from drake_dae.analysis.tables import named_values
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.assumptions import Violation
+from drake_dae.dae.layout import Layout
 from drake_dae.dae.states.margins import Margin
-from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.structure import Structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
 
 class Finding(StrEnum):
@@ -46,3 +52,85 @@ OF_VERDICT = {
     Verdict.UNDECIDED: Finding.UNDECIDED,
 }
 """What the stability of the zero dynamics says of Assumption 2.2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the theory says about one system, as values.
+
+    What is not known, because an assumption fails before, is None.
+
+    Attributes:
+        system: The system.
+        where: Which states were examined, in words.
+        states: The states, consistent where the constraints have degrees, shape (samples, n).
+        assumptions: (1), ..., (5).
+        constraint_degrees: r_1, ..., r_m.
+        output_degrees: mu_1, ..., mu_p in the order of the system's outputs.
+        independence: Margin of the gradients of all chains, which are linearly independent by
+            Theorem 2.1; None also where there are no chains.
+        zero_dynamics: Assumption 2.2, by linearization at an equilibrium.
+        motion: Along the reference; None also without one.
+        structure: For laws and blocks; None where A(x) or B(x) is singular at an examined state
+            itself. One that is singular only between them violates its assumption, no more.
+    """
+
+    system: DaeSystem
+    where: str
+    states: FloatArray
+    assumptions: tuple[Assumption, ...]
+    constraint_degrees: tuple[int, ...] | None = None
+    output_degrees: tuple[int, ...] | None = None
+    independence: Margin | None = None
+    zero_dynamics: Stability | None = None
+    motion: PinnedMotion | None = None
+    structure: Structure | None = None
+
+    @property
+    def output_order(self) -> tuple[int, ...] | None:
+        """The outputs in the paper's order (15): those with mu_i >= 1 first."""
+        if self.output_degrees is None:
+            return None
+        layout = Layout(self.output_degrees)
+        return (*map(int, layout.dynamic), *map(int, layout.direct))
+
+    @property
+    def index(self) -> int | None:
+        """max r_i + 1, the index of the DAE; 0 without constraints."""
+        degrees = self._degrees_of_manifold
+        return None if degrees is None else max(degrees, default=-1) + 1
+
+    @property
+    def _degrees_of_manifold(self) -> tuple[int, ...] | None:
+        """r_1, ..., r_m, unless Assumption (2) fails, so that they do not add up."""
+        violated = self.assumptions[1].finding is Finding.VIOLATED
+        return None if violated else self.constraint_degrees
+
+    @property
+    def manifold_dimension(self) -> int | None:
+        """dim N* = n - sum r_i, Theorem 1.1."""
+        degrees = self._degrees_of_manifold
+        return None if degrees is None else self.system.num_states - sum(degrees)
+
+    @property
+    def zero_dynamics_dimension(self) -> int | None:
+        """dim xi of (22): n - sum r_i - sum mu_i."""
+        known, degrees = self.manifold_dimension, self.output_degrees
+        return None if known is None or degrees is None else known - sum(degrees)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is violated, one text each; empty if nothing is."""
+        found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
+        # Where an assumption fails, the theorem may as well, and says nothing new.
+        if not found and self.independence is not None and self.independence.is_singular:
+            place = named_values(self.system.state_signals, self.independence.state)
+            found.append(
+                "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
+                f"depend on each other at {place}"
+            )
+        if self.zero_dynamics is not None and self.zero_dynamics.verdict is Verdict.UNSTABLE:
+            found.append(f"Assumption 2.2: {self.zero_dynamics.reason}")
+        if self.motion is not None and self.motion.ending is not None:
+            found.append(str(self.motion.ending))
+        return tuple(found)

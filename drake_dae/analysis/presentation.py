@@ -1,47 +1,40 @@
-"""An analysis as text, tables and data."""
-
-from __future__ import annotations
+"""Findings as text, tables and data."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from drake_dae.analysis.findings import OF_VERDICT, Finding
-from drake_dae.analysis.tables import Part, Table, count_of, digits
-from drake_dae.arrays import FloatArray
+from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
+from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR, Margin
-from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
-if TYPE_CHECKING:
-    from drake_dae.analysis.report import Analysis
 
-
-def as_dict(analysis: Analysis) -> dict[str, Any]:
+def as_dict(findings: Findings) -> dict[str, Any]:
     """What is printed as plain numbers, lists and texts, with the states of the margins."""
-    system = analysis.system
-    zero, motion = analysis.zero_dynamics, analysis.motion
+    system = findings.system
+    zero, motion = findings.zero_dynamics, findings.motion
     return {
         "name": system.name,
         "num_states": system.num_states,
         "num_constraints": system.num_constraints,
         "num_controls": system.num_controls,
         "states": [signal.name for signal in system.state_signals],
-        "examined_at": analysis.where,
+        "examined_at": findings.where,
         "constraint_degrees": _by_name(
-            system.constraint_output_signals, analysis.constraint_degrees
+            system.constraint_output_signals, findings.constraint_degrees
         ),
-        "index": analysis.index,
-        "manifold_dimension": analysis.manifold_dimension,
-        "output_degrees": _by_name(system.output_signals, analysis.output_degrees),
+        "index": findings.index,
+        "manifold_dimension": findings.manifold_dimension,
+        "output_degrees": _by_name(system.output_signals, findings.output_degrees),
         "output_order": None
-        if analysis.output_order is None
-        else [system.output_signals[i].name for i in analysis.output_order],
-        "zero_dynamics_dimension": analysis.zero_dynamics_dimension,
+        if findings.output_order is None
+        else [system.output_signals[i].name for i in findings.output_order],
+        "zero_dynamics_dimension": findings.zero_dynamics_dimension,
         "assumptions": [
             {
                 "number": a.number,
@@ -50,9 +43,9 @@ def as_dict(analysis: Analysis) -> dict[str, Any]:
                 "margin": _margin(a.margin),
                 "reason": a.reason,
             }
-            for a in analysis.assumptions
+            for a in findings.assumptions
         ],
-        "independence": _margin(analysis.independence),
+        "independence": _margin(findings.independence),
         "zero_dynamics": None
         if zero is None
         else {
@@ -62,30 +55,30 @@ def as_dict(analysis: Analysis) -> dict[str, Any]:
             "reason": zero.reason,
         },
         "reference": None if motion is None else _motion(motion),
-        "problems": list(analysis.problems),
+        "problems": list(findings.problems),
     }
 
 
-def parts_of(analysis: Analysis) -> list[Part]:
+def parts_of(findings: Findings) -> list[Part]:
     """Paragraphs and tables, without the problems."""
-    system = analysis.system
+    system = findings.system
     counts = (
         count_of(system.num_states, "state"),
         count_of(system.num_constraints, "constraint"),
         count_of(system.num_controls, "control"),
     )
-    parts: list[Part] = [[f"{system.name}: {', '.join(counts)}", f"examined at {analysis.where}"]]
+    parts: list[Part] = [[f"{system.name}: {', '.join(counts)}", f"examined at {findings.where}"]]
     if system.num_constraints:
         rows = [
-            [signal.name, _known(analysis.constraint_degrees, i)]
+            [signal.name, _known(findings.constraint_degrees, i)]
             for i, signal in enumerate(system.constraint_output_signals)
         ]
         parts.append(Table(["constraint", "r"], rows))
-    order = analysis.output_order
+    order = findings.output_order
     rows = [
         [
             signal.name,
-            _known(analysis.output_degrees, i),
+            _known(findings.output_degrees, i),
             "?" if order is None else str(order.index(i) + 1),
         ]
         for i, signal in enumerate(system.output_signals)
@@ -94,14 +87,14 @@ def parts_of(analysis: Analysis) -> list[Part]:
     index, manifold, zero = (
         "?" if number is None else str(number)
         for number in (
-            analysis.index,
-            analysis.manifold_dimension,
-            analysis.zero_dynamics_dimension,
+            findings.index,
+            findings.manifold_dimension,
+            findings.zero_dynamics_dimension,
         )
     )
     parts.append([f"index {index}, N* of dimension {manifold}, zero dynamics of dimension {zero}"])
-    parts.append(_findings(analysis))
-    margins = [a.margin for a in analysis.assumptions if a.margin] + [analysis.independence]
+    parts.append(_findings(findings))
+    margins = [a.margin for a in findings.assumptions if a.margin] + [findings.independence]
     if any(margins):
         parts.append(
             [
@@ -109,62 +102,62 @@ def parts_of(analysis: Analysis) -> list[Part]:
                 f"length one; below {SINGULAR:.0e} it counts as singular."
             ]
         )
-    parts += _places(analysis)
-    if analysis.motion is not None and analysis.motion.times.size:
-        parts.append(_along(analysis.motion))
+    parts += _places(findings)
+    if findings.motion is not None and findings.motion.times.size:
+        parts.append(_along(findings.motion))
     return parts
 
 
-def _findings(analysis: Analysis) -> Table:
-    free = "" if analysis.system.num_constraints else ": m = 0"
+def _findings(findings: Findings) -> Table:
+    free = "" if findings.system.num_constraints else ": m = 0"
     rows = [
         [
             f"({a.number})  {a.statement}{free if a.number <= 3 else ''}",
             str(a.finding),
             *_figures(a.margin),
         ]
-        for a in analysis.assumptions
+        for a in findings.assumptions
     ]
     chains, zero = Finding.NOT_EXAMINED, Finding.NOT_EXAMINED
-    if analysis.output_degrees is not None:
-        singular = analysis.independence is not None and analysis.independence.is_singular
+    if findings.output_degrees is not None:
+        singular = findings.independence is not None and findings.independence.is_singular
         chains = Finding.FAILS if singular else Finding.SATISFIED
-    if analysis.zero_dynamics is not None:
-        zero = OF_VERDICT[analysis.zero_dynamics.verdict]
-    none = ": there are none" if analysis.zero_dynamics_dimension == 0 else ""
+    if findings.zero_dynamics is not None:
+        zero = OF_VERDICT[findings.zero_dynamics.verdict]
+    none = ": there are none" if findings.zero_dynamics_dimension == 0 else ""
     rows += [
         [
             "2.1  theorem: gradients of all chains are independent",
             chains,
-            *_figures(analysis.independence),
+            *_figures(findings.independence),
         ],
         [f"2.2  zero dynamics are stable{none}", zero, "", ""],
     ]
     return Table(["assumption", "finding", "margin", "singular value"], rows, left=2)
 
 
-def _places(analysis: Analysis) -> list[Part]:
+def _places(findings: Findings) -> list[Part]:
     """Where the margins are smallest, and what the zero dynamics do."""
     lines = []
-    found = analysis.structure
+    found = findings.structure
     if found is not None:
         matrices = {2: found.elimination.constraint_matrix, 5: found.control_matrix}
         lines = [
-            _nearest(analysis, a.number, matrices[a.number], a.margin)
-            for a in analysis.assumptions
+            _nearest(findings, a.number, matrices[a.number], a.margin)
+            for a in findings.assumptions
             if a.margin is not None and a.finding is Finding.SATISFIED
         ]
-    zero = analysis.zero_dynamics
+    zero = findings.zero_dynamics
     if zero is not None and zero.eigenvalues.size:
         lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")
-    if zero is not None and analysis.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:
+    if zero is not None and findings.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:
         lines.append(f"Zero dynamics {zero.verdict}: {zero.reason}.")
     return [lines] if lines else []
 
 
-def _nearest(analysis: Analysis, number: int, matrix: ca.SX, margin: Margin) -> str:
+def _nearest(findings: Findings, number: int, matrix: ca.SX, margin: Margin) -> str:
     """Where A(x) or B(x) is nearest to singular, in the states that it depends on."""
-    letter, system = "A" if number == 2 else "B", analysis.system
+    letter, system = "A" if number == 2 else "B", findings.system
     used = ca.which_depends(ca.vec(matrix), system.state, 1, False)
     if not any(used):
         return f"{letter}(x) is the same at all states."
@@ -172,21 +165,13 @@ def _nearest(analysis: Analysis, number: int, matrix: ca.SX, margin: Margin) -> 
     values = np.array(
         [
             value(state, system.parameter_values)[0]
-            for state in np.vstack([analysis.states, margin.state])
+            for state in np.vstack([findings.states, margin.state])
         ]
     )
     if np.all(np.ptp(values, axis=0) <= 1e-9 * np.abs(values).max()):
         return f"{letter}(x) is the same at all examined states."
-    return f"{letter}(x) is nearest to singular at {named(system, margin.state, used)}."
-
-
-def named(system: DaeSystem, state: FloatArray, chosen: Sequence[bool] | None = None) -> str:
-    """A state, or what is chosen of it, as name=value with unit, ..."""
-    return ", ".join(
-        f"{signal.name}={digits(value)} {signal.unit}".rstrip()
-        for i, (signal, value) in enumerate(zip(system.state_signals, state, strict=True))
-        if chosen is None or chosen[i]
-    )
+    place = named_values(system.state_signals, margin.state, used)
+    return f"{letter}(x) is nearest to singular at {place}."
 
 
 def _known(values: Sequence[int] | None, index: int) -> str:

@@ -4,6 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import fill
 
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
+
 _WIDTH = 100
 """Of a paragraph, in characters."""
 
@@ -79,3 +82,14 @@ def to_markdown(parts: Sequence[Part]) -> str:
 def count_of(number: int, noun: str) -> str:
     """As in 1 state, 2 states."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def named_values(
+    signals: Sequence[Signal], values: FloatArray, chosen: Sequence[bool] | None = None
+) -> str:
+    """Values, or those that are chosen, as "name=value unit, ..."."""
+    return ", ".join(
+        f"{signal.name}={digits(value)} {signal.unit}".rstrip()
+        for i, (signal, value) in enumerate(zip(signals, values, strict=True))
+        if chosen is None or chosen[i]
+    )
