@@ -20,7 +20,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.build import build
-from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation, make_closed_loop
+from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
 from drake_dae.diagrams.scenario import load_scenario
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.actuation.dc_motors import DcMotors
@@ -46,6 +46,7 @@ from drake_dae.robots.outputs import (
     PointCoordinates,
     SurfaceCoordinates,
 )
+from drake_dae.simulation.animation import make_animation
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.view import start_meshcat

@@ -1,5 +1,7 @@
 """Arrays of numbers, and the checks that everything shares."""
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -49,3 +51,17 @@ def check_axes(name: str, axes: str) -> None:
     """
     if not axes or any(a not in "xyz" for a in axes) or len(set(axes)) != len(axes):
         raise ModelError(f"{name} must be distinct letters of x, y, z, got '{axes}'")
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """A message about a name that nothing bears: what is near it, and what there is.
+
+    Args:
+        kind: What the name should be of, as "frame".
+        name: The unknown name.
+        known: Names that exist.
+    """
+    names = list(known)
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    return f"no {kind} '{name}'; {hint}there are {', '.join(names) or 'none'}"
