@@ -13,29 +13,43 @@ SCENARIO ?= seven_joint_wall
 VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
 VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
+HOUSE := examples/pictures/house.png
 
-.PHONY: help demo test benchmark clean
+# One process per core; one that has nothing left to do takes tests from another.
+PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
+
+.PHONY: help demo check test benchmark house clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
-	@echo 'make test        lint, types and tests'
+	@echo 'make check       lint, types and the quick tests: the daily round, below 90 s'
+	@echo 'make test        lint, types and all tests'
 	@echo 'make benchmark   speed, with ratios'
+	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
 demo: $(VENV)/installed
 	$(BIN)/drake-dae simulate $(SCENARIO) --out runs/$(SCENARIO)
 
-test: $(VENV)/installed-dev
+lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+
+check: lint
+	$(PYTEST) -m 'not slow'
+
+test: lint
+	$(PYTEST)
 
 benchmark: $(VENV)/installed-dev
-	$(BIN)/python -m pytest tests/benchmarks -s
+	$(BIN)/python -m pytest tests/benchmarks -q
+
+house: $(VENV)/installed-dev
+	$(BIN)/python tests/draw_house.py $(HOUSE)
 
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache

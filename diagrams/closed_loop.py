@@ -10,10 +10,9 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerT
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ReferenceSignal
+from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.zero_dynamics import first_outputs
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import View, add_view
@@ -69,8 +68,7 @@ class ClosedLoop:
             context: The diagram's context.
         """
         record = Record.from_logs(self.loggers, context)
-        starts = np.cumsum([0, *[degree + 1 for degree in self.controller.law.degrees]])[:-1]
-        desired = record["reference"][:, starts]
+        desired = record["reference"][:, self.controller.law.layout.lowest]
         outputs = record.signals["controlled_output"]
         derived = {
             "desired_output": Recorded(desired, outputs.signals),
@@ -88,7 +86,7 @@ class ClosedLoop:
 def make_closed_loop(
     system: DaePlant,
     law: TrackingLaw,
-    references: Sequence[ReferenceSignal],
+    references: Sequence[Reference],
     *,
     sensor: ForceSensor | None = None,
     scene_graph: SceneGraph | None = None,
@@ -132,7 +130,7 @@ def make_closed_loop(
     plant = builder.AddSystem(system)
     reference = builder.AddSystem(ReferenceGenerator(references, law.degrees))
     try:
-        outputs = first_outputs(law.structure, reference.reference(start_time))
+        outputs = law.layout.values(reference.reference(start_time))
     except DrakeDaeError:
         outputs = None  # A trajectory that begins later.
     controller = builder.AddSystem(TrackingController(law, outputs))
@@ -220,7 +218,8 @@ def _add_force_feedback(
                 "time_constant or a sample_period"
             )
     else:
-        gain = float(np.linalg.norm(controller.law.force_gain, 2)) if force.size() else 0.0
+        measured = controller.law.measured_force
+        gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
         if gain >= sensor.largest_stable_gain():
             raise WiringError(
                 f"the sampled force loop diverges: ||Gbar|| = {gain:.3g}, but each sample "

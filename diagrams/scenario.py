@@ -1,310 +1,83 @@
 """Scenario files: a robot in contact, what it shall do, and how to simulate it.
 
-A scenario is YAML, read by Drake's typed loader into the dataclasses below. A choice between
-several forms is written with the form's name as a tag, for example `surface: !Sphere`.
+A scenario is YAML. What the library has as a dataclass is written with the keys of that dataclass;
+a choice between several is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from difflib import get_close_matches
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
-import numpy as np
-from pydrake.common.yaml import yaml_dump_typed
+from numpy.typing import ArrayLike
+from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
-from drake_dae.diagrams.typed_yaml import REQUIRED, Numbers, read_typed
+from drake_dae.arrays import unknown_name
+from drake_dae.dae import references
+from drake_dae.diagrams import scenario_parts as parts
+from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
+from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
 from drake_dae.errors import ScenarioError
+from drake_dae.robots import actuation, contact, outputs
+from drake_dae.robots.contact import surfaces
+from drake_dae.simulation.simulate import check_config, check_duration
 
 FOLDER = Path(__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
 
-
-def _none() -> Numbers:
-    """No numbers: the key was left out."""
-    return np.zeros(0)
-
-
-@dataclass
-class Robot:
-    """A robot that Drake's Parser reads.
-
-    Attributes:
-        file: A URDF, SDFormat or model-directives file, relative to the scenario, or
-            "package://drake_dae_models/<file>" for a shipped one.
-        packages: Name -> folder, relative to the scenario, for other "package://<name>/...".
-    """
-
-    file: str = field(default="", metadata=REQUIRED)
-    packages: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass
-class Plane:
-    """`robots.surfaces.Plane`."""
-
-    point: list[float] = field(default_factory=list, metadata=REQUIRED)
-    normal: list[float] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass
-class Sphere:
-    """`robots.surfaces.Sphere`."""
-
-    center: list[float] = field(default_factory=list, metadata=REQUIRED)
-    radius: float = field(default=0.0, metadata=REQUIRED)
-    axis: list[float] = field(default_factory=lambda: [0.0, 0.0, 1.0])
-    inside: bool = False
-
-
-@dataclass
-class Cylinder:
-    """`robots.surfaces.Cylinder`."""
-
-    point: list[float] = field(default_factory=list, metadata=REQUIRED)
-    axis: list[float] = field(default_factory=list, metadata=REQUIRED)
-    radius: float = field(default=0.0, metadata=REQUIRED)
-    inside: bool = False
-
-
-@dataclass
-class Ellipsoid:
-    """`robots.surfaces.Ellipsoid`."""
-
-    center: list[float] = field(default_factory=list, metadata=REQUIRED)
-    semi_axes: list[float] = field(default_factory=list, metadata=REQUIRED)
-    inside: bool = False
-
-
-@dataclass
-class Torus:
-    """`robots.surfaces.Torus`."""
-
-    center: list[float] = field(default_factory=list, metadata=REQUIRED)
-    axis: list[float] = field(default_factory=list, metadata=REQUIRED)
-    major_radius: float = field(default=0.0, metadata=REQUIRED)
-    minor_radius: float = field(default=0.0, metadata=REQUIRED)
-    inside: bool = False
-
-
-@dataclass
-class PointOnSurface:
-    """`robots.constraints.PointOnSurface`."""
-
-    frame: str = field(default="", metadata=REQUIRED)
-    surface: Plane | Sphere | Cylinder | Ellipsoid | Torus = field(
-        default_factory=Plane, metadata=REQUIRED
-    )
-    point: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    name: str = "surface"
-
-
-@dataclass
-class Pose:
-    """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
-
-    translation: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-
-
-@dataclass
-class WeldedFrames:
-    """`robots.constraints.WeldedFrames`."""
-
-    frame_a: str = field(default="", metadata=REQUIRED)
-    frame_b: str = field(default="", metadata=REQUIRED)
-    pose: Pose = field(default_factory=Pose)
-    name: str = "weld"
-
-
-@dataclass
-class CoincidentPoints:
-    """`robots.constraints.CoincidentPoints`."""
-
-    frame_a: str = field(default="", metadata=REQUIRED)
-    point_a: list[float] = field(default_factory=list, metadata=REQUIRED)
-    frame_b: str = field(default="", metadata=REQUIRED)
-    point_b: list[float] = field(default_factory=list, metadata=REQUIRED)
-    axes: str = "xyz"
-    name: str = "pin"
-
-
-@dataclass
-class PointCoordinates:
-    """`robots.outputs.PointCoordinates`."""
-
-    frame: str = field(default="", metadata=REQUIRED)
-    axes: str = "xyz"
-    point: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    name: str = ""
-
-
-@dataclass
-class AxisCoordinates:
-    """`robots.outputs.AxisCoordinates`."""
-
-    frame: str = field(default="", metadata=REQUIRED)
-    axis: str = field(default="", metadata=REQUIRED)
-    components: str = field(default="", metadata=REQUIRED)
-
-
-@dataclass
-class SurfaceCoordinates:
-    """`robots.outputs.SurfaceCoordinates` of the constraint with a name."""
-
-    constraint: str = field(default="", metadata=REQUIRED)
-
-
-@dataclass
-class JointPositions:
-    """`robots.outputs.JointPositions`."""
-
-    joints: list[str] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass(eq=False)
-class FlexibleJoints:
-    """`robots.actuation.FlexibleJoints`; one number serves all actuators.
-
-    Each is a number, one per actuator, or a matrix row by row, `[[8000, 500], [500, 6000]]`. An
-    inertia that is left out is what the URDF declares.
-    """
-
-    stiffness: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    inertia: Numbers = field(default_factory=_none)
-    damping: Numbers = field(default_factory=lambda: np.array(0.0))
-
-
-@dataclass(eq=False)
-class DcMotors:
-    """`robots.actuation.DcMotors`; one number serves all actuators.
-
-    Each is a number, or one per actuator. A gear ratio that is left out is what the URDF declares.
-    """
-
-    torque_constant: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    inductance: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    resistance: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    gear_ratio: Numbers = field(default_factory=_none)
-
-
-@dataclass(eq=False)
-class ElectrohydraulicServos:
-    """`robots.actuation.ElectrohydraulicServos`; one number serves all, G(q) is for Python.
-
-    Each is a number or one per actuator; leakage and geometry may be matrices, row by row.
-    """
-
-    stiffness: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    leakage: Numbers = field(default_factory=_none, metadata=REQUIRED)
-    geometry: Numbers = field(default_factory=lambda: np.array(1.0))
-
-
-@dataclass
-class ModelForce:
-    """The law uses the force of its model: (28)."""
-
-
-@dataclass(eq=False)
-class MeasuredForce:
-    """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
-
-    Attributes:
-        time_constant: Of the sensor's lag, s.
-        sample_period: s; 0 for none.
-        bias: N (N m for a moment), one number for all forces or one each.
-        noise_deviation: Likewise.
-        seed: Of the noise.
-        gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
-    """
-
-    time_constant: float = 0.0
-    sample_period: float = 0.0
-    bias: Numbers = field(default_factory=lambda: np.array(0.0))
-    noise_deviation: Numbers = field(default_factory=lambda: np.array(0.0))
-    seed: int = 0
-    gain: Numbers = field(default_factory=lambda: np.array(0.0))
-
-
-@dataclass
-class Poles:
-    """`dae.gains.poles`: real poles for all outputs, or per output name ("*" for all others).
-
-    Complex ones are written as Coefficients.
-    """
-
-    all: list[float] = field(default_factory=list)
-    outputs: dict[str, list[float]] = field(default_factory=dict)
-
-
-@dataclass
-class Coefficients:
-    """`dae.gains.coefficients`: K_i1, ..., K_i mu_i for all outputs, or per output name."""
-
-    all: list[float] = field(default_factory=list)
-    outputs: dict[str, list[float]] = field(default_factory=dict)
-
-
-@dataclass
-class Matrices:
-    """`dae.gains.matrices`: for each degree, highest first, its Lambda_1, Lambda_2, ..."""
-
-    groups: list[list[list[list[float]]]] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass
-class Constant:
-    """`systems.references.constant`."""
-
-    values: list[float] = field(default_factory=list, metadata=REQUIRED)
-
-
-@dataclass
-class Sinusoids:
-    """`systems.references.sinusoids`; the phases are 0 where none are given."""
-
-    offset: float = field(default=0.0, metadata=REQUIRED)
-    amplitudes: list[float] = field(default_factory=list, metadata=REQUIRED)
-    frequencies: list[float] = field(default_factory=list, metadata=REQUIRED)
-    phases: list[float] = field(default_factory=list)
-
-
-@dataclass
-class PointToPoint:
-    """`systems.references.point_to_point`."""
-
-    start: list[float] = field(default_factory=list, metadata=REQUIRED)
-    end: list[float] = field(default_factory=list, metadata=REQUIRED)
-    start_time: float = 0.0
-    end_time: float = field(default=0.0, metadata=REQUIRED)
-    order: int = 2
-
-
-@dataclass
-class Start:
-    """At rest, on the constraint, with given errors of the position outputs.
-
-    Attributes:
-        positions: Joint name -> position near which the robot starts, rad or m; the robot's
-            default where not given.
-        errors: Output name -> z - r at the start; 0 where not given. Forces can start off their
-            references where actuators have dynamics.
-    """
-
-    positions: dict[str, float] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass
-class Write:
-    """What a run leaves in its folder, beside the scenario and the summary."""
-
-    record: bool = True
-    plots: bool = True
-    animation: bool = True
-
-
-@dataclass(eq=False)
+T = TypeVar("T")
+
+
+# The families that a tag chooses from, and what stands in a file for the types of their fields. A
+# new member is one line here.
+
+Surface = Annotated[
+    surfaces.Plane | surfaces.Sphere | surfaces.Cylinder | surfaces.Ellipsoid | surfaces.Torus,
+    Choice({surfaces.Vector: Triple}),
+]
+Constraint = Annotated[
+    contact.PointOnSurface | parts.WeldedFrames | contact.CoincidentPoints,
+    Choice({surfaces.Vector: Triple, surfaces.Surface: Surface}),
+]
+Output = Annotated[
+    outputs.PointCoordinates
+    | outputs.AxisCoordinates
+    | parts.SurfaceCoordinates
+    | outputs.JointPositions,
+    Choice({surfaces.Vector: Triple}),
+]
+Stage = Annotated[
+    actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
+    Choice({ArrayLike: Numbers}),
+]
+Reference = Annotated[
+    Annotated[references.ConstantReference, Form(tag="!Constant")]
+    | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
+    | Annotated[
+        references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
+    ],
+    Choice({ArrayLike: Row}),
+]
+Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
+Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
+
+
+def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
+    """A check that passes the value on."""
+
+    def passed_on(value: T) -> T:
+        check(value)
+        return value
+
+    return passed_on
+
+
+_INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
+
+
+@dataclass(frozen=True, eq=False)
 class Scenario:
     """A robot in contact, what it shall do, and how to simulate it.
 
@@ -319,40 +92,40 @@ class Scenario:
         gains: Of the tracking law (28).
         references: One below the other, in the order of the outputs, the forces last.
         start: Where it starts.
-        duration: s.
+        duration: In s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
         write: What to keep.
     """
 
-    description: str = ""
-    robot: Robot = field(default_factory=Robot, metadata=REQUIRED)
-    constraints: list[PointOnSurface | WeldedFrames | CoincidentPoints] = field(
-        default_factory=list
-    )
-    outputs: list[PointCoordinates | AxisCoordinates | SurfaceCoordinates | JointPositions] = field(
-        default_factory=list
-    )
-    actuation: list[FlexibleJoints | DcMotors | ElectrohydraulicServos] = field(
-        default_factory=list
-    )
-    force: ModelForce | MeasuredForce = field(default_factory=ModelForce)
+    description: str = field(default="", kw_only=True)
+    robot: parts.Robot
+    constraints: list[Constraint] = field(default_factory=list)
+    outputs: list[Output] = field(default_factory=list)
+    actuation: list[Stage] = field(default_factory=list)
+    force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
-    gains: Poles | Coefficients | Matrices = field(default_factory=Poles)
-    references: list[Constant | Sinusoids | PointToPoint] = field(
-        default_factory=list, metadata=REQUIRED
-    )
-    start: Start = field(default_factory=Start)
-    duration: float = 10.0
-    integrator: SimulatorConfig = field(
-        default_factory=lambda: SimulatorConfig(
-            integration_scheme="runge_kutta5", accuracy=1e-6, use_error_control=True
-        )
-    )
-    write: Write = field(default_factory=Write)
+    gains: Gains = field(default_factory=parts.Poles)
+    references: list[Reference] = field(kw_only=True)
+    start: parts.Start = field(default_factory=parts.Start)
+    duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
+    integrator: Annotated[
+        SimulatorConfig, Form(defaults=_INTEGRATOR), AfterValidator(_checked(check_config))
+    ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
+    write: parts.Write = field(default_factory=parts.Write)
 
     def __eq__(self, other: object) -> bool:
-        # Drake's SimulatorConfig compares by identity.
-        return isinstance(other, Scenario) and yaml_dump_typed(self) == yaml_dump_typed(other)
+        # Arrays, and Drake's SimulatorConfig, do not compare as a whole.
+        return isinstance(other, Scenario) and _reader().write(self) == _reader().write(other)
+
+
+@cache
+def _reader() -> Reader[Scenario]:
+    return Reader(Scenario)
+
+
+def scenario_schema() -> dict[str, Any]:
+    """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
+    return _reader().schema
 
 
 def shipped_scenarios() -> dict[str, Path]:
@@ -372,9 +145,7 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    near = get_close_matches(name, shipped, n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
-    raise ScenarioError(f"no scenario file '{name}'; {hint}shipped scenarios: {', '.join(shipped)}")
+    raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
 
 
 def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
@@ -386,23 +157,29 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
             "constraints.0.surface.point=[0.7, 0, 0]".
 
     Raises:
-        ScenarioError: No such file, broken YAML, a key that is unknown, missing or given twice, or
-            a value of a wrong type.
+        ScenarioError: No such file, broken YAML, or keys that are unknown, missing or given twice
+            and values that cannot be used, all at once.
     """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: {error}") from None
-    scenario = read_typed(Scenario, text, settings, str(path))
+        raise ScenarioError((str(path), str(error))) from None
+    data = load_yaml(text, str(path))
+    data = {} if data is None else data
+    if isinstance(data, dict):
+        # As Drake has it: a place for anchors.
+        data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
+    for setting in settings:
+        set_entry(data, setting, _reader().free_names)
+    scenario = _reader().read(data)
     # Absolute, so that the scenario as run means the same wherever it is written.
     robot, here = scenario.robot, path.resolve().parent
-    if robot.file and not robot.file.startswith("package://"):
-        robot.file = str((here / robot.file).resolve())
-    robot.packages = {
-        name: str((here / folder).resolve()) for name, folder in robot.packages.items()
-    }
-    return scenario
+    file = robot.file
+    if file and not file.startswith("package://"):
+        file = str((here / file).resolve())
+    packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
+    return replace(scenario, robot=parts.Robot(file, packages))
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
@@ -414,4 +191,4 @@ def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> No
         comment: A first line, with its "#".
     """
     head = f"{comment}\n" if comment else ""
-    Path(path).write_text(head + yaml_dump_typed(scenario), encoding="utf-8")
+    Path(path).write_text(head + dump_yaml(_reader().write(scenario)), encoding="utf-8")

@@ -10,18 +10,25 @@ from importlib.metadata import version
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
-from drake_dae.dae.extension import Extension, dynamic_extension, extend
-from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.dynamic_extension import dynamic_extension
+from drake_dae.dae.extension import Extension, extend
+from drake_dae.dae.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
 from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.references import ExpressionSignal, constant, point_to_point, sinusoids
+from drake_dae.dae.references import (
+    ConstantReference,
+    ExpressionReference,
+    PointToPointReference,
+    Reference,
+    SinusoidReference,
+)
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.diagrams.build import build
+from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
-from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.diagrams.scenario import load_scenario, scenario_schema
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.actuation.dc_motors import DcMotors
 from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
@@ -54,7 +61,7 @@ from drake_dae.symbolic import from_symbolic
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.realization import StateRealization
-from drake_dae.systems.references import ReferenceGenerator, TrajectorySignal
+from drake_dae.systems.references import ReferenceGenerator, TrajectoryReference
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
 
@@ -65,6 +72,7 @@ __all__ = [
     "AxisCoordinates",
     "ClosedLoop",
     "CoincidentPoints",
+    "ConstantReference",
     "Cylinder",
     "DaePlant",
     "DaeSystem",
@@ -73,7 +81,7 @@ __all__ = [
     "ElectrohydraulicServos",
     "Ellipsoid",
     "ExpressionOutput",
-    "ExpressionSignal",
+    "ExpressionReference",
     "Extension",
     "FeedbackGains",
     "FlexibleJoints",
@@ -87,11 +95,14 @@ __all__ = [
     "Plane",
     "PointCoordinates",
     "PointOnSurface",
+    "PointToPointReference",
     "Record",
+    "Reference",
     "ReferenceGenerator",
     "RobotModel",
     "RobotPlant",
     "Signal",
+    "SinusoidReference",
     "Sphere",
     "StateRealization",
     "Structure",
@@ -99,24 +110,22 @@ __all__ = [
     "Torus",
     "TrackingController",
     "TrackingLaw",
-    "TrajectorySignal",
+    "TrajectoryReference",
     "WeldedFrames",
     "ZeroDynamics",
     "analyze",
-    "build",
-    "coefficients",
-    "constant",
+    "build_scenario",
     "dynamic_extension",
     "extend",
     "find_structure",
     "from_symbolic",
+    "gain_coefficients",
+    "gain_matrices",
     "load_scenario",
     "make_animation",
     "make_closed_loop",
-    "matrices",
-    "point_to_point",
     "poles",
+    "scenario_schema",
     "simulate",
-    "sinusoids",
     "start_meshcat",
 ]

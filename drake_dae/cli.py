@@ -16,9 +16,9 @@ from tempfile import TemporaryDirectory
 from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.diagrams.build import build
+from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.preview import preview
+from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.diagrams.scenario import (
     DEFAULT_SCENARIO,
     Scenario,
@@ -103,9 +103,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _warnings():
             return _simulate(options)
     except DrakeDaeError as error:
-        # Texts of Drake and YAML may have several lines.
-        text = " ".join(str(error).split())
-        print(f"error: {text}", file=sys.stderr)
+        # A scenario has a line for each problem; other texts, as of Drake, are made one.
+        text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
+        print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
         if options.command == "analyze" and options.json:
             print(json.dumps({"error": text}))
         return 1
@@ -141,7 +141,7 @@ def _warnings(*ignored: type[Warning]) -> Iterator[None]:
 
 def _analyze(options: argparse.Namespace) -> int:
     path = find_scenario(options.scenario)
-    found = preview(load_scenario(path, options.settings))
+    found = find_feasibility(load_scenario(path, options.settings))
     if options.json:
         print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
     else:
@@ -156,7 +156,7 @@ def _simulate(options: argparse.Namespace) -> int:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat or scenario.write.animation else None
     began = time.perf_counter()
-    loop, context = build(scenario, meshcat, live=options.meshcat)
+    loop, context = build_scenario(scenario, meshcat, live=options.meshcat)
     print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
     folder = _prepare(options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"))
     save_scenario(scenario, folder / "scenario.yaml", f"{_MARK} {drake_dae.__version__}")
@@ -194,17 +194,16 @@ def _prepare(folder: Path) -> Path:
         if present:
             scenario = folder / FILES[0]
             if not (scenario.exists() and scenario.read_text("utf-8").startswith(_MARK)):
-                raise ScenarioError(
-                    f"--out: '{folder}' holds {', '.join(file.name for file in present)}, not from "
-                    "an earlier run; choose another folder"
-                )
+                found = ", ".join(file.name for file in present)
+                text = f"'{folder}' holds {found}, not from an earlier run; choose another folder"
+                raise ScenarioError(("--out", text))
         for file in present:
             file.unlink()
         # A folder that cannot be written to is found now, not at the end of the run.
         (folder / FILES[0]).touch()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ScenarioError(f"--out: cannot write to '{folder}': {reason}") from None
+        raise ScenarioError(("--out", f"cannot write to '{folder}': {reason}")) from None
     return folder
 
 

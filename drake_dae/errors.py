@@ -23,7 +23,17 @@ class ReferenceSignalError(DrakeDaeError, ValueError):
 
 
 class ScenarioError(DrakeDaeError, ValueError):
-    """A scenario file that cannot be used; the message names the key."""
+    """A scenario that cannot be used; the message has a line "key: text" for each problem.
+
+    Attributes:
+        problems: (dotted key, text) of each; the key is "" where the problem has none.
+    """
+
+    def __init__(self, *problems: tuple[str, str]) -> None:
+        self.problems = tuple((key, " ".join(text.split())) for key, text in problems)
+        super().__init__(
+            "\n".join(f"{key}: {text}" if key else text for key, text in self.problems)
+        )
 
 
 class AssumptionError(DrakeDaeError):
@@ -32,15 +42,21 @@ class AssumptionError(DrakeDaeError):
     Attributes:
         assumption: Number of the assumption in the paper, (1) to (5).
         state: A consistent state, shape (n,), where it fails, or None if it fails everywhere.
-        system: The `DaeSystem` that `find_structure` found it in, for `analyze`; else None.
+        violation: What was found, as a `dae.assumptions.Violation`; None where integrators were
+            looked for and none help.
     """
 
-    system: Any = None
-
-    def __init__(self, message: str, assumption: int, state: ArrayLike | None = None) -> None:
-        super().__init__(f"Assumption ({assumption}): {message}")
+    def __init__(
+        self,
+        message: str,
+        assumption: int,
+        state: ArrayLike | None = None,
+        violation: Any = None,
+    ) -> None:
+        super().__init__(message)
         self.assumption = assumption
         self.state = None if state is None else np.array(state, dtype=float)
+        self.violation = violation
 
 
 class InconsistentStateError(DrakeDaeError):

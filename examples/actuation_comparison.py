@@ -20,12 +20,12 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 from drake_dae.diagrams.scenario import FOLDER
 
-SPRINGS = dae.FlexibleJoints(stiffness=8000.0, inertia=1.0)
-MOTORS = dae.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
-SERVOS = dae.ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
+SPRINGS = dd.FlexibleJoints(stiffness=8000.0, inertia=1.0)
+MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
+SERVOS = dd.ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
 ACTUATIONS = {
     "rigid joints": ([], "-"),
     "flexible joints": ([SPRINGS], "-"),
@@ -35,21 +35,21 @@ ACTUATIONS = {
 }
 
 
-def run(actuation: list) -> tuple[dae.Record, np.ndarray]:
+def run(actuation: list) -> tuple[dd.Record, np.ndarray]:
     """The record of one actuation, and the predicted errors."""
     multibody = MultibodyPlant(0.0)
     Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
     multibody.Finalize()
-    model = dae.RobotModel.from_multibody(
+    model = dd.RobotModel.from_multibody(
         multibody,
-        constraints=[dae.PointOnSurface("tool", dae.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[dae.PointCoordinates("tool", "z")],
+        constraints=[dd.PointOnSurface("tool", dd.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
+        positions=[dd.PointCoordinates("tool", "z")],
         nominal_positions=[1.2, -1.6],
         actuation=actuation,
     )
-    law = dae.TrackingLaw(model.dae, dae.poles(-5.0))
-    references = [dae.sinusoids(0.3, 0.2, 1.5), dae.sinusoids(20.0, 5.0, 2.0)]
-    loop = dae.make_closed_loop(dae.RobotPlant(model, law.structure), law, references)
+    law = dd.TrackingLaw(model.dae, dd.poles(-5.0))
+    references = [dd.SinusoidReference(0.3, 0.2, 1.5), dd.SinusoidReference(20.0, 5.0, 2.0)]
+    loop = dd.make_closed_loop(dd.RobotPlant(model, structure=law.structure), law, references)
     context = loop.diagram.CreateDefaultContext()
     q = model.configuration([0.32], guess=[1.2, -1.6])
     loop.plant.set_consistent_state(
@@ -59,7 +59,7 @@ def run(actuation: list) -> tuple[dae.Record, np.ndarray]:
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=5e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 3.0, config)
+    dd.simulate(loop.diagram, context, 3.0, config)
     record = loop.record(context)
     return record, loop.predicted_error(record)
 

@@ -20,29 +20,29 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 from drake_dae.diagrams.scenario import FOLDER
 
-MOTORS = dae.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
+MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 
 
-def run(mass_factor: float, measured_force: bool) -> tuple[dae.Record, np.ndarray]:
+def run(mass_factor: float, measured_force: bool) -> tuple[dd.Record, np.ndarray]:
     """The record of a move to another height, and the predicted errors."""
     multibody = MultibodyPlant(0.0)
     Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
     multibody.Finalize()
-    model = dae.RobotModel.from_multibody(
+    model = dd.RobotModel.from_multibody(
         multibody,
-        constraints=[dae.PointOnSurface("tool", dae.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[dae.PointCoordinates("tool", "z")],
+        constraints=[dd.PointOnSurface("tool", dd.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
+        positions=[dd.PointCoordinates("tool", "z")],
         nominal_positions=[1.2, -1.6],
         actuation=[MOTORS],
     )
-    law = dae.TrackingLaw(model.dae, dae.poles(-8.0), measured_force=measured_force)
-    move = dae.point_to_point(0.3, 0.6, start_time=0.5, end_time=2.0, order=3)
+    law = dd.TrackingLaw(model.dae, dd.poles(-8.0), measured_force=measured_force)
+    move = dd.PointToPointReference(0.3, 0.6, start_time=0.5, end_time=2.0, order=3)
     # Behind motors the force is a function of the state: it may be connected without a sensor.
-    loop = dae.make_closed_loop(
-        dae.RobotPlant(model, law.structure), law, [move, dae.constant(20.0)]
+    loop = dd.make_closed_loop(
+        dd.RobotPlant(model, structure=law.structure), law, [move, dd.ConstantReference(20.0)]
     )
     context = loop.diagram.CreateDefaultContext()
     believed = loop.controller.GetMyMutableContextFromRoot(context)
@@ -56,7 +56,7 @@ def run(mass_factor: float, measured_force: bool) -> tuple[dae.Record, np.ndarra
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=1e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 5.0, config)
+    dd.simulate(loop.diagram, context, 5.0, config)
     record = loop.record(context)
     return record, loop.predicted_error(record)
 

@@ -24,6 +24,7 @@ from pydrake.systems.primitives import Linearize, LogVectorOutput, TrajectorySou
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import (
+    ConstantReference,
     ForceSensor,
     Plane,
     PointCoordinates,
@@ -31,7 +32,6 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     TrackingLaw,
-    constant,
     find_structure,
     make_closed_loop,
     poles,
@@ -66,9 +66,9 @@ def main(folder: Path) -> tuple[float, float]:
 
     low = np.append(model.configuration([LOW], guess=[1.2, -1.6]), [0.0, 0.0])
     high = np.append(model.configuration([HIGH], guess=low[:2]), [0.0, 0.0])
-    problem, plan = collocate(RobotPlant(model, structure), low, high)
+    problem, plan = collocate(RobotPlant(model, structure=structure), low, high)
     control = problem.ReconstructInputTrajectory(plan)
-    outputs = replay(RobotPlant(model, structure), control, low)
+    outputs = replay(RobotPlant(model, structure=structure), control, low)
     missed = abs(outputs.data()[0, -1] - HIGH)
     print(f"the planned motion, replayed, misses its goal by {missed:.1e} m (claim: 1e-4)")
 
@@ -93,11 +93,11 @@ def linearize(model: RobotModel, structure: Structure) -> float:
     """The largest distance of an eigenvalue of the closed loop from where it should be."""
     gain, lag, height, force = 3.0, 0.05, 0.3, 20.0
     law = TrackingLaw(
-        model.dae, poles([-3.0, -5.0]), structure, measured_force=True, force_gain=gain
+        model.dae, poles([-3.0, -5.0]), structure=structure, measured_force=True, force_gain=gain
     )
     sensor = ForceSensor(1, time_constant=lag)
-    references = [constant(height), constant(force)]
-    loop = make_closed_loop(RobotPlant(model, structure), law, references, sensor=sensor)
+    references = [ConstantReference(height), ConstantReference(force)]
+    loop = make_closed_loop(RobotPlant(model, structure=structure), law, references, sensor=sensor)
 
     # Linearize takes equilibria alone: at rest at the reference, with the sensor settled.
     context = loop.diagram.CreateDefaultContext()

@@ -18,7 +18,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 from drake_dae.diagrams.scenario import FOLDER
 
 
@@ -28,26 +28,26 @@ def main(folder: Path) -> float:
     Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
     multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
-    model = dae.RobotModel.from_multibody(
+    model = dd.RobotModel.from_multibody(
         multibody,
-        constraints=[dae.PointOnSurface("tool", dae.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")],
+        constraints=[dd.PointOnSurface("tool", dd.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")],
         positions=[
-            dae.PointCoordinates("tool", "yz"),
-            dae.AxisCoordinates("tool", "z", "yz"),
-            dae.JointPositions(["joint3", "joint7"]),
+            dd.PointCoordinates("tool", "yz"),
+            dd.AxisCoordinates("tool", "z", "yz"),
+            dd.JointPositions(["joint3", "joint7"]),
         ],
         nominal_positions=[0.0, -0.19, 0.0, -1.94, 0.0, 0.56, 0.0],
-        actuation=[dae.FlexibleJoints(stiffness=8000.0)],  # rotor inertia: what the URDF says
+        actuation=[dd.FlexibleJoints(stiffness=8000.0)],  # rotor inertia: what the URDF says
     )
-    law = dae.TrackingLaw(model.dae, dae.poles({"wall.force": -12.0, "*": -6.0}))
-    loop = dae.make_closed_loop(
-        dae.RobotPlant(model, law.structure),
+    law = dd.TrackingLaw(model.dae, dd.poles({"wall.force": -12.0, "*": -6.0}))
+    loop = dd.make_closed_loop(
+        dd.RobotPlant(model, structure=law.structure),
         law,
         references=[
-            dae.sinusoids(0.0, 0.1, 1.5),
-            dae.sinusoids(0.6, 0.1, 1.5, np.pi / 2),
-            dae.constant([0.0, 0.0, 0.0, 0.0]),
-            dae.sinusoids(20.0, 5.0, 2.0),
+            dd.SinusoidReference(0.0, 0.1, 1.5),
+            dd.SinusoidReference(0.6, 0.1, 1.5, np.pi / 2),
+            dd.ConstantReference([0.0, 0.0, 0.0, 0.0]),
+            dd.SinusoidReference(20.0, 5.0, 2.0),
         ],
     )
     context = loop.diagram.CreateDefaultContext()
@@ -58,7 +58,7 @@ def main(folder: Path) -> float:
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=1e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 2.0, config)
+    dd.simulate(loop.diagram, context, 2.0, config)
 
     record = loop.record(context)
     off = float(np.max(np.abs(record["tracking_error"] - loop.predicted_error(record))))

@@ -19,10 +19,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 from drake_dae.diagrams.scenario import FOLDER
 
-SERVOS = dae.ElectrohydraulicServos(
+SERVOS = dd.ElectrohydraulicServos(
     stiffness=1e6, leakage=1e-6, geometry=lambda q: ca.diag(0.05 + 0.02 * ca.sin(q))
 )
 
@@ -32,16 +32,16 @@ def main(folder: Path) -> float:
     multibody = MultibodyPlant(0.0)
     Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
     multibody.Finalize()
-    model = dae.RobotModel.from_multibody(
+    model = dd.RobotModel.from_multibody(
         multibody,
-        constraints=[dae.PointOnSurface("tool", dae.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[dae.PointCoordinates("tool", "z")],
+        constraints=[dd.PointOnSurface("tool", dd.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
+        positions=[dd.PointCoordinates("tool", "z")],
         nominal_positions=[1.2, -1.6],
         actuation=[SERVOS],
     )
-    law = dae.TrackingLaw(model.dae, dae.poles({"tool.z": [-4, -5, -6], "wall.force": -8.0}))
-    references = [dae.sinusoids(0.3, 0.2, 1.5), dae.sinusoids(20.0, 5.0, 2.0)]
-    loop = dae.make_closed_loop(dae.RobotPlant(model, law.structure), law, references)
+    law = dd.TrackingLaw(model.dae, dd.poles({"tool.z": [-4, -5, -6], "wall.force": -8.0}))
+    references = [dd.SinusoidReference(0.3, 0.2, 1.5), dd.SinusoidReference(20.0, 5.0, 2.0)]
+    loop = dd.make_closed_loop(dd.RobotPlant(model, structure=law.structure), law, references)
     context = loop.diagram.CreateDefaultContext()
     q = model.configuration([0.32], guess=[1.2, -1.6])
     loop.plant.set_consistent_state(
@@ -50,7 +50,7 @@ def main(folder: Path) -> float:
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=1e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 3.0, config)
+    dd.simulate(loop.diagram, context, 3.0, config)
 
     record = loop.record(context)
     off = float(np.max(np.abs(record["tracking_error"] - loop.predicted_error(record))))

@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 from drake_dae.errors import NonMinimumPhaseWarning
 
 AREA = np.array([28.0, 32.0, 28.0, 32.0])  # cm^2
@@ -35,7 +35,7 @@ SETTINGS = {
 }
 
 
-def tanks(levels: list[float], gains: tuple, down: tuple) -> dae.DaeSystem:
+def tanks(levels: list[float], gains: tuple, down: tuple) -> dd.DaeSystem:
     """A_i h_i' = inflow - a_i sqrt(2 g h_i)."""
 
     def drift(x: ca.SX) -> list[ca.SX]:
@@ -45,13 +45,13 @@ def tanks(levels: list[float], gains: tuple, down: tuple) -> dae.DaeSystem:
 
     (k1, k2), (g1, g2) = gains, down
     inflow = np.array([[g1 * k1, 0], [0, g2 * k2], [0, (1 - g2) * k2], [(1 - g1) * k1, 0]])
-    return dae.DaeSystem.from_functions(
-        [dae.Signal(f"h{i + 1}", "cm") for i in range(4)],
+    return dd.DaeSystem.from_functions(
+        [dd.Signal(f"h{i + 1}", "cm") for i in range(4)],
         f=drift,
         h=lambda x: inflow / AREA[:, None],
         l=lambda x: [x[0], x[1]],
-        control_signals=[dae.Signal("pump1", "V"), dae.Signal("pump2", "V")],
-        output_signals=[dae.Signal("h1", "cm"), dae.Signal("h2", "cm")],
+        control_signals=[dd.Signal("pump1", "V"), dd.Signal("pump2", "V")],
+        output_signals=[dd.Signal("h1", "cm"), dd.Signal("h2", "cm")],
         nominal_state=levels,
         name="quadruple tank",
     )
@@ -70,8 +70,8 @@ def main(folder: Path) -> tuple[float, float]:
     errors, zeros = [], []
     for column, (name, (levels, gains, down)) in zip(axes.T, SETTINGS.items(), strict=True):
         system = tanks(levels, gains, down)
-        law = dae.TrackingLaw(system, dae.poles(-0.1))
-        stability = dae.ZeroDynamics(law.structure).stability()
+        law = dd.TrackingLaw(system, dd.poles(-0.1))
+        stability = dd.ZeroDynamics(law.structure.system, structure=law.structure).stability()
         found = np.sort(stability.eigenvalues.real)
         expected = np.sort(zeros_of_johansson(stability.state, down))
         zeros.append(np.max(np.abs(found / expected - 1.0)))
@@ -81,10 +81,10 @@ def main(folder: Path) -> tuple[float, float]:
         start = stability.state
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", NonMinimumPhaseWarning)
-            loop = dae.make_closed_loop(
-                dae.DaePlant(law.structure),
+            loop = dd.make_closed_loop(
+                dd.DaePlant(law.structure.system, structure=law.structure),
                 law,
-                references=[dae.constant([start[0] + 0.3, start[1] + 0.1])],
+                references=[dd.ConstantReference([start[0] + 0.3, start[1] + 0.1])],
             )
         for warning in caught:
             print(f"the controller warns: {warning.message}")
@@ -93,7 +93,7 @@ def main(folder: Path) -> tuple[float, float]:
         config = SimulatorConfig(
             integration_scheme="runge_kutta5", max_step_size=0.1, use_error_control=False
         )
-        dae.simulate(loop.diagram, context, 150.0, config)
+        dd.simulate(loop.diagram, context, 150.0, config)
         record = loop.record(context)
         errors.append(np.max(np.abs(record["tracking_error"] - loop.predicted_error(record))))
 

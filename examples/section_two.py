@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 
 TROLLEY, LOAD, ROPE, DRAG, GRAVITY = 10.0, 5.0, 2.0, 3.0, 9.81
 """Masses in kg, length in m, air drag of the load in N s/m, m/s^2."""
@@ -26,7 +26,7 @@ TROLLEY, LOAD, ROPE, DRAG, GRAVITY = 10.0, 5.0, 2.0, 3.0, 9.81
 def main(folder: Path) -> tuple[float, float, float]:
     """Returns the largest errors: of Phi^-1(Phi(x)), of a pole in 1/s, of the error in m."""
     # (1)-(3): trolley at s, load at (x, z); v is the rope's tension over its length.
-    crane = dae.DaeSystem.from_functions(
+    crane = dd.DaeSystem.from_functions(
         ["s", "x", "z", "vs", "vx", "vz"],
         f=lambda c: [*c[3, 4, 5].elements(), 0, -DRAG / LOAD * c[4], -GRAVITY - DRAG / LOAD * c[5]],
         g=lambda c: [0, 0, 0, (c[1] - c[0]) / TROLLEY, (c[0] - c[1]) / LOAD, -c[2] / LOAD],
@@ -39,7 +39,7 @@ def main(folder: Path) -> tuple[float, float, float]:
     )
 
     # Assumptions (1)-(5) and 2.2, r, mu, the index, the margins.
-    report = dae.analyze(crane)
+    report = dd.analyze(crane)
     print(report)
     structure = report.structure
 
@@ -47,27 +47,27 @@ def main(folder: Path) -> tuple[float, float, float]:
     x = structure.manifold.project([0.0, 0.8, -1.8, 0.0, 0.3, 0.0])
 
     # (20)-(22): the normal form, with the states that complete it, and its inverse.
-    form = dae.NormalForm(structure)
+    form = dd.NormalForm(structure.system, structure=structure)
     print("xi =", ", ".join(signal.name for signal in form.completion_signals))
     inverse = np.max(np.abs(form.state(form.coordinates(x)) - x))
     print(f"Phi and its inverse are off the identity by {inverse:.1e} (claim: 1e-12)")
 
     # (35): the zero dynamics about the load at rest.
-    zeros = dae.ZeroDynamics(structure).stability().eigenvalues
+    zeros = dd.ZeroDynamics(structure.system, structure=structure).stability().eigenvalues
     pendulum = np.roots([1.0, DRAG / LOAD, GRAVITY / ROPE])
     pole = np.max(np.abs(np.sort_complex(zeros) - np.sort_complex(pendulum)))
     print(f"poles of the zero dynamics off by {pole:.1e} 1/s (claim: 1e-9)")
 
     # (28): the law; (30): the error that it promises, and the one that it has.
-    law = dae.TrackingLaw(crane, dae.poles(-2.0), structure)
-    move = dae.point_to_point(0.5, 2.5, 1.0, 4.0)
-    loop = dae.make_closed_loop(dae.DaePlant(structure), law, [move])
+    law = dd.TrackingLaw(crane, dd.poles(-2.0), structure=structure)
+    move = dd.PointToPointReference(0.5, 2.5, 1.0, 4.0)
+    loop = dd.make_closed_loop(dd.DaePlant(structure.system, structure=structure), law, [move])
     context = loop.diagram.CreateDefaultContext()
     loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), x)
     fixed = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=5e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 8.0, fixed)
+    dd.simulate(loop.diagram, context, 8.0, fixed)
     record = loop.record(context)
     predicted = loop.predicted_error(record)
     error = float(np.max(np.abs(record["tracking_error"] - predicted)))

@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 
 
 def main(folder: Path) -> float:
@@ -27,7 +27,7 @@ def main(folder: Path) -> float:
     q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
     angle, reach = q[0], q[1]
     mass, hub, gravity = 4.0, 0.5, 9.81
-    links = dae.LinkExpressions(
+    links = dd.LinkExpressions(
         q=q,
         v=v,
         mass_matrix=ca.diag(ca.vertcat(hub + mass * reach**2, mass)),
@@ -39,20 +39,20 @@ def main(folder: Path) -> float:
     )
 
     # A wavy bench below the tip, z = -0.5 + 0.05 sin(6 x), free above.
-    bench = dae.ImplicitSurface(lambda p: p[2] + 0.5 - 0.05 * ca.sin(6 * p[0]))
-    model = dae.RobotModel(
+    bench = dd.ImplicitSurface(lambda p: p[2] + 0.5 - 0.05 * ca.sin(6 * p[0]))
+    model = dd.RobotModel(
         links,
-        constraints=[dae.PointOnSurface("tip", bench, name="bench")],
-        positions=[dae.PointCoordinates("tip", "x")],
+        constraints=[dd.PointOnSurface("tip", bench, name="bench")],
+        positions=[dd.PointCoordinates("tip", "x")],
         nominal_positions=[-0.6, 1.0],
     )
-    law = dae.TrackingLaw(model.dae, dae.coefficients([36.0, 9.0]))
-    loop = dae.make_closed_loop(
-        dae.DaePlant(law.structure),
+    law = dd.TrackingLaw(model.dae, dd.gain_coefficients([36.0, 9.0]))
+    loop = dd.make_closed_loop(
+        dd.DaePlant(law.structure.system, structure=law.structure),
         law,
         references=[
-            dae.point_to_point(0.6, 1.2, start_time=1.0, end_time=3.0),
-            dae.ExpressionSignal(lambda t: 30.0 - 10.0 * ca.exp(-t) * ca.cos(4 * t)),
+            dd.PointToPointReference(0.6, 1.2, start_time=1.0, end_time=3.0),
+            dd.ExpressionReference(lambda t: 30.0 - 10.0 * ca.exp(-t) * ca.cos(4 * t)),
         ],
     )
     context = loop.diagram.CreateDefaultContext()
@@ -61,7 +61,7 @@ def main(folder: Path) -> float:
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=1e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 4.0, config)
+    dd.simulate(loop.diagram, context, 4.0, config)
 
     record = loop.record(context)
     off = np.max(np.abs(record["tracking_error"] - loop.predicted_error(record)))

@@ -25,10 +25,10 @@ from drake_dae import (
     ReferenceGenerator,
     RobotModel,
     RobotPlant,
+    SinusoidReference,
     TrackingController,
     TrackingLaw,
     poles,
-    sinusoids,
 )
 from drake_dae.diagrams.scenario import FOLDER
 
@@ -51,9 +51,9 @@ def main(folder: Path) -> tuple[float, float]:
 
     # The blocks and their wires.
     builder = DiagramBuilder()
-    robot = builder.AddSystem(RobotPlant(model, law.structure))
+    robot = builder.AddSystem(RobotPlant(model, structure=law.structure))
     controller = builder.AddSystem(TrackingController(law))
-    height, force = sinusoids(0.3, 0.3, 1.5), sinusoids(20.0, 5.0, 2.0)
+    height, force = SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)
     reference = builder.AddSystem(ReferenceGenerator([height, force], law.degrees))
     builder.Connect(robot.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))

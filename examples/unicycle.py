@@ -19,28 +19,28 @@ import matplotlib.pyplot as plt
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 
 
 def main(folder: Path) -> float:
     """Returns the largest distance of the position error from what theory predicts, in m."""
-    unicycle = dae.DaeSystem.from_functions(
-        [dae.Signal("x", "m"), dae.Signal("y", "m"), dae.Signal("heading", "rad")],
+    unicycle = dd.DaeSystem.from_functions(
+        [dd.Signal("x", "m"), dd.Signal("y", "m"), dd.Signal("heading", "rad")],
         f=lambda x: [0, 0, 0],
         h=lambda x: [[ca.cos(x[2]), 0], [ca.sin(x[2]), 0], [0, 1]],
         l=lambda x: [x[0], x[1]],
-        control_signals=[dae.Signal("v", "m/s"), dae.Signal("w", "rad/s")],
-        output_signals=[dae.Signal("x", "m"), dae.Signal("y", "m")],
+        control_signals=[dd.Signal("v", "m/s"), dd.Signal("w", "rad/s")],
+        output_signals=[dd.Signal("x", "m"), dd.Signal("y", "m")],
         name="unicycle",
     )
 
     # B(x) is singular again at rest: the nominal speed says that the unicycle moves.
-    extension = dae.dynamic_extension(unicycle, nominal_control={"v": 2.0})
-    law = dae.TrackingLaw(extension.system, dae.poles(-2.0), extension.structure)
-    loop = dae.make_closed_loop(
-        dae.DaePlant(extension.structure),
+    extension = dd.dynamic_extension(unicycle, nominal_control={"v": 2.0})
+    law = dd.TrackingLaw(extension.system, dd.poles(-2.0), structure=extension.structure)
+    loop = dd.make_closed_loop(
+        dd.DaePlant(extension.structure.system, structure=extension.structure),
         law,
-        references=[dae.sinusoids(0.0, 2.0, 1.0), dae.sinusoids(0.0, 1.0, 2.0)],
+        references=[dd.SinusoidReference(0.0, 2.0, 1.0), dd.SinusoidReference(0.0, 1.0, 2.0)],
     )
 
     # A start beside the path, with another heading.
@@ -50,7 +50,7 @@ def main(folder: Path) -> float:
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=1e-3, use_error_control=False
     )
-    dae.simulate(loop.diagram, context, 2 * np.pi, config)
+    dd.simulate(loop.diagram, context, 2 * np.pi, config)
 
     record = loop.record(context)
     off = float(np.max(np.abs(record["tracking_error"] - loop.predicted_error(record))))

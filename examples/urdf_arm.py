@@ -16,7 +16,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
-import drake_dae as dae
+import drake_dae as dd
 from drake_dae.diagrams.scenario import FOLDER
 
 
@@ -26,26 +26,26 @@ def main(folder: Path) -> tuple[float, float]:
     Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
     multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
-    wall = dae.PointOnSurface("tool", dae.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")
-    model = dae.RobotModel.from_multibody(
+    wall = dd.PointOnSurface("tool", dd.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")
+    model = dd.RobotModel.from_multibody(
         multibody,
         constraints=[wall],
         positions=[
-            dae.PointCoordinates("tool", "yz"),
-            dae.AxisCoordinates("tool", "z", "yz"),
-            dae.JointPositions(["joint3", "joint7"]),
+            dd.PointCoordinates("tool", "yz"),
+            dd.AxisCoordinates("tool", "z", "yz"),
+            dd.JointPositions(["joint3", "joint7"]),
         ],
         nominal_positions=[0.0, -0.19, 0.0, -1.94, 0.0, 0.56, 0.0],
     )
-    law = dae.TrackingLaw(model.dae, dae.poles(-4.0))
-    loop = dae.make_closed_loop(
-        dae.RobotPlant(model, law.structure),
+    law = dd.TrackingLaw(model.dae, dd.poles(-4.0))
+    loop = dd.make_closed_loop(
+        dd.RobotPlant(model, structure=law.structure),
         law,
         references=[
-            dae.sinusoids(0.0, 0.1, 2.0, np.pi / 2),
-            dae.sinusoids(0.6, 0.1, 2.0),
-            dae.constant([0.0, 0.0, 0.0, 0.0]),
-            dae.sinusoids(20.0, 5.0, 3.0),
+            dd.SinusoidReference(0.0, 0.1, 2.0, np.pi / 2),
+            dd.SinusoidReference(0.6, 0.1, 2.0),
+            dd.ConstantReference([0.0, 0.0, 0.0, 0.0]),
+            dd.SinusoidReference(20.0, 5.0, 3.0),
         ],
     )
     context = loop.diagram.CreateDefaultContext()
@@ -54,7 +54,7 @@ def main(folder: Path) -> tuple[float, float]:
         loop.plant.GetMyMutableContextFromRoot(context), np.concatenate([q, np.zeros(7)])
     )
     config = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-9)
-    dae.simulate(loop.diagram, context, 5.0, config)
+    dd.simulate(loop.diagram, context, 5.0, config)
 
     record = loop.record(context)
     error = record["tracking_error"]

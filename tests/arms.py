@@ -20,7 +20,7 @@ from drake_dae import (
     PointOnSurface,
     RobotModel,
     TrackingLaw,
-    build,
+    build_scenario,
     load_scenario,
     poles,
 )
@@ -74,7 +74,7 @@ def arm(name: str) -> Arm:
 
 
 def law(name: str, gains: GainDesign | None = None) -> TrackingLaw:
-    return TrackingLaw(arm(name).model.dae, gains or poles(-4.0), arm(name).structure)
+    return TrackingLaw(arm(name).model.dae, gains or poles(-4.0), structure=arm(name).structure)
 
 
 def fixed_step(step: float = 1e-3) -> SimulatorConfig:
@@ -90,7 +90,7 @@ def error_controlled(accuracy: float) -> SimulatorConfig:
 
 
 def shipped(name: str) -> tuple[ClosedLoop, Context]:
-    return build(load_scenario(find_scenario(name)))
+    return build_scenario(load_scenario(find_scenario(name)))
 
 
 def consistent_states(name: str, count: int, seed: int = 0) -> np.ndarray:

@@ -98,6 +98,7 @@ def test_the_page_holds_the_animation(demo):
     assert np.ptp(hand[:, 1]) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "link", "force"),
     [("two_arms", "right/link7", "grasp.fx"), ("five_bar", "five_bar/right2", "pin.fx")],
@@ -222,6 +223,13 @@ def test_a_mistake_is_one_line_and_leaves_nothing(arguments, line, tmp_path, mon
     assert list(tmp_path.iterdir()) == []
 
 
+def test_each_mistake_in_a_scenario_has_its_line(capsys):
+    assert main(["simulate", "two_link_wall", "--set", "duration=0", "--set", "foo=1"]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: duration: ")
+    assert second.startswith("error: scenario: has no key 'foo'; ")
+
+
 def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, capsys):
     """The arm is stretched out at z = 1.6 m, which the reference passes after 0.13 s."""
     move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
@@ -251,6 +259,7 @@ def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
 # Ctrl-C.
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
     """The run would last a minute; it is interrupted after about half a second."""
     process = command(
@@ -316,6 +325,7 @@ def test_a_wrong_command_line(arguments, capsys):
     assert "usage: drake-dae" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_enough():
     """`drake-dae list | head -1`"""
     with command("list") as process:
@@ -335,6 +345,7 @@ def test_meshcat_tells_where_and_runs_in_real_time(tmp_path, capsys):
     assert load_scenario(tmp_path / "scenario.yaml").integrator.target_realtime_rate == 1.0
 
 
+@pytest.mark.slow
 def test_a_bar_on_a_terminal(tmp_path):
     """One that does not know its width, as in some containers."""
     ours, theirs = pty.openpty()

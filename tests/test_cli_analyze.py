@@ -5,18 +5,16 @@ import re
 
 import numpy as np
 import pytest
+from runs import run, scenario
 from scipy.optimize import brentq
 
-from drake_dae import build, load_scenario, simulate
+from drake_dae import build_scenario
 from drake_dae.cli import main
-from drake_dae.diagrams import preview as preview_module
-from drake_dae.diagrams.preview import preview
-from drake_dae.diagrams.scenario import find_scenario, shipped_scenarios
+from drake_dae.diagrams import feasibility as module
+from drake_dae.diagrams.feasibility import find_feasibility
+from drake_dae.diagrams.feasibility_report import Feasibility
+from drake_dae.diagrams.scenario import shipped_scenarios
 from drake_dae.simulation.summary import Limits
-
-
-def scenario(name, *settings):
-    return load_scenario(find_scenario(name), settings)
 
 
 def analyze(capsys, *arguments):
@@ -35,16 +33,16 @@ def course(courses, name):
 # Against another route.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_wall", "two_link_flexible"])
 def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
     """A loop that starts on the reference stays on it."""
     case = scenario(name, "start.errors={}", "duration=1.5")
-    told = preview(case)
-    loop, context = build(case)
+    told = find_feasibility(case)
+    loop, context = build_scenario(case)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_state(own, told.analysis.motion.states[0])
-    simulate(loop.diagram, context, case.duration, case.integrator)
-    record = loop.record(context)
+    record = run(loop, context, case.duration, case.integrator)
     # What integration to 1e-8, or fixed steps of 5 ms, leave of the error.
     assert np.abs(record["tracking_error"]).max() < 1e-6
     groups = (("control", told.controls), ("constraint_force", told.constraint_forces))
@@ -78,8 +76,8 @@ def test_the_joint_force_behind_an_actuation():
         "start.errors={}",
         "duration=0.1",
     ]
-    rigid = preview(scenario("two_link_wall", *still))
-    soft = preview(scenario("two_link_flexible", *still))
+    rigid = find_feasibility(scenario("two_link_wall", *still))
+    soft = find_feasibility(scenario("two_link_flexible", *still))
     assert rigid.joint_forces == ()
     for one, two in zip(rigid.controls, soft.joint_forces, strict=True):
         assert two.largest == pytest.approx(one.largest, rel=1e-9)
@@ -124,8 +122,8 @@ def test_a_reference_that_leaves_the_workspace(capsys):
     assert code == 2
     words = " ".join(text.split())
     assert "the reference leaves what the system can reach at t = 0.147" in words
-    found = preview(scenario("two_link_wall", move)).analysis.motion
-    assert found.failure_time == pytest.approx(when, abs=1e-4)
+    found = find_feasibility(scenario("two_link_wall", move)).analysis.motion
+    assert found.ending.time == pytest.approx(when, abs=1e-4)
     assert found.times[-1] < when < found.times[-1] + 0.01
     # On the way there, what is beyond the limits is told as well.
     assert re.search(r"PROBLEM  joint2_w goes from .* its limits are -3 and 3, left at 0\.0", text)
@@ -150,10 +148,10 @@ def test_a_contact_that_would_have_to_pull(capsys):
 def test_times_follow_a_reference_that_even_times_would_not_see(periods):
     """1001 even times over 1000 periods see sin(2 pi t) as 0, and half as many as a beat."""
     wanted = lambda t: np.array([4.0 + 5.0 * np.sin(2 * np.pi * t), 0.3])  # noqa: E731
-    times, is_resolved = preview_module.sample_times(wanted, 0.0, float(periods))
+    times, is_resolved = module.sample_times(wanted, 0.0, float(periods))
     assert is_resolved
     assert (times[0], times[-1]) == (0.0, periods)
-    assert preview_module.SAMPLES <= times.size <= preview_module.MOST_SAMPLES
+    assert module.SAMPLES <= times.size <= module.MOST_SAMPLES
     assert np.all(np.diff(times) > 0.0)
     values = np.array([wanted(t)[0] for t in times])
     # A chord is off by 1 % of the range, 0.1, at a random place of it: 0.16 at the worst.
@@ -165,20 +163,20 @@ def test_times_follow_a_reference_that_even_times_would_not_see(periods):
 
 def test_times_that_do_not_suffice_are_told():
     wanted = lambda t: np.array([np.sin(1e4 * t)])  # noqa: E731
-    times, is_resolved = preview_module.sample_times(wanted, 0.0, 100.0)
+    times, is_resolved = module.sample_times(wanted, 0.0, 100.0)
     assert not is_resolved
-    assert times.size == preview_module.MOST_SAMPLES
+    assert times.size == module.MOST_SAMPLES
     values = np.array([wanted(t)[0] for t in times])
     assert np.ptp(values) > 1.99
-    analysis = preview(scenario("two_link_wall", "duration=0.1")).analysis
-    told = preview_module.Preview(analysis, 0.1, is_resolved=False)
+    analysis = find_feasibility(scenario("two_link_wall", "duration=0.1")).analysis
+    told = Feasibility(analysis, 0.1, is_resolved=False)
     assert "The reference varies too fast" in str(told)
     assert told.to_dict()["resolved"] is False
 
 
 def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
     """2 + 5 sin 20 pi t over 10 s at 101 even times, all of them at its zeros."""
-    monkeypatch.setattr(preview_module, "SAMPLES", 101)
+    monkeypatch.setattr(module, "SAMPLES", 101)
     fast = ("references.1.offset=2", "references.1.frequencies=[62.83185307179586]")
     arguments = [word for setting in fast for word in ("--set", setting)]
     code, text = analyze(capsys, "two_link_wall", *arguments, "--set", "duration=10")
@@ -197,12 +195,12 @@ def test_extremes_of_a_constant_have_no_time(capsys):
 
 
 def test_a_pin_may_pull():
-    told = preview(scenario("five_bar", "references.2.offset=-15"))
+    told = find_feasibility(scenario("five_bar", "references.2.offset=-15"))
     assert course(told.constraint_forces, "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
     assert not any("pulls" in problem for problem in told.problems)
-    loop, _ = build(scenario("five_bar"))
+    loop, _ = build_scenario(scenario("five_bar"))
     assert all(Limits.of(loop.plant.model).can_pull(s) for s in loop.plant.dae.output_signals[2:])
-    loop, _ = build(scenario("two_link_wall"))
+    loop, _ = build_scenario(scenario("two_link_wall"))
     (force,) = loop.plant.dae.constraint_input_signals
     assert not Limits.of(loop.plant.model).can_pull(force)
     assert not Limits().can_pull(force)
@@ -236,7 +234,7 @@ def test_json(capsys):
     assert code == 0
     found = json.loads(text)
     assert found.pop("scenario") == "two_link_motors"
-    assert found == preview(scenario("two_link_motors", "duration=1")).to_dict()
+    assert found == find_feasibility(scenario("two_link_motors", "duration=1")).to_dict()
     assert found["analysis"]["index"] == 3
     # Voltages have no limit, which JSON has no number for.
     assert [c["high"] for c in found["controls"]] == [None, None]
@@ -277,8 +275,8 @@ def test_an_error_as_json(capsys):
 
 def test_objects_are_one_line_at_the_prompt():
     case = scenario("two_link_wall", "duration=0.1")
-    assert repr(preview(case)) == "Preview('two_link_arm': no problem found)"
-    loop, _ = build(case)
+    assert repr(find_feasibility(case)) == "Feasibility('two_link_arm': no problem found)"
+    loop, _ = build_scenario(case)
     assert repr(loop).startswith("ClosedLoop('two_link_arm', logs state, constraint_force, ")
 
 
@@ -297,9 +295,10 @@ def test_help_tells_the_exit_codes(capsys):
     assert "exit code: 0 if no problem was found, 2 if one was" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_shipped_scenarios_have_no_problems(name):
-    told = preview(scenario(name))
+    told = find_feasibility(scenario(name))
     assert told.problems == ()
     assert told.analysis.motion.times[-1] == told.duration
     assert told.to_markdown().endswith("no problem found")

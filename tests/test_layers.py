@@ -1,112 +1,53 @@
-"""Imports run one way, and only to what pyproject.toml declares."""
+"""Imports run one way, and only to what pyproject.toml declares; see tests/house.py."""
 
-import ast
-import os
 import re
+import subprocess
 import sys
-import tomllib
-from pathlib import Path
+from collections.abc import Collection
 
 import pytest
-
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "drake_dae"
-
-# A module imports from its own layer and from layers before it; "" is drake_dae/__init__.py, which
-# gathers the public names, so that nothing but the command may import it.
-LAYERS = (
-    "errors",
-    "arrays",
-    "trace",
-    "dae",
-    "analysis",
-    "robots",
-    "symbolic",
-    "systems",
-    "simulation",
-    "diagrams",
-    "",
-    "cli",
-    "__main__",
+from draw_house import draw
+from house import (
+    PAPER,
+    ROOMS,
+    ROOT,
+    WITHOUT_DRAKE,
+    circle,
+    imported_modules,
+    imports,
+    may_import,
+    modules,
+    room,
+    violations,
 )
-
-# Distributions whose modules bear another name.
-IMPORT_NAMES = {"drake": "pydrake", "pyyaml": "yaml"}
-
-
-def declared_modules() -> set[str]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    names = [re.split(r"[^\w.-]", requirement)[0] for requirement in project["dependencies"]]
-    return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
-
-
-def modules() -> dict[str, Path]:
-    """Every module of the package; os.walk, since rglob does not follow the link to diagrams."""
-    found = {}
-    for folder, _, files in os.walk(PACKAGE, followlinks=True):
-        for path in (Path(folder, file) for file in files if file.endswith(".py")):
-            parts = ("drake_dae", *path.relative_to(PACKAGE).with_suffix("").parts)
-            found[".".join(parts)] = path
-    return found
-
-
-def imported_modules(module: str, source: str, existing: set[str]) -> set[str]:
-    """Absolute names of the modules that a module imports, wherever in its text."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = module.split(".")[: -node.level] if node.level else []
-            base += (node.module or "").split(".") if node.module else []
-            for alias in node.names:
-                member = ".".join([*base, alias.name])
-                is_module = member in existing or f"{member}.__init__" in existing
-                found.add(member if is_module else ".".join(base))
-    return found
-
-
-def layer(module: str) -> str:
-    parts = module.removesuffix(".__init__").split(".")
-    return parts[1] if len(parts) > 1 else ""
-
-
-def violations(module: str, source: str, existing: set[str]) -> list[str]:
-    own = layer(module)
-    if own not in LAYERS:
-        return [f"{module} stands in no layer"]
-    found = []
-    for imported in sorted(imported_modules(module, source, existing)):
-        top = imported.split(".")[0]
-        if top == "drake_dae":
-            other = layer(imported)
-            if other not in LAYERS or LAYERS.index(other) > LAYERS.index(own):
-                found.append(f"{module} imports {imported}, which stands above it")
-        elif own == "dae" and top == "pydrake":
-            found.append(f"{module} imports {imported}: drake_dae.dae is free of Drake")
-        elif top not in sys.stdlib_module_names | declared_modules():
-            found.append(f"{module} imports {imported}, which pyproject.toml does not declare")
-    return found
 
 
 def test_every_import_points_down() -> None:
-    paths = modules()
-    assert {"drake_dae.__init__", "drake_dae.errors", "drake_dae.diagrams.__init__"} <= set(paths)
-    found = [
-        violation
-        for module, path in paths.items()
-        for violation in violations(module, path.read_text(), set(paths))
-    ]
-    assert not found, "\n".join(found)
+    found = imports()
+    assert {"drake_dae.__init__", "drake_dae.errors", "drake_dae.diagrams.__init__"} <= set(found)
+    wrong = [line for module, imported in found.items() for line in violations(module, imported)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_imports_go_round() -> None:
+    assert circle(imports()) == []
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"d"}}) == []
+    assert circle({"a": {"b"}, "b": {"c", "d"}, "c": {"b"}}) == ["b", "c"]
 
 
 EXISTING = {
     "drake_dae.__init__",
     "drake_dae.errors",
+    "drake_dae.analysis.analyze",
     "drake_dae.dae.__init__",
+    "drake_dae.dae.gains",
+    "drake_dae.dae.states.__init__",
+    "drake_dae.dae.states.samples",
+    "drake_dae.dae.structure",
     "drake_dae.dae.system",
     "drake_dae.robots.__init__",
     "drake_dae.robots.model",
+    "drake_dae.symbolic",
     "drake_dae.diagrams.__init__",
     "drake_dae.cli",
 }
@@ -126,6 +67,17 @@ EXISTING = {
         ("drake_dae.dae.system", "from drake_dae import RobotModel"),
         ("drake_dae.dae.system", "import pydrake.math"),
         ("drake_dae.dae.system", "from pydrake.all import RigidTransform"),
+        ("drake_dae.dae.system", "from drake_dae.dae.structure import Structure"),
+        ("drake_dae.dae.system", "from .states import samples"),
+        ("drake_dae.dae.system", "from drake_dae.dae import find_structure"),
+        ("drake_dae.dae.states.samples", "from ..structure import Structure"),
+        ("drake_dae.dae.helpers", "import math"),
+        ("drake_dae.trace.lie", "from drake_dae.dae.system import DaeSystem"),
+        ("drake_dae.trace.lie", "import pydrake.symbolic"),
+        ("drake_dae.analysis.analyze", "from drake_dae.robots.model import RobotModel"),
+        ("drake_dae.analysis.analyze", "import pydrake.math"),
+        ("drake_dae.robots.model", "from drake_dae.analysis.analyze import analyze"),
+        ("drake_dae.robots.model", "from drake_dae.symbolic import from_symbolic"),
         ("drake_dae.errors", "from .dae import system"),
         ("drake_dae.robots.model", "import drake_dae.cli"),
         ("drake_dae.robots.model", "import torch"),
@@ -136,7 +88,7 @@ EXISTING = {
     ],
 )
 def test_a_violation_is_found(module: str, source: str) -> None:
-    assert len(violations(module, source, EXISTING)) == 1
+    assert len(violations(module, imported_modules(module, source, EXISTING))) == 1
 
 
 @pytest.mark.parametrize(
@@ -144,6 +96,8 @@ def test_a_violation_is_found(module: str, source: str) -> None:
     [
         ("drake_dae.dae.system", "from drake_dae.errors import ModelError\nimport casadi, math"),
         ("drake_dae.dae.system", "from .. import errors"),
+        ("drake_dae.dae.structure", "from .system import DaeSystem\nfrom .states import samples"),
+        ("drake_dae.dae.states.region", "from drake_dae.dae.states import samples"),
         ("drake_dae.robots.model", "from drake_dae.dae import system\nimport pydrake.math"),
         ("drake_dae.diagrams.__init__", "from drake_dae.simulation import record"),
         ("drake_dae.__init__", "from drake_dae.diagrams import scenario\nfrom .dae import system"),
@@ -152,4 +106,57 @@ def test_a_violation_is_found(module: str, source: str) -> None:
     ],
 )
 def test_an_import_that_points_down_passes(module: str, source: str) -> None:
-    assert violations(module, source, EXISTING) == []
+    assert violations(module, imported_modules(module, source, EXISTING)) == []
+
+
+def loaded_with(rooms: Collection[str]) -> set[str]:
+    """All modules that a fresh interpreter holds after it has imported every file of some rooms."""
+    names = sorted(m.removesuffix(".__init__") for m in modules() if room(m) in rooms)
+    code = "import sys\n" + "".join(f"import {name}\n" for name in names) + "print(*sys.modules)"
+    command = [sys.executable, "-W", "error", "-c", code]
+    printed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert set(names) <= set(printed.split())
+    return set(printed.split())
+
+
+def test_the_mathematics_loads_no_drake() -> None:
+    tops = {module.split(".")[0] for module in loaded_with(WITHOUT_DRAKE)}
+    assert "casadi" in tops
+    assert "pydrake" not in tops
+
+
+def test_traced_functions_load_no_system() -> None:
+    loaded = {room(name) for name in loaded_with(["trace"]) if name.startswith("drake_dae.")}
+    assert loaded == {"errors", "arrays", "trace"}
+
+
+GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def test_the_guide_has_the_rules_of_this_file() -> None:
+    """Its table has a row a room, from the roof down: whether Drake is in, and what it imports."""
+    told = {}
+    table = re.findall(r"^\| `([\w./]+)` \| .* \| (yes|no) \| (.*) \|$", GUIDE, flags=re.MULTILINE)
+    for written, drake, cell in table:
+        name = {"__init__.py": "drake_dae"}.get(written, re.sub(r"\.py$|/$", "", written))
+        below = may_import(name) if cell == "all below" else re.findall(r"`(\w+)`", cell)
+        told[name] = (drake == "no", set(below))
+    ruled = {name: (name in WITHOUT_DRAKE, set(may_import(name))) for name in reversed(ROOMS)}
+    assert list(told.items()) == list(ruled.items())
+
+
+def test_the_guide_has_the_order_of_the_paper() -> None:
+    (order,) = re.findall(r"^    (signals(?:\s+\w+/?)*)$", GUIDE, flags=re.MULTILINE)
+    assert tuple(name.rstrip("/") for name in order.split()) == PAPER
+
+
+def test_the_house_is_drawn(tmp_path) -> None:
+    draw(tmp_path / "house.png")
+    assert (tmp_path / "house.png").stat().st_size > 50_000
+
+
+def test_files_that_the_guide_names_exist() -> None:
+    names = re.findall(r"`((?:robots|dae|tests)/[\w/]+\.py)`|\]\(([\w/.]+)\)", GUIDE)
+    assert len(names) > 10
+    for name in (first or second for first, second in names):
+        assert (ROOT / name).exists() or (ROOT / "drake_dae" / name).exists(), name

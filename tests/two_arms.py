@@ -7,7 +7,15 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae import AxisCoordinates, JointPositions, PointCoordinates, RobotModel, WeldedFrames
+from drake_dae import (
+    AxisCoordinates,
+    ConstantReference,
+    JointPositions,
+    PointCoordinates,
+    RobotModel,
+    SinusoidReference,
+    WeldedFrames,
+)
 from drake_dae.diagrams.scenario import FOLDER
 from drake_dae.robots.actuation.stage import Stage
 
@@ -25,6 +33,20 @@ GRASP = WeldedFrames(
     name="grasp",
 )
 """The right tool on the right end of the object; its fx presses the object together."""
+
+REFERENCES = [
+    SinusoidReference(APART / 2, 0.05, 2.0),
+    SinusoidReference(0.0, 0.05, 3.0),
+    SinusoidReference(0.4, 0.04, 2.5),
+    ConstantReference([0.0, 0.0]),
+    SinusoidReference(0.0, 0.1, 2.0),
+    ConstantReference([0.0, 0.0]),
+    SinusoidReference(40.0, 15.0, 4.0),
+    ConstantReference([0.0, 0.0]),
+    SinusoidReference(0.0, 1.0, 3.0),
+    ConstantReference([0.0, 0.0]),
+]
+"""The object moves and turns about x; fx presses with 40 N, mx twists, the rest stays zero."""
 
 
 def two_arms_plant() -> MultibodyPlant:

@@ -74,3 +74,8 @@ def to_markdown(parts: Sequence[Part]) -> str:
     return "\n\n".join(
         part.to_markdown() if isinstance(part, Table) else "  \n".join(part) for part in parts
     )
+
+
+def count_of(number: int, noun: str) -> str:
+    """As in 1 state, 2 states."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

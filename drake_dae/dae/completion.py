@@ -7,11 +7,11 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.margins import Margin
-from drake_dae.dae.states.samples import Samples, traced
+from drake_dae.dae.states.margins import Margin, find_margin
+from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import ModelError
-from drake_dae.trace.smoothness import flaw
+from drake_dae.trace.smoothness import find_flaw
 
 TRANSVERSAL = 0.05
 """Single states complete the chains if the sine of their smallest angle is above this."""
@@ -49,9 +49,9 @@ def check_completion(
             f"{system.name}: the completion depends on {', '.join(unknown)}, which is neither a "
             "state nor a parameter"
         )
-    kink = flaw(xi, system.state, system.parameter_symbol, "the state")
-    if kink:
-        raise ModelError(f"{system.name}: the completion {kink}")
+    flaw = find_flaw(xi, system.state, system.parameter_symbol)
+    if flaw:
+        raise ModelError(f"{system.name}: the completion {flaw.describe('the state')}")
     signals = tuple(
         next(
             (
@@ -64,7 +64,7 @@ def check_completion(
         for i in range(count)
     )
     gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
-    margin = samples.margin(gradient)
+    margin = find_margin(samples, gradient)
     if not margin.is_singular:
         return xi, signals, margin
     if not count:
@@ -72,7 +72,8 @@ def check_completion(
             f"{system.name}: the differentials of the chains are dependent to round-off at x = "
             f"{show(margin.state)}: A(x) of (2) or B(x) of (16) is close to singular there"
         )
-    (matrix,) = traced(system, gradient=gradient)(margin.state, system.parameter_values)
+    function = system.trace("coordinates", {"gradient": gradient}, often=False)
+    (matrix,) = function(margin.state, system.parameter_values)
     # How far each differential is from the span of those before it.
     rows = _unit_rows(matrix.reshape(system.num_states, -1) * samples.scale)
     distances = np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]
@@ -108,7 +109,7 @@ def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> 
         leading = matrix[np.arange(count), largest]
         factors = np.vectorize(lambda c: float(f"{c:.3g}"))(matrix / leading[:, None])
         xi = ca.mtimes(ca.sparsify(ca.SX(factors)), system.state)
-        margin = samples.margin(ca.jacobian(ca.vertcat(chains, xi), system.state))
+        margin = find_margin(samples, ca.jacobian(ca.vertcat(chains, xi), system.state))
         if not margin.is_singular:
             return xi, tuple(_combination(row, system.state_signals) for row in factors), margin
     raise ModelError(

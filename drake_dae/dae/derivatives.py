@@ -18,13 +18,12 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.states.samples import default_spread
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 
 
-class Motion:
+class Derivatives:
     """The motion of a system on N* and its time derivatives, the control held constant.
 
     Args:
@@ -35,7 +34,7 @@ class Motion:
         control: The symbol u, shape (p, 1).
         constraint_gradient: dc/dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        pivot: 0 exactly where A(x) is singular; see `expressions.Factorization`.
+        pivot: 0 exactly where A(x) is singular; see `trace.factorization`.
     """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX) -> None:
@@ -66,8 +65,8 @@ class Motion:
         self._symbols.append(first)
         #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
         self.constraint_input = first[len(self._rows) :, :]  # Of a scalar [1:] would be a row.
-        residual, self._constraint_rate = self._first_order(constraint)
-        self._residual = residual[self._rows] - ca.mtimes(h[self._rows, :], self.control)
+        balance, self._constraint_rate = self._first_order(constraint)
+        self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
         if _agree(system, gradient, force):
             gradient = force
@@ -103,7 +102,7 @@ class Motion:
         return self._inline(expression, len(self._values))
 
     def has_unknowns(self, expression: ca.SX) -> bool:
-        """Whether an expression holds unknowns of the motion, which A(x) must be regular for."""
+        """Whether an expression holds unknowns, which A(x) must be regular for."""
         return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
 
     def inverse(self, expression: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX] | None:
@@ -179,13 +178,13 @@ class Motion:
     def _first_order(self, constraint: ca.SX) -> tuple[ca.SX, ca.SX]:
         """E x' - f - g v and c', in terms of the first unknowns."""
         system, rate = self.system, self._rates[0]
-        residual = ca.mtimes(system.mass_matrix, rate) - system.f
-        residual -= ca.mtimes(system.g, self.constraint_input)
+        balance = ca.mtimes(system.mass_matrix, rate) - system.f
+        balance -= ca.mtimes(system.g, self.constraint_input)
         constraint_rate = ca.jtimes(constraint, system.state, rate)
         if system.motion is None:
-            return residual, constraint_rate
+            return balance, constraint_rate
         shorter = ca.vertcat(*system.motion(rate, self.constraint_input))
-        longer = ca.vertcat(residual, constraint_rate)
+        longer = ca.vertcat(balance, constraint_rate)
         if shorter.shape != longer.shape or not _agree(
             system, shorter, longer, self._symbols[1], self.control
         ):
@@ -205,16 +204,16 @@ class Motion:
     def _add_order(self) -> None:
         following = self._next_unknown()
         self._rates.append(following)
-        size = self._residual.numel()
-        both = self._total_derivative(ca.vertcat(self._residual, self._constraint_rate))
-        self._residual, self._constraint_rate = both[:size, :], both[size:, :]
+        size = self._balance.numel()
+        both = self._total_derivative(ca.vertcat(self._balance, self._constraint_rate))
+        self._balance, self._constraint_rate = both[:size, :], both[size:, :]
         self._symbols.append(following)
         self._solve_order()
 
     def _solve_order(self) -> None:
         """The newest unknowns enter residual and constraint rate linearly: solve for them."""
         newest = self._symbols[-1]
-        self._equations.append(ca.vertcat(self._residual, self._constraint_rate))
+        self._equations.append(ca.vertcat(self._balance, self._constraint_rate))
         known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
         count = len(self._rows)
         solution = self._unknowns(known[:count, :], known[count:, :])
@@ -253,7 +252,7 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
     symbols = [system.state, *unknowns, system.parameter_symbol]
     function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
     random, p = np.random.default_rng(0), system.parameter_values
-    deviation = default_spread(system.nominal_state)
+    deviation = system.nominal_spread
     finite = 0
     for spread in (0.0, 0.1, 0.1):
         x = system.nominal_state + deviation * random.standard_normal(system.num_states)

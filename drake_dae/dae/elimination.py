@@ -1,10 +1,14 @@
 """The constraint inputs eliminated: v = alpha + beta u, and the system that remains.   (9)-(14)"""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
-from drake_dae.dae.derivatives import Motion
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.trace.round_off import Sized, equilibration, multiply, without_round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +28,7 @@ class Elimination:
         h_star: h + g beta (10), shape (n, p).
         l_star: l + m alpha (11), shape (p, 1).
         n_star: m beta (12), shape (p, p).
-        pivot: 0 exactly where A(x) is singular; see `expressions.Factorization`.
+        pivot: 0 exactly where A(x) is singular; see `trace.factorization`.
     """
 
     constraint_gradient: ca.SX
@@ -38,22 +42,51 @@ class Elimination:
     pivot: ca.SX
 
 
-def eliminate(motion: Motion) -> Elimination:
-    """The motion on N*, which is affine in the control, as expressions of the state."""
-    system = motion.system
-    alpha, beta = affine(motion.expand(motion.constraint_input), motion.control)
-    f_star, h_star = affine(motion.expand(motion.rate), motion.control)
+def eliminate(derivatives: Derivatives) -> Elimination:
+    """What remains of a system on N*, which is affine in the control, by its own equations."""
+    system, control = derivatives.system, derivatives.control
+    alpha, beta = affine(derivatives.expand(derivatives.constraint_input), control)
+    f_star, h_star = affine(derivatives.expand(derivatives.rate), control)
     return Elimination(
-        constraint_gradient=motion.constraint_gradient,
-        constraint_matrix=motion.constraint_matrix,
+        constraint_gradient=derivatives.constraint_gradient,
+        constraint_matrix=derivatives.constraint_matrix,
         alpha=alpha,
         beta=beta,
         f_star=f_star,
         h_star=h_star,
         l_star=system.l + ca.mtimes(system.m, alpha),
         n_star=ca.sparsify(ca.mtimes(system.m, beta)),
-        pivot=motion.pivot,
+        pivot=derivatives.pivot,
     )
+
+
+def eliminate_numbers(
+    fields: Mapping[str, FloatArray],
+    constraint_gradient: FloatArray,
+    constraint_matrix: FloatArray,
+    scale: FloatArray,
+) -> tuple[Sized, Sized]:
+    """h* (10) and n* (12) at one state, where what is zero but for round-off is zero.
+
+    The expressions of `eliminate` do not tell how large the terms were that cancelled in them; the
+    factors of beta (14) do.
+
+    Args:
+        fields: g, h and m of the system with E = 1, by letter.
+        constraint_gradient: d L_f^(r_i - 1) k_i / dx, shape (m, n).
+        constraint_matrix: A, shape (m, m).
+        scale: How large each state is, shape (n,).
+    """
+    h, size = fields["h"], np.abs(fields["h"])
+    by_control = multiply(constraint_gradient, (h, size), scale)
+    # Units of the constraints' derivatives, and of the constraint inputs.
+    rows, columns = equilibration(np.abs(constraint_matrix))
+    scaled = np.linalg.inv(constraint_matrix / rows[:, None] / columns)
+    inverse = scaled / columns[:, None] / rows
+    beta = multiply(-inverse, by_control, rows)
+    added, added_size = multiply(fields["g"], beta, 1.0 / columns)
+    h_star = without_round_off(h + added, size + added_size)
+    return h_star, multiply(fields["m"], beta, 1.0 / columns)
 
 
 def affine(expression: ca.SX, control: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -1,36 +1,19 @@
-"""Dynamic extension: integrators before controls, where B(x) has no inverse without them.
-
-Where B(x) of (16) is singular, some outputs hear of one combination of the controls too early: a
-wheeled robot's drive acts on both coordinates of its position before its steering does. If that
-combination becomes a state and its derivative the control, the outputs wait for the others. The
-law (28) of the extended system is then a dynamic state feedback of the original one.
-
-Descusse and Moog, "Decoupling with dynamic compensation for strong invertible affine non-linear
-systems", International Journal of Control 42(6), 1985; Isidori, Nonlinear Control Systems, 1995,
-section 5.4; Nijmeijer and van der Schaft, Nonlinear Dynamical Control Systems, 1990, chapter 8.
-"""
+"""Integrators before controls: a system whose controls are derivatives of those of another."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, show
-from drake_dae.dae.manifold import Manifold
+from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.margins import SINGULAR
-from drake_dae.dae.states.samples import Fields, Samples, spread_of, traced
-from drake_dae.dae.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import AssumptionError, ModelError
-from drake_dae.trace.factorization import Factorization
+from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative
-from drake_dae.trace.round_off import multiply, positive
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,8 +53,7 @@ class Extension:
             control: w of the extended system, shape (p,).
             parameters: Values of all parameters; the defaults if None.
         """
-        values = self.original.parameter_values if parameters is None else parameters
-        return self._control(state, control, values)[0]
+        return self._control(state, control, self.original.parameter_vector(parameters))[0]
 
     @cached_property
     def _control(self) -> TracedFunction:
@@ -123,12 +105,12 @@ def extend(
     bad = {name: count for name, count in integrators.items() if not _is_count(count)}
     if bad:
         raise ModelError(f"{system.name}: integrators must be whole numbers from 1, got {bad}")
-    nominal = _nominal_control(system, nominal_control)
+    nominal = nominal_controls(system, nominal_control)
     _check_names(system, integrators, "integrators")
     base = system.control_signals
     for order in range(max(integrators.values(), default=0)):
         columns = [i for i, signal in enumerate(base) if integrators.get(signal.name, 0) > order]
-        system = _integrated(
+        system = integrated(
             system,
             columns,
             held=[base[i].derivative(order) for i in columns],
@@ -138,144 +120,7 @@ def extend(
     return system
 
 
-def dynamic_extension(
-    system: DaeSystem,
-    *,
-    nominal_control: Mapping[str, float] | None = None,
-    max_integrators: int | None = None,
-    spread: ArrayLike | None = None,
-) -> Extension:
-    """Finds integrators that make B(x) regular, by the dynamic extension algorithm.
-
-    In each round the controls that the dependent rows of B(x) hear of get an integrator. Where such
-    rows of rank q hear of more than q controls, a regular static feedback u = beta(x) w comes
-    first, after which they hear of q controls alone; see `Extension.integrators`. A round takes as
-    many dimensions from the zero dynamics as B(x) lacks in rank, so that few rounds decide: where
-    none are left, the outputs depend on each other. A violation of Assumption (3) is repaired on
-    the way; see `extend`.
-
-    Args:
-        system: (1)-(3).
-        nominal_control: Values of the controls at the nominal state, for the integrators that hold
-            them; zero where not given.
-        max_integrators: How many may be needed in all; n if None.
-        spread: Of the states at which numbers decide, as in `find_structure`. That of a control is
-            0.1 of its nominal value; 0.1 if that is zero.
-
-    Returns:
-        The extended system; the original one if its B(x) is regular.
-
-    Raises:
-        AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
-            isolated states only, or more than max_integrators are needed.
-        ModelError, InconsistentStateError: As `find_structure`.
-    """
-    check_is_system(system, "dynamic_extension")
-    limit = system.num_states if max_integrators is None else max_integrators
-    chain = _Chain(system, _nominal_control(system, nominal_control), spread)
-    while True:
-        try:
-            structure, _ = examine_structure(chain.beside_nominal(), spread=chain.spread)
-        except AssumptionError as error:
-            if error.assumption != 3:
-                raise
-            chain.integrate(_early_controls(chain.system, error))
-        else:
-            choice = _controls_to_integrate(structure)
-            if choice is None:
-                break
-            chain.integrate(*choice)
-        if sum(chain.integrators.values()) > limit:
-            raise AssumptionError(
-                f"more than max_integrators = {limit} are needed for a regular B(x) of (16), so "
-                f"far {_in_words(chain.integrators)}. Allow more, or choose other outputs",
-                5,
-            )
-    return Extension(
-        original=system,
-        system=chain.system,
-        structure=_structure_at_nominal(chain),
-        integrators=chain.integrators,
-        control_offset=chain.offset,
-        control_matrix=chain.matrix,
-    )
-
-
-class _Chain:
-    """A system on its way from the original to the extended one.
-
-    Args:
-        system: The original one.
-        nominal: Values of its controls at the nominal state, shape (p,).
-        spread: Of its states.
-
-    Attributes:
-        system: With the integrators up to now.
-        spread: Of its states.
-        integrators: How many stand before which control.
-        offset, matrix: u of the original system is offset(x) + matrix(x) w.
-    """
-
-    def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike | None) -> None:
-        self.system = system
-        self.spread = spread_of(system, spread)
-        self.integrators: dict[str, int] = {}
-        self.offset = ca.SX(system.num_controls, 1)
-        self.matrix = ca.SX.eye(system.num_controls)
-        self._nominal = nominal
-        self._names = [signal.name for signal in system.control_signals]
-        self._bases = [(signal, 0) for signal in system.control_signals]
-
-    def beside_nominal(self) -> DaeSystem:
-        """The system with a nominal state where no sine happens to be zero.
-
-        Rows of B(x) that vanish there say nothing yet: sin(heading) does at heading 0.
-        """
-        random = np.random.default_rng(0)
-        step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
-        return replace(self.system, nominal_state=self.system.nominal_state + step)
-
-    def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
-        """One integrator before each of some controls.
-
-        Args:
-            columns: Of the controls.
-            mixing: b(x) of u_i* = u_i + sum_j b_ij(x) u_j, which takes the place of u_i first;
-                j are the other controls. Shape (len(columns), p - len(columns)).
-        """
-        system = self.system
-        others = [j for j in range(system.num_controls) if j not in columns]
-        nominal = self._nominal[columns]
-        if mixing is not None:
-            here = traced(system, mixing=mixing)(system.nominal_state, system.parameter_values)[0]
-            nominal = nominal + here.reshape(mixing.shape) @ self._nominal[others]
-            for i in columns:
-                control = system.control_signals[i]
-                self._bases[i] = (Signal(f"{control.name}*", control.unit), 0)
-        held = [self._signal(i) for i in columns]
-        for i in columns:
-            self._bases[i] = (self._bases[i][0], self._bases[i][1] + 1)
-            name = self._names[i]
-            self.integrators[name] = self.integrators.get(name, 0) + 1
-        following = [self._signal(i) for i in columns]
-        self.system = _integrated(system, columns, held, following, nominal, mixing)
-        # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
-        new = self.system.state[system.num_states :]
-        self.offset += ca.mtimes(self.matrix[:, columns], new)
-        if mixing is not None:
-            self.matrix[:, others] -= ca.mtimes(self.matrix[:, columns], mixing)
-        self.matrix[:, columns] = 0.0
-        self._nominal[columns] = 0.0
-        # Away from zero, where B(x) is often singular, it stays away from zero.
-        size = np.where(nominal == 0.0, 1.0, np.abs(nominal))
-        self.spread = np.concatenate([self.spread, 0.1 * size])
-
-    def _signal(self, column: int) -> Signal:
-        base, order = self._bases[column]
-        return base.derivative(order)
-
-
-def _integrated(
+def integrated(
     system: DaeSystem,
     columns: list[int],
     held: Sequence[Signal],
@@ -317,145 +162,16 @@ def _integrated(
     )
 
 
-def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
-    """The controls that the dependent rows of B(x) hear of, and how they must be mixed first.
-
-    Returns:
-        Columns and b(x) of `_Chain.integrate`; None if B(x) is regular.
+def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
+    """Values of the controls at the nominal state by their names, 0 where not given, shape (p,).
 
     Raises:
-        AssumptionError: No integrators help.
+        ModelError: A name that no control has, or a value that is not finite.
     """
-    system = structure.system
-    samples = Samples(structure.manifold, Fields(system.explicit), structure.states)
-    matrices = _control_matrices(structure, samples)
-    size = np.abs(matrices).max(axis=0)
-    row_size = positive(size.max(axis=1))
-    column_size = positive((size / row_size[:, None]).max(axis=0))
-    scaled = matrices / row_size[:, None] / column_size
-    left, values, _ = np.linalg.svd(scaled)
-    ranks = (values > SINGULAR).sum(axis=1)
-    rank, p = int(ranks.max()), system.num_controls
-    if rank == p:
-        return None
-    rows = [i for i in range(p) if any(np.abs(u[i, rank:]).max() > SINGULAR for u in left)]
-    names = ", ".join(system.output_signals[i].name for i in rows)
-    if ranks.min() < rank:
-        state = samples.states[int(ranks.argmin())]
-        raise AssumptionError(
-            f"the rank of B(x) of (16) falls from {rank} to {ranks.min()} at x = {show(state)}, so "
-            "that the integrators to add differ from state to state. Keep away from this state",
-            5,
-            state,
-        )
-    chains = [ca.vertcat(*chain) for chain in structure.output_chains if chain]
-    used = ca.vertcat(structure.manifold.residual_expression, *chains)
-    if samples.dependent(used):
-        raise AssumptionError(
-            f"no integrators make B(x) of (16) regular: the outputs {names} and their derivatives "
-            "depend on each other or on the constraints, so that the system is not right-"
-            "invertible. Choose other outputs",
-            5,
-        )
-    q = len(rows) - (p - rank)
-    heard = [j for j in range(p) if matrices[:, rows, j].any()]
-    if len(heard) == q:
-        return heard, None
-
-    def distance(columns: list[int]) -> float:
-        values = np.linalg.svd(scaled[:, rows][:, :, columns], compute_uv=False)
-        return round(float(values[:, -1].min()), 9)
-
-    candidates: list[list[int]] = [list(columns) for columns in combinations(heard, q)]
-    columns = max(candidates, key=distance)
-    others = [j for j in range(p) if j not in columns]
-    # Least squares over all dependent rows, of which some q may be dependent elsewhere. It is
-    # exact: every column lies in the span of the chosen ones.
-    part = structure.control_matrix[rows, :] / row_size[rows]
-    chosen = part[:, columns]
-    mixing = ca.SX(q, p - q)
-    mixed = [i for i, j in enumerate(others) if j in heard]
-    mixing[:, mixed] = Factorization(ca.mtimes(chosen.T, chosen)).solve(
-        ca.mtimes(chosen.T, part[:, [others[i] for i in mixed]])
-    )
-    return columns, mixing
-
-
-def _control_matrices(structure: Structure, samples: Samples) -> FloatArray:
-    """B(x) without its round-off, shape (samples, p, p)."""
-    elimination, state = structure.elimination, structure.system.state
-    h_star, n_star = samples.eliminated(
-        elimination.constraint_gradient, elimination.constraint_matrix
-    )
-    dynamic = [i for i, degree in enumerate(structure.output_degrees) if degree]
-    last = ca.vertcat(ca.SX(0, 1), *[structure.output_chains[i][-1] for i in dynamic])
-    gradients = samples.values(gradient=ca.jacobian(last, state))
-    result = np.array([value for value, _ in n_star])
-    for matrix, (gradient,), field in zip(result, gradients, h_star, strict=True):
-        matrix[dynamic] = multiply(gradient, field, samples.scale)[0]
-    return result
-
-
-def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
-    """The controls that act on a derivative of a constraint before any constraint input does."""
-    x, explicit = system.state, system.explicit
-    manifold = Manifold(system, [[explicit.k[i]] for i in range(system.num_constraints)])
-    samples = Samples(manifold, Fields(explicit), np.array([violation.state]))
-    found: set[int] = set()
-    for i in range(system.num_constraints):
-        last = explicit.k[i]
-        for _ in range(system.num_states):
-            gradient = samples.values(gradient=ca.jacobian(last, x))[0][0]
-            by_force = multiply(gradient, samples.field("g")[0], samples.scale)[0]
-            by_control = multiply(gradient, samples.field("h")[0], samples.scale)[0]
-            if by_force.any():
-                break
-            if by_control.any():
-                found.update(int(j) for j in np.flatnonzero(by_control))
-                break
-            last = lie_derivative(last, explicit.f, x)
-    return sorted(found)
-
-
-def _structure_at_nominal(chain: _Chain) -> Structure:
-    """Of the extended system, which is regular nearly everywhere.
-
-    Raises:
-        AssumptionError: But not at the nominal state, or near it.
-    """
-    try:
-        return find_structure(chain.system, spread=chain.spread)
-    except AssumptionError as error:
-        if error.state is None:
-            raise
-        remedy = "Keep away from this state"
-        if chain.integrators:
-            given = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
-            remedy += (
-                f", or give another nominal_control, for example nominal_control={{{given}}}; "
-                f"integrators: {_in_words(chain.integrators)}"
-            )
-        raise AssumptionError(
-            f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
-            f"singular at isolated states, which more integrators do not mend. {remedy}",
-            error.assumption,
-            error.state,
-        ) from error
-
-
-def _in_words(integrators: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} before {name}" for name, count in integrators.items())
-
-
-def _nominal_control(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
-    """Shape (p,)."""
     values = values or {}
     _check_names(system, values, "nominal_control")
     given = [values.get(s.name, 0.0) for s in system.control_signals]
-    nominal = numbers(f"{system.name}: nominal_control", given)
-    if not np.all(np.isfinite(nominal)):
-        raise ModelError(f"{system.name}: nominal_control must be finite, got {dict(values)}")
-    return nominal
+    return vector(f"{system.name}: nominal_control", given, system.num_controls)
 
 
 def _check_names(system: DaeSystem, given: Mapping[str, float], what: str) -> None:

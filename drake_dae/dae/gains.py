@@ -146,12 +146,12 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         chosen: list[tuple[str, int, Poles]] = _per_output(values, names, degrees)
         polynomials = {name: _polynomial(name, degree, own) for name, degree, own in chosen}
-        return coefficients(polynomials)(names, degrees)
+        return gain_coefficients(polynomials)(names, degrees)
 
     return design
 
 
-def coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -> GainDesign:
+def gain_coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -> GainDesign:
     """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first.
 
     Args:
@@ -175,13 +175,13 @@ def coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -> Gai
     return design
 
 
-def matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
+def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
     """Gains as full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ..., Lambda_6 of (72)-(73).
 
     Args:
         groups: For each degree mu >= 1 that occurs among the outputs, highest first, the mu
             matrices (lowest derivative first) that couple the outputs of this degree, in the
-            outputs' order. Rigid joints: `matrices([Lambda_1, Lambda_2])`.
+            outputs' order. Rigid joints: `gain_matrices([Lambda_1, Lambda_2])`.
     """
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dgetrf, dgetrs
 
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.completion import check_completion, choose_completion
-from drake_dae.dae.states.samples import Fields, Samples
-from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import ROUND_OFF, Linearization, newton
 
 
@@ -32,13 +31,14 @@ class NormalForm:
     The paper allows any completion; L_h* xi = 0 is not required.
 
     Args:
-        structure: Of the system, or the system.
+        system: (1)-(3).
         completion: xi as expressions of the state (and parameters), shape (d, 1) with
             d = n - sum r_i - sum mu_i. Chosen if None: states that complete the chains well at
             all of `structure.states`; if none do, linear combinations of states.
+        structure: If it is known already; found otherwise.
 
     Attributes:
-        structure: As given.
+        structure: What is assumed of the system.
         completion: xi, shape (d, 1).
         completion_signals: Names and units of xi. A chosen one is its own name: "x3", or
             "x0 - 0.5 x1".
@@ -50,20 +50,25 @@ class NormalForm:
             each other and of the chains; or B(x) is singular.
     """
 
-    def __init__(self, structure: Structure | DaeSystem, completion: ca.SX | None = None) -> None:
-        if not isinstance(structure, Structure):
-            structure = find_structure(structure)
+    def __init__(
+        self,
+        system: DaeSystem,
+        completion: ca.SX | None = None,
+        *,
+        structure: Structure | None = None,
+    ) -> None:
+        structure = structure_of("NormalForm", system, structure)
         self.structure = structure
-        self.system = structure.system
-        system, residual = self.system, structure.manifold.residual_expression
+        self.system = system
+        residual = structure.manifold.residual_expression
         if structure.control_margin.is_singular:
             raise ModelError(
                 f"{system.name}: B(x) of (16) is singular at x = "
                 f"{show(structure.control_margin.state)}, so the output chains are not independent "
                 "there and are no coordinates; choose other outputs"
             )
-        chains = ca.vertcat(residual, *[e for chain in structure.output_chains for e in chain])
-        samples = Samples(structure.manifold, Fields(system.explicit), structure.states)
+        chains = ca.vertcat(residual, structure.chain)
+        samples = Samples(structure.manifold, structure.states)
         if completion is None:
             found = choose_completion(structure, chains, samples)
         else:
@@ -71,23 +76,13 @@ class NormalForm:
         self.completion, self.completion_signals, self.margin = found
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
-            *[
-                signal.derivative(order)
-                for signal, degree in zip(
-                    system.output_signals, structure.output_degrees, strict=True
-                )
-                for order in range(degree)
-            ],
+            *structure.layout.chain_signals(system.output_signals),
             *self.completion_signals,
         )
         coordinates = ca.vertcat(chains, self.completion)
-        inputs = {"state": system.state, "parameters": system.parameter_symbol}
-        self._coordinates = TracedFunction(
-            f"{system.name} normal form", inputs, {"coordinates": coordinates}
-        )
-        self._map = TracedFunction(
-            f"{system.name} normal form and Jacobian",
-            inputs,
+        self._coordinates = system.trace("normal form", {"coordinates": coordinates})
+        self._map = system.trace(
+            "normal form and Jacobian",
             {"coordinates": coordinates, "jacobian": ca.jacobian(coordinates, system.state)},
         )
         self._scale = samples.scale
@@ -102,7 +97,7 @@ class NormalForm:
         Returns:
             Shape (n,), as `coordinate_signals`.
         """
-        return self._coordinates(state, self._parameters(parameters))[0]
+        return self._coordinates(state, self.system.parameter_vector(parameters))[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """dPhi/dx, shape (n, n); singular where Phi is no coordinate change, see the class.
@@ -111,7 +106,7 @@ class NormalForm:
             state: x, shape (n,).
             parameters: Values of all parameters; the defaults if None.
         """
-        return self._at(np.asarray(state, dtype=float), self._parameters(parameters))[1]
+        return self._at(np.asarray(state, dtype=float), self.system.parameter_vector(parameters))[1]
 
     def state(
         self,
@@ -139,9 +134,9 @@ class NormalForm:
                 residual is what is left in the coordinates, shape (n,).
             ModelError: Shapes that do not fit, or numbers that are not finite.
         """
-        target = self._vector("coordinates", coordinates)
-        x = self._vector("guess", self.structure.states[0] if guess is None else guess)
-        p = self._parameters(parameters)
+        target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
+        x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
+        p = self.system.parameter_vector(parameters)
         found = self._newton(x, target, p)
         if found is not None:
             return found
@@ -175,7 +170,9 @@ class NormalForm:
 
         def linearize(z: FloatArray) -> Linearization | None:
             solve = _solver(self._at(scale * z, parameters)[1] * scale)
-            return None if solve is None else (lambda z: solve(left(z)), True)
+            if solve is None:
+                return None
+            return Linearization(lambda z: solve(left(z)), True)
 
         found, converged = newton(state / scale, linearize)
         return scale * found if converged else None
@@ -222,19 +219,6 @@ class NormalForm:
         """Phi and its Jacobian."""
         values, jacobian = self._map(state, parameters)
         return values, jacobian.reshape(values.size, -1)
-
-    def _parameters(self, parameters: ArrayLike | None) -> FloatArray:
-        values = self.system.parameter_values if parameters is None else parameters
-        return np.asarray(values, dtype=float)
-
-    def _vector(self, what: str, values: ArrayLike) -> FloatArray:
-        array = np.array(values, dtype=float)
-        if array.shape != (self.system.num_states,) or not np.all(np.isfinite(array)):
-            raise ModelError(
-                f"{self.system.name}: {what} must be finite with shape "
-                f"({self.system.num_states},), got {values!r}"
-            )
-        return array
 
 
 def _solver(matrix: FloatArray) -> Callable[[FloatArray], FloatArray] | None:

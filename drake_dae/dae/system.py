@@ -2,9 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from difflib import get_close_matches
 from functools import cached_property
-from inspect import signature
 from types import SimpleNamespace
 from typing import Any, Self
 
@@ -12,11 +10,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
+from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
-from drake_dae.trace.smoothness import flaw
+from drake_dae.trace.functions import TracedFunction
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,85 +82,37 @@ class DaeSystem:
                 f"{self.name}: 'state' must be a CasADi SX column of symbols, "
                 f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
             )
-
-        def put(key: str, value: object) -> None:
-            object.__setattr__(self, key, value)
-
-        put("state", ca.vec(self.state))
-        put("parameters", tuple(self.parameters))
-        n = self.state.numel()
-        k = _expression("k", self.k, self.name)
-        constraints = k.numel()
-        controls = _expression("h", self.h, self.name).shape[1]
-        shapes = {
-            "f": (n, 1),
-            "g": (n, constraints),
-            "h": (n, controls),
-            "k": (constraints, 1),
-            "l": (controls, 1),
-            "m": (controls, constraints),
-            "mass_matrix": (n, n),
-        }
+        self._put("state", ca.vec(self.state))
+        self._put("parameters", tuple(self.parameters))
+        check_unique(self.name, "parameter", [p.name for p in self.parameters])
         if self.mass_matrix is None:
-            put("mass_matrix", ca.SX.eye(n))
-        _unique([p.name for p in self.parameters], "parameter", self.name)
-        known = ca.vertcat(self.state, self.parameter_symbol)
-        if len(ca.symvar(known)) != known.numel():
-            raise ModelError(f"{self.name}: a symbol stands twice among the states and parameters")
-        for key, shape in shapes.items():
-            value = _expression(key, getattr(self, key), self.name)
-            if value.numel() == 0 and 0 in shape:
-                value = ca.SX(*shape)
-            if value.shape != shape and value.shape == shape[::-1] and 1 in shape:
-                value = value.T
-            if value.shape != shape:
-                hint = (
-                    " (as many controlled outputs as controls: the law (28) inverts B(x), "
-                    "which is p x p)"
-                    if key in "lm"
-                    else ""
-                )
-                if value.numel() == 0 and constraints and key in "gm":
-                    raise ModelError(
-                        f"{self.name}: k is given, so g and m are needed; {key} is missing, with "
-                        f"shape {shape}"
-                    )
-                raise ModelError(
-                    f"{self.name}: {key} has shape {value.shape}, expected {shape} for "
-                    f"n = {n} states, m = {constraints} constraints, p = {controls} controls{hint}"
-                )
-            unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(known, s)]
-            if unknown:
-                raise ModelError(
-                    f"{self.name}: {key} depends on {', '.join(unknown)}, which is neither a "
-                    "state nor a parameter; pass it in 'parameters' or put its number in"
-                )
-            put(key, ca.sparsify(value))  # Zeros of an array are structural, too.
-        _check_operations(self, list(shapes))
-        sizes = (
-            ("state_signals", n, "x"),
-            ("constraint_input_signals", constraints, "v"),
-            ("constraint_output_signals", constraints, "y"),
-            ("control_signals", controls, "u"),
-            ("output_signals", controls, "z"),
-        )
-        for key, count, letter in sizes:
-            made_up = [f"{letter}{i}" for i in range(count)]
-            given = _signals(f"{self.name}: {key}", getattr(self, key) or made_up)
-            if len(given) != count:
-                raise ModelError(f"{self.name}: {key} has {len(given)} entries, expected {count}")
-            _unique([s.name for s in given], key, self.name)
-            put(key, given)
-        nominal = np.zeros(n)
-        if self.nominal_state is not None:
-            nominal = numbers(f"{self.name}: nominal_state", self.nominal_state)
-        if nominal.shape != (n,) or not np.all(np.isfinite(nominal)):
-            raise ModelError(
-                f"{self.name}: nominal_state must be finite with shape ({n},), "
-                f"got {self.nominal_state!r}"
-            )
+            self._put("mass_matrix", ca.SX.eye(self.state.numel()))
+        functions = {key: getattr(self, key) for key in ("f", "g", "h", "k", "l", "m")}
+        functions["mass_matrix"] = self.mass_matrix
+        checked = as_functions(self.name, functions, self.state, self.parameter_symbol)
+        for key, expression in checked.items():
+            self._put(key, expression)
+        for key, count, letter in (
+            ("state_signals", self.num_states, "x"),
+            ("constraint_input_signals", self.num_constraints, "v"),
+            ("constraint_output_signals", self.num_constraints, "y"),
+            ("control_signals", self.num_controls, "u"),
+            ("output_signals", self.num_controls, "z"),
+        ):
+            given = getattr(self, key) or [f"{letter}{i}" for i in range(count)]
+            signals = as_signals(f"{self.name}: {key}", given)
+            if len(signals) != count:
+                raise ModelError(f"{self.name}: {key} has {len(signals)} entries, expected {count}")
+            check_unique(self.name, key, [signal.name for signal in signals])
+            self._put(key, signals)
+        given = np.zeros(self.num_states) if self.nominal_state is None else self.nominal_state
+        nominal = vector(f"{self.name}: nominal_state", given, self.num_states)
         nominal.setflags(write=False)
-        put("nominal_state", nominal)
+        self._put("nominal_state", nominal)
+
+    def _put(self, key: str, value: object) -> None:
+        """Sets a field while the frozen system is made."""
+        object.__setattr__(self, key, value)
 
     def __repr__(self) -> str:
         counts = (self.num_states, self.num_constraints, self.num_controls)
@@ -202,62 +153,29 @@ class DaeSystem:
         known = [item.name for item in fields(cls) if item.name not in own]
         for label in labels:
             if label not in known:
-                near = get_close_matches(label, known, n=1)
-                hint = f"did you mean '{near[0]}'? " if near else ""
-                raise ModelError(f"{owner}: no field '{label}'; {hint}fields: {', '.join(known)}")
+                raise ModelError(f"{owner}: {unknown_name('field', label, known)}")
         bad = [name for name in parameters or {} if not name.isidentifier()]
         if bad:
             raise ModelError(
                 f"parameter names must be Python identifiers, to be read as p.name: {bad}"
             )
-        if isinstance(state, int):
-            state = [f"x{i}" for i in range(state)]
-        named = _signals(f"{owner}: the states", state)
+        names = [f"x{i}" for i in range(state)] if isinstance(state, int) else state
+        named = as_signals(f"{owner}: the states", names)
         if not named:
             raise ModelError(f"{owner}: a system needs at least one state")
-        x = ca.vertcat(ca.SX(0, 1), *[ca.SX.sym(s.name) for s in named])
+        x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
         defined = tuple(
             Parameter(name, numbers(f"parameter '{name}'", value))
             for name, value in (parameters or {}).items()
         )
-        arguments = [x]
+        arguments: list[Any] = [x]
         if defined:
             arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
-
-        def call(letter: str, function: Callable[..., Any] | None) -> ca.SX:
-            if function is None:
-                return ca.SX(0, 0)
-            if not callable(function):
-                raise ModelError(
-                    f"{owner}: {letter} must be a function of the state, got "
-                    f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
-                )
-            try:
-                value = function(*arguments)
-            except Exception as error:
-                raise ModelError(
-                    f"{owner}: function {letter} failed on a CasADi column of {x.numel()} states: "
-                    f"{_explained(error, function, arguments)}"
-                ) from error
-            if value is None:
-                raise ModelError(f"{owner}: function {letter} returned nothing")
-            return _expression(letter, value, owner)
-
-        drift, control = call("f", f), call("h", h)
-        if control.shape[0] == 1 and x.numel() != 1:
-            control = control.T
-        return cls(
-            state=x,
-            f=drift,
-            g=call("g", g),
-            h=control,
-            k=call("k", k),
-            l=call("l", l),
-            m=call("m", m),
-            parameters=defined,
-            state_signals=named,
-            **labels,
-        )
+        functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
+        values = {key: call(owner, key, given, arguments) for key, given in functions.items()}
+        if values["h"].shape[0] == 1 and x.numel() != 1:
+            values["h"] = values["h"].T
+        return cls(state=x, **values, parameters=defined, state_signals=named, **labels)
 
     @cached_property
     def explicit(self) -> "DaeSystem":
@@ -275,6 +193,13 @@ class DaeSystem:
             mass_matrix=None,
             motion=None,
         )
+
+    @cached_property
+    def fields(self) -> TracedFunction:
+        """f, g, h, l and m of the system with E = 1, as a function of state and parameters."""
+        e = self.explicit
+        outputs = {"f": e.f, "g": e.g, "h": e.h, "l": e.l, "m": e.m}
+        return self.trace("fields", outputs, often=False)
 
     @property
     def num_states(self) -> int:
@@ -301,6 +226,49 @@ class DaeSystem:
         """The defaults of all parameters, in the order of `parameter_symbol`."""
         return np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
 
+    @property
+    def nominal_spread(self) -> FloatArray:
+        """How far states are drawn from the nominal one where nobody says, shape (n,)."""
+        return usual_spread(self.nominal_state)
+
+    def trace(
+        self,
+        name: str,
+        outputs: Mapping[str, ca.SX],
+        inputs: Mapping[str, ca.SX] | None = None,
+        pivot: ca.SX | None = None,
+        regular: str = "a matrix",
+        often: bool = True,
+    ) -> TracedFunction:
+        """Expressions as a fast function of the state, of other inputs and of the parameters.
+
+        Args:
+            name: What the outputs are, for messages.
+            outputs, pivot, regular, often: As in `TracedFunction`.
+            inputs: Other symbols, which stand between "state" and "parameters".
+        """
+        every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
+        return TracedFunction(f"{self.name} {name}", every, outputs, pivot, regular, often)
+
+    def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
+        """Values of all parameters in the order of `parameter_symbol`; the defaults if None.
+
+        Raises:
+            ModelError: A wrong shape, or a number that is not finite.
+        """
+        default = self.parameter_values
+        if parameters is None:
+            return default
+        return vector(f"{self.name}: parameters", parameters, default.size)
+
+    def state_vector(self, state: ArrayLike) -> FloatArray:
+        """A state as a new array of shape (n,).
+
+        Raises:
+            ModelError: A wrong shape, or a number that is not finite.
+        """
+        return vector(f"{self.name}: a state", state, self.num_states)
+
     def parameter_slice(self, name: str) -> slice:
         """Where a parameter stands in `parameter_values`.
 
@@ -312,8 +280,19 @@ class DaeSystem:
             if parameter.name == name:
                 return slice(start, start + parameter.value.size)
             start += parameter.value.size
-        names = ", ".join(p.name for p in self.parameters) or "none"
-        raise ModelError(f"{self.name} has no parameter '{name}'; it has {names}")
+        known = [parameter.name for parameter in self.parameters]
+        raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
+
+
+def usual_spread(state: FloatArray) -> FloatArray:
+    """How far states are drawn from one where nobody says, shape (n,): 0.1.
+
+    In unusual units a hundredth of the state's value where that is above 10, and a tenth where it
+    is below 1e-3 and not round-off.
+    """
+    size = np.abs(state)
+    small = (size < 1e-3) & (size > 1e-12 * size.max())
+    return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
 
 
 def check_is_system(value: Any, owner: str) -> None:
@@ -327,77 +306,3 @@ def check_is_system(value: Any, owner: str) -> None:
     meant = [name for name in ("dae", "system") if isinstance(getattr(value, name, 0), DaeSystem)]
     hint = f"; pass its .{meant[0]}" if meant else ""
     raise ModelError(f"{owner} needs a DaeSystem, got {type(value).__name__}{hint}")
-
-
-def _signals(what: str, given: Any) -> tuple[Signal, ...]:
-    """Signals, or names of signals without unit."""
-    items = [given] if isinstance(given, str) or not isinstance(given, Sequence) else given
-    bad = [item for item in items if not isinstance(item, (Signal, str))]
-    if items is not given or bad:
-        raise ModelError(f"{what} must be a list of names or Signals, got {(bad or items)[0]!r}")
-    return tuple(Signal(item) if isinstance(item, str) else item for item in items)
-
-
-def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
-    """What a function's own error means here."""
-    text = str(error)
-    try:
-        signature(function).bind(*arguments)
-    except TypeError:
-        called = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
-        return f"{text}. It is called with {called}"
-    except ValueError:
-        pass  # Of built-in functions nothing is known.
-    if "truth value" in text:
-        return (
-            "it asks whether a condition on the state is true, as in if, max or min. Conditions "
-            "are not smooth, and the theory differentiates: write the side on which the state "
-            "stays, or a smooth function"
-        )
-    if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
-        return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"
-    text = text.removeprefix("...").split(": ", 1)[-1] if text.startswith(".../casadi") else text
-    if isinstance(error, NotImplementedError):
-        text += ". Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"
-    return text
-
-
-def _expression(key: str, value: Any, owner: str) -> ca.SX:
-    """An SX matrix from an SX, a number, an array, or a (nested) list of these."""
-    if isinstance(value, ca.MX):
-        raise ModelError(f"{owner}: {key} is a CasADi MX; use SX symbols and expressions")
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        value = value.tolist()
-    try:
-        if isinstance(value, (list, tuple)):
-            rows = [ca.horzcat(*row) if isinstance(row, (list, tuple)) else row for row in value]
-            value = ca.vertcat(*rows) if rows else ca.SX(0, 1)
-        result = ca.SX(np.asarray(value, dtype=float) if not isinstance(value, ca.SX) else value)
-    except Exception as error:
-        raise ModelError(
-            f"{owner}: {key} must be a CasADi SX expression, an array, or a list of these (of "
-            f"lists of one length for a matrix), got {type(value).__name__}"
-        ) from error
-    return result
-
-
-def _check_operations(system: DaeSystem, keys: Sequence[str]) -> None:
-    """Refuses what evaluates without complaint, but makes no sense in (1)-(3)."""
-    expressions = [getattr(system, key) for key in keys]
-    x, p = system.state, system.parameter_symbol
-    if flaw(ca.veccat(*expressions), x, p, "the state") is None:
-        return
-    for key, expression in zip(keys, expressions, strict=True):
-        for row, column in zip(*expression.sparsity().get_triplet(), strict=True):
-            message = flaw(expression[row, column], x, p, "the state")
-            if message:
-                raise ModelError(
-                    f"{system.name}: {key}, entry [{row}, {column}] of shape {expression.shape}, "
-                    f"{message}"
-                )
-
-
-def _unique(names: Sequence[str], kind: str, owner: str) -> None:
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise ModelError(f"{owner}: {kind} names must be unique, twice: {', '.join(double)}")

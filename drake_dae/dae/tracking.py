@@ -1,4 +1,4 @@
-"""The tracking law, with or without measured force.            (28), (29), (59), (71), (81)"""
+"""The tracking law.                                                        (28), (29)"""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.gains import FeedbackGains, GainDesign
-from drake_dae.dae.structure import Structure, find_structure
-from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import GainError, ModelError
-from drake_dae.trace.factorization import Factorization
+from drake_dae.dae.layout import Layout
+from drake_dae.dae.measured_force import MeasuredForce
+from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import GainError
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -22,26 +23,27 @@ class TrackingLaw:
         ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
 
     with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
-    exactly. The law needs the state x; it needs no measurement of the constraint inputs.
+    exactly. The law needs the state x; it needs no measurement of the constraint inputs, but takes
+    one with `measured_force`; see `MeasuredForce`.
 
     The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
     numbers.
-
-    With measured force, outputs z_i = v_j are fed back from a measurement of v as well:
-
-        mu_i = 0: r_2 - Gbar (v - r_2) takes the place of r_2, which is the term J^T Gbar
-            (lambda - r_2) of (59). The force error of a wrong model shrinks to 1 / (1 + Gbar).
-        mu_i >= 1: v takes the place of the model's l*_i, as (71) and (81) allow.
-
-    In a diagram the measurement needs a sensor with state where mu_i = 0; see `ForceSensor`.
 
     Args:
         system: (1)-(3).
         gains: A design such as `poles(-4.0)`, or finished gains.
         structure: If it is known already; found otherwise.
-        measured_force: Whether the law takes a measurement of v.
+        measured_force: Whether the law takes a measurement of v. In a diagram it needs a sensor
+            with state where mu_i = 0; see `ForceSensor`.
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
+
+    Attributes:
+        layout: How references and chains are stacked.
+        reference_signals: Names and units of R.
+        function: (state, reference, measured_force, gains, parameters) -> control and
+            tracking_error; without measured force there is no such input.
+        measured_force: How the measurement enters; None without one.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
@@ -54,154 +56,128 @@ class TrackingLaw:
         self,
         system: DaeSystem,
         gains: GainDesign | FeedbackGains,
+        *,
         structure: Structure | None = None,
         measured_force: bool = False,
         force_gain: ArrayLike = 0.0,
     ) -> None:
-        check_is_system(system, "TrackingLaw")
+        self.structure = structure_of("TrackingLaw", system, structure)
         self.system = system
-        self.structure = structure or find_structure(system)
-        if self.structure.system is not system:
-            raise ModelError(
-                f"{system.name}: the given structure is that of another system, "
-                f"{self.structure.system.name}; find it for this one"
-            )
-        degrees = self.structure.output_degrees
-        names = tuple(signal.name for signal in system.output_signals)
-        if not (isinstance(gains, FeedbackGains) or callable(gains)):
-            raise GainError(f"gains must be a design such as poles(-4.0), got {gains!r}")
-        self.gains = gains if isinstance(gains, FeedbackGains) else gains(names, degrees)
-        if (self.gains.names, self.gains.degrees) != (names, degrees):
-            raise GainError(
-                f"the gains are for the outputs {', '.join(self.gains.names)} with degrees "
-                f"{self.gains.degrees}, the system has {', '.join(names)} with {degrees}"
-            )
-        self.reference_signals = tuple(
-            signal.derivative(order)
-            for signal, degree in zip(system.output_signals, degrees, strict=True)
-            for order in range(degree + 1)
-        )
-        reference = ca.SX.sym("R", len(self.reference_signals))
-        # Only where it is not zero: the errors of most outputs are not coupled.
-        pattern = ca.sparsify(ca.DM(self.gains.matrix)).sparsity()
-        gain = ca.SX.sym("K", pattern)
-        starts = np.cumsum([0, *[degree + 1 for degree in degrees]])
-        nominal = reference[starts[:-1].tolist()]
-        highest = reference[(starts[1:] - 1).tolist()]
-        chains = [list(chain) for chain in self.structure.output_chains]
+        self.layout = Layout(self.structure.output_degrees)
+        self.reference_signals = self.layout.reference_signals(system.output_signals)
+        self.gains = self.design(gains)
+        self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
+        self._error_coordinates = self._trace_error_coordinates()
+        self.function = self._trace()
 
-        def errors() -> ca.SX:
-            return ca.vertcat(
-                ca.SX(0, 1),
-                *[
-                    element - reference[start + j]
-                    for chain, start in zip(chains, starts, strict=False)
-                    for j, element in enumerate(chain)
-                ],
-            )
-
-        coordinates = errors()
-        self.measured_force = measured_force
-        self.force_gain = _force_gain(force_gain, system.num_constraints)
-        if self.force_gain.any() and not measured_force:
-            raise GainError("force_gain needs measured_force=True")
-        measurement = ca.SX.sym("v", system.num_constraints if measured_force else 0)
-        if measured_force:
-            forces = _force_outputs(system)
-            missing = ca.SX(measurement.numel(), 1)
-            for i, j in forces.items():
-                missing[j] = measurement[j] - nominal[i]
-            for i, j in forces.items():
-                if degrees[i] and self.force_gain[j].any():
-                    raise GainError(
-                        f"force_gain is for outputs that the law meets at once; '{names[i]}' has "
-                        f"degree {degrees[i]} and takes the measured force itself. Leave it 0"
-                    )
-                if degrees[i]:
-                    chains[i][0] = measurement[j]
-                else:
-                    highest[i] -= ca.mtimes(ca.DM(self.force_gain[j : j + 1]), missing)
-        wanted = highest - ca.mtimes(gain, errors())
-        found = self.structure.motion.inverse(self.structure.highest_derivatives, wanted)
-        if found is None:  # L_h* of an output vanishes, but not by structure.
-            factors = Factorization(self.structure.control_matrix)
-            found = factors.solve(wanted - self.structure.drift), factors.pivot
-        control, pivot = found
-        if self.structure.chains_need_force:
-            pivot = ca.fmin(pivot, self.structure.elimination.pivot)
-        # What the control reaches at once is as wanted.
-        output = ca.vertcat(
-            *[
-                chain[0] if chain else wanted[i]
-                for i, chain in enumerate(self.structure.output_chains)
-            ]
-        )
-        inputs = {
-            "state": system.state,
-            "reference": reference,
-            "measured_force": measurement,
-            "parameters": ca.vertcat(system.parameter_symbol, *gain.nonzeros()),
-        }
-        if not measured_force:
-            del inputs["measured_force"]
-        self.function = TracedFunction(
-            f"{system.name} tracking law",
+    def _trace(self) -> TracedFunction:
+        """(28)."""
+        structure, layout, measured = self.structure, self.layout, self.measured_force
+        reference = ca.SX.sym("R", layout.reference_size)
+        # Symbols where K is not zero: the errors of most outputs are not coupled.
+        gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
+        values = reference[layout.lowest.tolist(), :]
+        highest = reference[layout.highest.tolist(), :]
+        chain = structure.chain
+        inputs = {"reference": reference}
+        if measured:
+            chain, highest = measured.chain(chain), measured.highest(highest, values)
+            inputs["measured_force"] = measured.symbol
+        ubar = highest - ca.mtimes(gain, chain - reference[layout.chained.tolist(), :])
+        inputs["gains"] = ca.vertcat(ca.SX(0, 1), *gain.nonzeros())
+        control, pivot = structure.control_for(ubar)
+        # By the model; what the control reaches at once is as wanted.
+        output = ca.SX(ubar)
+        output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
+        return self.system.trace(
+            "tracking law",
+            {"control": control, "tracking_error": output - values},
             inputs,
-            {
-                "control": control,
-                "tracking_error": output - nominal,
-                "pivot": pivot,
-            },
+            pivot,
+            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
         )
-        self._coordinates = TracedFunction(
-            f"{system.name} error coordinates",
-            {
-                "state": system.state,
-                "reference": reference,
-                "parameters": system.parameter_symbol,
-            },
-            {"coordinates": coordinates},
-            often=False,
-        )
+
+    def _trace_error_coordinates(self) -> TracedFunction:
+        """The initial value of (30)."""
+        reference = ca.SX.sym("R", self.layout.reference_size)
+        chain = self.structure.chain - reference[self.layout.chained.tolist(), :]
+        inputs = {"reference": reference}
+        return self.system.trace("error coordinates", {"coordinates": chain}, inputs, often=False)
 
     @property
     def degrees(self) -> tuple[int, ...]:
         """mu_1, ..., mu_p: how many derivatives of each reference the law needs."""
-        return self.structure.output_degrees
+        return self.layout.degrees
+
+    def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
+        """Gains for the outputs of this law.
+
+        Raises:
+            GainError: The gains are for other outputs or degrees, or no gains.
+        """
+        names = tuple(signal.name for signal in self.system.output_signals)
+        if not (isinstance(gains, FeedbackGains) or callable(gains)):
+            raise GainError(f"gains must be a design such as poles(-4.0), got {gains!r}")
+        found = gains if isinstance(gains, FeedbackGains) else gains(names, self.degrees)
+        if (found.names, found.degrees) != (names, self.degrees):
+            raise GainError(
+                f"the gains are for the outputs {', '.join(found.names)} with degrees "
+                f"{found.degrees}, the system has {', '.join(names)} with {self.degrees}"
+            )
+        return found
+
+    def gain_vector(self, gains: GainDesign | FeedbackGains | None = None) -> FloatArray:
+        """What `function` takes as gains: the entries of K that the law has, column by column.
+
+        Args:
+            gains: Other gains than those of the law, for a context; None for its own.
+
+        Raises:
+            GainError: Gains that do not fit, or that couple outputs which the law does not.
+        """
+        chosen = self.gains if gains is None else self.design(gains)
+        has = self.gains.matrix != 0.0
+        if np.any(chosen.matrix[~has]):
+            i, j = np.argwhere((chosen.matrix != 0.0) & ~has)[0]
+            signals = self.layout.chain_signals(self.system.output_signals)
+            raise GainError(
+                f"the law has no gain from the error of {signals[j].name} to "
+                f"{self.system.output_signals[i].name}; make a new law with such a gain"
+            )
+        return chosen.matrix.T[has.T]
 
     def control(
         self,
         state: ArrayLike,
         reference: ArrayLike,
-        parameters: ArrayLike | None = None,
+        *,
         measured_force: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
     ) -> FloatArray:
         """u(x, R) of (28).
 
         Args:
             state: x, shape (n,).
             reference: R, shape (sum (mu_i + 1),), output-major.
-            parameters: Values of all parameters; the defaults if None.
             measured_force: v, shape (m,); exactly where the law takes it.
+            parameters: Values of all parameters; the defaults if None.
 
         Returns:
             Shape (p,).
         """
         measured = [] if measured_force is None else [measured_force]
-        return self.function(state, reference, *measured, self.parameter_values(parameters))[0]
-
-    def parameter_values(self, parameters: ArrayLike | None = None) -> FloatArray:
-        """What `function` takes: all parameters of the system, then K's nonzeros by columns."""
-        values = self.system.parameter_values if parameters is None else parameters
-        gains = self.gains.matrix.T
-        return np.concatenate([np.asarray(values, float), gains[gains != 0.0]])
+        values = self.system.parameter_vector(parameters)
+        return self.function(state, reference, *measured, self.gain_vector(), values)[0]
 
     def error_coordinates(
         self, state: ArrayLike, reference: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """(e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30)."""
-        values = self.system.parameter_values if parameters is None else parameters
-        return self._coordinates(state, reference, values)[0]
+        """(e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
+
+        The arguments are those of `control`.
+        """
+        values = self.system.parameter_vector(parameters)
+        return self._error_coordinates(state, reference, values)[0]
 
     def predicted_error(
         self,
@@ -218,41 +194,15 @@ class TrackingLaw:
             reference: R at the start.
             parameters: Values of all parameters; the defaults if None.
         """
-        return self.gains.error_response(
-            np.asarray(times, dtype=float), self.error_coordinates(state, reference, parameters)
-        )
+        start = self.error_coordinates(state, reference, parameters)
+        return self.gains.error_response(times, start)
 
 
-def _force_gain(value: ArrayLike, size: int) -> FloatArray:
-    """Gbar as a matrix that is positive semidefinite."""
-    try:
-        gain = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise GainError(f"force_gain must be numbers, got {value!r}") from None
-    if gain.ndim == 0:
-        gain = gain * np.eye(size)
-    if gain.shape != (size, size) or not np.all(np.isfinite(gain)):
-        raise GainError(f"force_gain must be a number or shape ({size}, {size}), got {value!r}")
-    smallest = float(np.min(np.linalg.eigvalsh((gain + gain.T) / 2.0), initial=0.0))
-    if smallest < -1e-12:
-        raise GainError(
-            "force_gain, Gbar of (59), must be positive semidefinite: a negative one feeds the "
-            f"force error back with the wrong sign. Smallest eigenvalue {smallest:.3g}"
-        )
-    return gain
-
-
-def _force_outputs(system: DaeSystem) -> dict[int, int]:
-    """Output index -> constraint input index, for the outputs z_i = v_j."""
-    found = {}
-    for i in range(system.num_controls):
-        row = ca.sparsify(system.m[i, :])
-        if row.nnz() == 1 and system.l[i].is_zero():
-            j = row.sparsity().get_triplet()[1][0]
-            if row[j].is_one():
-                found[i] = j
-    if not found:
-        raise ModelError(
-            f"{system.name}: measured_force needs an output that is a constraint input, z_i = v_j"
-        )
-    return found
+def _measured_force(
+    system: DaeSystem, layout: Layout, wanted: bool, gain: ArrayLike
+) -> MeasuredForce | None:
+    if wanted:
+        return MeasuredForce.of(system, layout, gain)
+    if numbers("force_gain", gain, GainError).any():
+        raise GainError("force_gain needs measured_force=True")
+    return None

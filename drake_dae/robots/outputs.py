@@ -97,6 +97,13 @@ class SurfaceCoordinates(PositionOutput):
 
     contact: Constraint
 
+    def __post_init__(self) -> None:
+        if not self.contact.coordinate_signals:
+            raise ModelError(
+                f"constraint '{self.contact.name}' has no coordinates along it; use "
+                "PointCoordinates or an expression"
+            )
+
     def expression(self, links: Links) -> ca.SX:
         return self.contact.coordinates(links)
 

@@ -102,8 +102,7 @@ class Balance:
             steps = shortest_steps(gradient / scale, residual)
             if steps is None:
                 return None
-            step_from, regular = steps
-            return lambda x: step_from(x) / scale, regular
+            return Linearization(lambda x: steps.step(x) / scale, steps.is_regular)
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
         left = float(np.max(np.abs(residual(solution)), initial=0.0))

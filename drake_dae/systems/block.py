@@ -1,6 +1,12 @@
-"""What our LeafSystems share: parameters in the context, and conversion to AutoDiffXd."""
+"""What our LeafSystems share: parameters, checked functions, and conversion to AutoDiffXd.
 
-from collections.abc import Callable, Sequence
+Drake's Linearize, FirstOrderTaylorApproximation, DirectCollocation and DirectTranscription convert
+a system to AutoDiffXd and read gradients. CasADi has the derivatives already: a converted block
+evaluates the same traced functions as before, and multiplies their traced Jacobians with the
+gradients of its inputs, state and parameters.
+"""
+
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, Protocol
 
@@ -17,18 +23,22 @@ from pydrake.systems.framework import (
     SystemScalarConverter,
 )
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError, NonFiniteError
-from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
+from drake_dae.errors import ModelError, NonFiniteError, SimulationError, SingularityError
+from drake_dae.trace.functions import Failure, Fault, TracedFunction
+
+STATES = ("state", "estimated_state")
+"""What the argument of a formula is called that says where the system is."""
 
 
 class Formula(Protocol):
     """What an output port, or the time derivative, computes.
 
     Attributes:
-        sources: Where each argument comes from: "time", "state", "parameters", or the name of an
-            input port.
+        sources: Where each argument comes from: "time", "state", the name of a group of numeric
+            parameters, or that of an input port.
     """
 
     @property
@@ -45,54 +55,108 @@ class TracedFormula:
     """An output of a TracedFunction; its derivatives are traced when they are first needed.
 
     Args:
-        function: If it has an output "pivot", that one tells how far a matrix is from singular.
-        output: Which output.
-        sources: Of the arguments; their own names if None.
-        failure: (time, *arguments) -> the error to raise where the function is not finite or its
-            pivot is below `SINGULAR_PIVOT`.
+        function: The function.
+        output: Which of its outputs.
+        sources: Where its arguments come from; their own names if None.
+        signals: Name of an argument -> names of its entries, for messages.
     """
 
     def __init__(
         self,
         function: TracedFunction,
-        output: str,
+        output: str = "value",
         sources: Sequence[str] | None = None,
-        failure: Callable[..., Exception] | None = None,
+        signals: Mapping[str, Sequence[Signal]] | None = None,
     ) -> None:
         self.sources = tuple(function.input_names if sources is None else sources)
         self._function = function
+        self._signals = signals or {}
         self._output = function.output_names.index(output)
-        self._failure = failure or self._not_finite
+        places = [i for i, source in enumerate(self.sources) if source in STATES]
+        self._state = places[0] if places else 0
         self._slopes: dict[tuple[int, ...], TracedFunction] = {}
 
     def value(self, time: float, *arguments: FloatArray) -> FloatArray:
-        values = self._function.evaluate(*arguments)
-        names = self._function.output_names
-        regular = "pivot" not in names or values[names.index("pivot")][0] >= SINGULAR_PIVOT
-        if not (self._function.is_finite and regular):
-            raise self._failure(time, *arguments)
-        return values[self._output].copy()
+        return self._checked(self._function, time, arguments)[self._output].copy()
 
     def slope(self, moving: tuple[int, ...], time: float, *arguments: FloatArray) -> FloatArray:
         if moving not in self._slopes:
             self._slopes[moving] = self._function.derivative(self._output, moving)
-        function = self._slopes[moving]
-        (slope,) = function.evaluate(*arguments)
-        if not function.is_finite:
-            raise NonFiniteError(
-                f"{function.name} is not finite at t = {time:.6g} s: it is not differentiable "
-                "there, or leaves its domain",
-                time,
-                np.concatenate(arguments),
-            )
+        (slope,) = self._checked(self._slopes[moving], time, arguments)
         return slope.reshape(-1, sum(self._function.sizes[i] for i in moving))
 
-    def _not_finite(self, time: float, *arguments: FloatArray) -> NonFiniteError:
-        return NonFiniteError(
-            f"{self._function.name} is not finite at t = {time:.6g} s",
-            time,
-            np.concatenate(arguments),
-        )
+    def _checked(
+        self, function: TracedFunction, time: float, arguments: tuple[FloatArray, ...]
+    ) -> tuple[FloatArray, ...]:
+        return evaluate_checked(function, time, arguments[self._state], arguments, self._signals)
+
+
+def evaluate_checked(
+    function: TracedFunction,
+    time: float,
+    state: FloatArray,
+    arguments: Sequence[FloatArray],
+    signals: Mapping[str, Sequence[Signal]],
+) -> tuple[FloatArray, ...]:
+    """The values of a function in a simulation.
+
+    Args:
+        function: The function.
+        time: In s.
+        state: Where the system is, shape (n,).
+        arguments: As `function` takes them.
+        signals: Name of an input -> names of its entries, for messages.
+
+    Raises:
+        SingularityError, NonFiniteError: The values are of no use, and why, with time and state.
+    """
+    values = function.evaluate(*arguments)
+    if function.is_valid:
+        return values
+    failure = function.failure()
+    assert failure is not None
+    raise simulation_error(failure, time, state, signals)
+
+
+def simulation_error(
+    failure: Failure,
+    time: float,
+    state: FloatArray,
+    signals: Mapping[str, Sequence[Signal]],
+) -> SimulationError:
+    """The exception for a function that has no value in a simulation.
+
+    Args:
+        failure: What was wrong.
+        time: When, in s.
+        state: Where, shape (n,).
+        signals: Name of an input -> names of its entries; the name of the input serves otherwise.
+    """
+    where = f"at t = {time:.6g} s, state {show(state)}"
+    match failure.fault:
+        case Fault.INPUT:
+            bad = [
+                signals[name][i].name if name in signals else name
+                for name, entries in failure.inputs.items()
+                for i in (entries if name in signals else entries[:1])
+            ]
+            return NonFiniteError(
+                f"{failure.function}: its input {', '.join(bad)} is not finite {where}", time, state
+            )
+        case Fault.VALUE:
+            return NonFiniteError(
+                f"{failure.function} is not finite {where}: a function left its domain or is not "
+                "differentiable there, or a matrix that is inverted is singular",
+                time,
+                state,
+            )
+        case Fault.SINGULAR:
+            return SingularityError(
+                f"{failure.singular} is singular {where}, so {failure.function} is not determined "
+                "there. Keep away from this state, or choose other constraints or outputs",
+                time,
+                state,
+            )
 
 
 class DifferentiableSystem(LeafSystem):
@@ -101,12 +165,18 @@ class DifferentiableSystem(LeafSystem):
     The converted system has the same ports, continuous state and numeric parameters, and exact
     gradients. It has no events: a converted plant does not project its state onto N*, nor does it
     refuse a start that is off N*.
+
+    Args:
+        parameters: Name of a group of numeric parameters -> default values, shape (k,).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, parameters: Mapping[str, FloatArray] | None = None) -> None:
         converter = SystemScalarConverter()
         converter._AddConstructor[AutoDiffXd, float](_AutoDiffSystem)
         super().__init__(converter)
+        self.parameter_groups = tuple(parameters or {})
+        for values in (parameters or {}).values():
+            self.DeclareNumericParameter(BasicVector(values))
 
     @cached_property
     def formulas(self) -> dict[str, Formula]:
@@ -129,6 +199,57 @@ class DifferentiableSystem(LeafSystem):
         return _AutoDiffSystem(self)
 
 
+class ParameterizedSystem(DifferentiableSystem):
+    """A LeafSystem whose numeric parameter 0 holds all parameters of a DaeSystem.
+
+    So a study changes numbers in a context without tracing again, and a controller can be given
+    other numbers than its plant.
+
+    Args:
+        dae: The system.
+        more: Name -> default values of further groups of numeric parameters.
+    """
+
+    def __init__(self, dae: DaeSystem, more: Mapping[str, FloatArray] | None = None) -> None:
+        super().__init__({"parameters": dae.parameter_values, **(more or {})})
+        self.dae = dae
+
+    def parameters(self, context: Context) -> FloatArray:
+        """All parameters in the order of `dae.parameters`, shape (k,)."""
+        return np.array(context.get_numeric_parameter(0).value())
+
+    def get_parameter(self, context: Context, name: str) -> FloatArray:
+        """A parameter by name, shape (k,).
+
+        Raises:
+            ModelError: No parameter has that name.
+        """
+        return self.parameters(context)[self.dae.parameter_slice(name)]
+
+    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
+        """Changes a parameter in a context.
+
+        Args:
+            context: Of this system.
+            name: As in `dae.parameters`.
+            value: Shape (k,), or a number for all entries.
+
+        Raises:
+            ModelError: No parameter has that name, or a value that does not fit.
+        """
+        values = context.get_numeric_parameter(0).CopyToVector()
+        place = self.dae.parameter_slice(name)
+        given = numbers(f"parameter '{name}'", value)
+        size = place.stop - place.start
+        if given.shape not in ((), (1,), (size,)):
+            raise ModelError(f"parameter '{name}' has {size} entries, got {value!r}")
+        values[place] = given
+        for parameter in self.dae.parameters:
+            if parameter.name == name:
+                parameter.check(values[place])
+        context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+
 class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
     """A DifferentiableSystem on AutoDiffXd."""
 
@@ -137,7 +258,8 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         self.set_name(original.get_name())
         formulas = original.formulas
         context = original.CreateDefaultContext()
-        for i in range(context.num_numeric_parameter_groups()):
+        self._groups = original.parameter_groups
+        for i in range(len(self._groups)):
             values = context.get_numeric_parameter(i).CopyToVector()
             self.DeclareNumericParameter(BasicVector_[AutoDiffXd](values))
         if context.num_continuous_states():
@@ -147,7 +269,7 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         tickets = {
             "time": self.time_ticket(),
             "state": self.xc_ticket(),
-            "parameters": self.all_parameters_ticket(),
+            **dict.fromkeys(self._groups, self.all_parameters_ticket()),
         }
         for i in range(original.num_input_ports()):
             port = original.get_input_port(i)
@@ -176,15 +298,13 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         output.SetFromVector(self._evaluate(formula, context))
 
     def _source(self, name: str, context: Context) -> Any:
-        match name:
-            case "time":
-                return np.array([context.get_time()])
-            case "state":
-                return context.get_continuous_state_vector().CopyToVector()
-            case "parameters":
-                return context.get_numeric_parameter(0).CopyToVector()
-            case _:
-                return self.GetInputPort(name).Eval(context)
+        if name == "time":
+            return np.array([context.get_time()])
+        if name == "state":
+            return context.get_continuous_state_vector().CopyToVector()
+        if name in self._groups:
+            return context.get_numeric_parameter(self._groups.index(name)).CopyToVector()
+        return self.GetInputPort(name).Eval(context)
 
     def _evaluate(self, formula: Formula, context: Context) -> Any:
         """The value with its gradient, by the chain rule; an array of AutoDiffXd."""
@@ -199,56 +319,3 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             slope = formula.slope(moving, time, *arguments)
             total = slope @ np.vstack([gradients[i] for i in moving])
         return InitializeAutoDiff(value, total).reshape(-1)
-
-
-class ParameterizedSystem(DifferentiableSystem):
-    """A LeafSystem whose numeric parameter 0 starts with all parameters of a DaeSystem.
-
-    So a study changes numbers in a context without tracing again, and a controller can be given
-    other numbers than its plant.
-
-    Args:
-        dae: The system.
-        values: The default: `dae.parameter_values`, and what else the system appends.
-    """
-
-    def __init__(self, dae: DaeSystem, values: FloatArray) -> None:
-        super().__init__()
-        self.dae = dae
-        self.DeclareNumericParameter(BasicVector(values))
-
-    def parameters(self, context: Context) -> FloatArray:
-        """All parameters in the order of `dae.parameters`, shape (k,)."""
-        values = context.get_numeric_parameter(0).value()
-        return np.array(values[: self.dae.parameter_values.size])
-
-    def get_parameter(self, context: Context, name: str) -> FloatArray:
-        """A parameter by name, shape (k,).
-
-        Raises:
-            ModelError: No parameter has that name.
-        """
-        return self.parameters(context)[self.dae.parameter_slice(name)]
-
-    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
-        """Changes a parameter in a context.
-
-        Args:
-            context: Of this system.
-            name: As in `dae.parameters`.
-            value: Shape (k,), or a number for all entries.
-
-        Raises:
-            ModelError: No parameter has that name, or a value that does not fit.
-        """
-        values = context.get_numeric_parameter(0).CopyToVector()
-        place = self.dae.parameter_slice(name)
-        try:
-            values[place] = np.asarray(value, dtype=float)
-        except ValueError:
-            size = place.stop - place.start
-            raise ModelError(f"parameter '{name}' has {size} entries, got {value!r}") from None
-        for parameter in self.dae.parameters:
-            if parameter.name == name:
-                parameter.check(values[place])
-        context.get_mutable_numeric_parameter(0).SetFromVector(values)

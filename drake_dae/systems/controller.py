@@ -2,21 +2,21 @@
 
 import warnings
 
-import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.zero_dynamics import Verdict, ZeroDynamics
-from drake_dae.errors import (
-    NonFiniteError,
-    NonMinimumPhaseWarning,
-    SimulationError,
-    SingularityError,
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import NonMinimumPhaseWarning
+from drake_dae.systems.block import (
+    Formula,
+    ParameterizedSystem,
+    TracedFormula,
+    evaluate_checked,
 )
-from drake_dae.systems.block import Formula, ParameterizedSystem, TracedFormula
-from drake_dae.trace.functions import SINGULAR_PIVOT
 
 
 class TrackingController(ParameterizedSystem):
@@ -31,8 +31,9 @@ class TrackingController(ParameterizedSystem):
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, shape (p,).
 
-    Both outputs feed through from all inputs. The context holds the model's parameters and then
-    the gains K (its nonzeros, column by column) as one numeric parameter. Converts to AutoDiffXd.
+    Both outputs feed through from all inputs. The context holds the model's parameters as numeric
+    parameter 0, and the gains as numeric parameter 1; see `set_parameter` and `set_gains`. Converts
+    to AutoDiffXd.
 
     Args:
         law: The law.
@@ -46,29 +47,39 @@ class TrackingController(ParameterizedSystem):
     """
 
     def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
-        super().__init__(law.system, law.parameter_values())
-        if law.structure.zero_dynamics_dimension:
-            dynamics = ZeroDynamics(law.structure)
-            stability = dynamics.stability(law.structure.states[0], outputs=outputs)
-            if stability.verdict is Verdict.UNSTABLE:
-                warnings.warn(
-                    f"{law.system.name}: {stability.reason}. The outputs follow the reference "
-                    "while other states, or the control, run off; choose other outputs",
-                    NonMinimumPhaseWarning,
-                    stacklevel=2,
-                )
+        super().__init__(law.system, {"gains": law.gain_vector()})
+        _warn_of_zero_dynamics(law, outputs)
         self.law = law
         self.set_name("tracking_controller")
         dae = law.system
-        sizes = {"estimated_state": dae.num_states, "reference": len(law.reference_signals)}
+        sizes = {"estimated_state": dae.num_states, "reference": law.layout.reference_size}
         if law.measured_force:
             sizes["measured_force"] = dae.num_constraints
+        self._signals = {
+            "state": dae.state_signals,
+            "reference": law.reference_signals,
+            "measured_force": dae.constraint_input_signals,
+        }
         self._input_ports = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         self.DeclareVectorOutputPort("control", dae.num_controls, self._calc_control, sources)
         self.DeclareVectorOutputPort(
             "tracking_error", dae.num_controls, self._calc_tracking_error, sources
         )
+
+    def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
+        """Changes the gains in a context.
+
+        Args:
+            context: Of this system.
+            gains: A design such as `poles(-8.0)`, or finished gains.
+
+        Raises:
+            GainError: Gains that do not fit, are not Hurwitz, or couple outputs that the law does
+                not.
+        """
+        values = self.law.gain_vector(gains)
+        context.get_mutable_numeric_parameter(1).SetFromVector(values)
 
     def _calc_control(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(context)[0])
@@ -77,38 +88,31 @@ class TrackingController(ParameterizedSystem):
         output.SetFromVector(self._evaluate(context)[1])
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
-        function = self.law.function
-        arguments = [port.Eval(context) for port in self._input_ports]
-        arguments.append(context.get_numeric_parameter(0).value())
-        values = function.evaluate(*arguments)
-        if function.is_finite and values[2][0] >= SINGULAR_PIVOT:
-            return values
-        raise self._failure(context.get_time(), *arguments)
-
-    def _failure(self, time: float, state: FloatArray, *others: FloatArray) -> SimulationError:
-        where = f"at t = {time:.6g} s, state {np.array2string(state, precision=4, separator=', ')}"
-        inputs = (state, *others[:-1])  # The last are the parameters.
-        bad = [
-            port.get_name()
-            for port, value in zip(self._input_ports, inputs, strict=True)
-            if not np.all(np.isfinite(value))
-        ]
-        if bad:
-            return NonFiniteError(
-                f"the controller's input {', '.join(bad)} is not finite {where}", time, state
-            )
-        return SingularityError(
-            f"A(x) or B(x) of Assumptions (2), (5) is singular {where}: the outputs "
-            f"{', '.join(s.name for s in self.law.system.output_signals)} cannot be steered "
-            "independently there. Keep the reference away from it, or choose other outputs",
-            time,
-            state,
+        inputs = [port.Eval(context) for port in self._input_ports]
+        gains, parameters = (context.get_numeric_parameter(i).value() for i in (1, 0))
+        arguments = (*inputs, gains, parameters)
+        return evaluate_checked(
+            self.law.function, context.get_time(), inputs[0], arguments, self._signals
         )
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function
         sources = ["estimated_state", *function.input_names[1:]]
         return {
-            name: TracedFormula(function, name, sources, self._failure)
+            name: TracedFormula(function, name, sources, self._signals)
             for name in ("control", "tracking_error")
         }
+
+
+def _warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:
+    if not law.structure.zero_dynamics_dimension:
+        return
+    dynamics = ZeroDynamics(law.system, structure=law.structure)
+    stability = dynamics.stability(law.structure.states[0], outputs=outputs)
+    if stability.verdict is Verdict.UNSTABLE:
+        warnings.warn(
+            f"{law.system.name}: {stability.reason}. The outputs follow the reference "
+            "while other states, or the control, run off; choose other outputs",
+            NonMinimumPhaseWarning,
+            stacklevel=3,
+        )

@@ -8,17 +8,9 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState, Val
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.structure import Structure, find_structure
-from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import (
-    InconsistentStateError,
-    ModelError,
-    NonFiniteError,
-    SimulationError,
-    SingularityError,
-)
-from drake_dae.systems.block import Formula, ParameterizedSystem
-from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
+from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
+from drake_dae.systems.block import Formula, ParameterizedSystem, evaluate_checked
+from drake_dae.trace.functions import TracedFunction
 
 
 class StateRealization(ParameterizedSystem):
@@ -50,55 +42,41 @@ class StateRealization(ParameterizedSystem):
     `Clone` of a context keeps it, `SetTimeStateAndParametersFrom` does not.
 
     Args:
-        normal_form: Of the system; or the system, or its structure, for a completion that is
-            chosen.
+        normal_form: The coordinates, `NormalForm(system)`.
 
     Raises:
-        AssumptionError: The system violates an assumption of the theory.
-        ModelError: The structure has no normal form.
+        ModelError: No normal form.
         SimulationError: During a simulation, with time and last state: there is no x, since the
             motion came to an end of the coordinates.
         SingularityError, NonFiniteError: During a simulation, with time and state.
     """
 
-    def __init__(self, normal_form: NormalForm | Structure | DaeSystem) -> None:
-        if not isinstance(normal_form, (NormalForm, Structure)):
-            check_is_system(normal_form, "StateRealization")
-            normal_form = find_structure(normal_form)
-        if isinstance(normal_form, Structure):
-            normal_form = NormalForm(normal_form)
-        structure = normal_form.structure
-        super().__init__(structure.system, structure.system.parameter_values)
+    def __init__(self, normal_form: NormalForm) -> None:
+        if not isinstance(normal_form, NormalForm):
+            raise ModelError(
+                f"StateRealization needs a NormalForm, got {type(normal_form).__name__}; make it "
+                "with NormalForm(system)"
+            )
+        structure, dae = normal_form.structure, normal_form.system
+        super().__init__(dae)
         self.normal_form = normal_form
-        self.set_name(self.dae.name)
-        dae, elimination, motion = self.dae, structure.elimination, structure.motion
-        x, u, p = dae.state, motion.control, dae.parameter_symbol
-        degrees = np.array(structure.output_degrees)
-        starts = np.cumsum(degrees) - degrees
-        self._chained, self._direct = np.flatnonzero(degrees), np.flatnonzero(degrees == 0)
-        self._heads = starts[self._chained]
-        self._ends = self._heads + degrees[self._chained] - 1
-        self._num_chained = int(degrees.sum())
+        self.set_name(dae.name)
+        self._layout = layout = structure.layout
         self._on_manifold = np.zeros(sum(structure.constraint_degrees))
-
-        def traced(name: str, needs_control: bool, value: ca.SX) -> TracedFunction:
-            inputs = {"state": x, "control": u, "parameters": p}
-            if not needs_control:
-                value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(dae.num_controls))
-            outputs = {"value": value, "pivot": elimination.pivot}
-            return TracedFunction(f"{dae.name} {name}", inputs, outputs)
-
-        highest = structure.drift + ca.mtimes(structure.control_matrix, u)
+        self._signals = {"state": dae.state_signals, "control": dae.control_signals}
+        elimination, derivatives = structure.elimination, structure.derivatives
+        highest = structure.drift + ca.mtimes(structure.control_matrix, derivatives.control)
         rate = ca.SX(0, 1)
         if normal_form.completion.numel():
-            rate = ca.jtimes(normal_form.completion, x, motion.expand(motion.rate))
-        rates = ca.vertcat(*[highest[int(i)] for i in self._chained], rate)
-        force = motion.expand(motion.constraint_input)
+            moving = derivatives.expand(derivatives.rate)
+            rate = ca.jtimes(normal_form.completion, dae.state, moving)
+        rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
+        force = derivatives.expand(derivatives.constraint_input)
         self._force_needs_control = elimination.beta.nnz() > 0
-        self._dynamics = traced("state realization", True, rates)
-        self._force = traced("constraint force", self._force_needs_control, force)
-        direct = ca.vertcat(ca.SX(0, 1), *[highest[int(i)] for i in self._direct])
-        self._output = traced("controlled output", True, direct)
+        self._dynamics = structure.trace("state realization", rates, True)
+        self._force = structure.trace("constraint force", force, self._force_needs_control)
+        direct = highest[layout.direct.tolist(), :]
+        self._output = structure.trace("controlled output", direct, True)
 
         start = structure.states[0]
         state_index = self.DeclareContinuousState(BasicVector(self._coordinates(start, None)))
@@ -123,7 +101,7 @@ class StateRealization(ParameterizedSystem):
             "controlled_output",
             dae.num_controls,
             self._calc_output,
-            by_control if self._direct.size else {self.xc_ticket()},
+            by_control if layout.direct.size else {self.xc_ticket()},
         )
 
     def state(self, context: Context) -> FloatArray:
@@ -137,8 +115,7 @@ class StateRealization(ParameterizedSystem):
             InconsistentStateError: The state is off N*; `manifold.project` finds one that is not.
             ModelError: A wrong shape.
         """
-        x = np.array(state, dtype=float)
-        p = self.parameters(context)
+        x, p = self.dae.state_vector(state), self.parameters(context)
         manifold = self.normal_form.structure.manifold
         if not manifold.is_consistent(x, p):
             residual = manifold.residual(x, p)
@@ -155,11 +132,11 @@ class StateRealization(ParameterizedSystem):
         entry.GetMutableValueOrThrow()[:] = x
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        rates = self._evaluate(self._dynamics, context, self._control_port.Eval(context))
+        rates = self._evaluate(self._dynamics, context, needs_control=True)
         coordinates = context.get_continuous_state_vector().CopyToVector()
         value = np.roll(coordinates, -1)
-        value[self._ends] = rates[: self._ends.size]
-        value[self._num_chained :] = rates[self._ends.size :]
+        value[self._layout.ends] = rates[: self._layout.ends.size]
+        value[self._layout.chain_size :] = rates[self._layout.ends.size :]
         derivatives.get_mutable_vector().SetFromVector(value)
 
     def _coordinates(self, state: FloatArray, parameters: FloatArray | None) -> FloatArray:
@@ -192,35 +169,11 @@ class StateRealization(ParameterizedSystem):
             ) from reason
 
     def _evaluate(
-        self, function: TracedFunction, context: Context, *control: FloatArray
+        self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
-        x = self._state_entry.Eval(context)
-        value, pivot = function.evaluate(x, *control, context.get_numeric_parameter(0).value())
-        if function.is_finite and pivot[0] >= SINGULAR_PIVOT:
-            return value
-        time = context.get_time()
-        where = f"at t = {time:.6g} s, state {show(x)}"
-        bad = [
-            signal.name
-            for values in control
-            for signal, value in zip(self.dae.control_signals, values, strict=True)
-            if not np.isfinite(value)
-        ]
-        if bad:
-            raise NonFiniteError(f"the input {', '.join(bad)} is not finite {where}", time, x)
-        if not function.is_finite:
-            raise NonFiniteError(
-                f"{function.name} is not finite {where}: a singular A(x), or a function left its "
-                "domain",
-                time,
-                x,
-            )
-        raise SingularityError(
-            f"A(x) of Assumption (2) is singular {where}: the constraints depend on each other "
-            "there, so their forces are not determined",
-            time,
-            x,
-        )
+        x, p = self._state_entry.Eval(context), context.get_numeric_parameter(0).value()
+        arguments = (x, self._control_port.Eval(context), p) if needs_control else (x, p)
+        return evaluate_checked(function, context.get_time(), x, arguments, self._signals)[0]
 
     def _formulas(self) -> dict[str, Formula]:
         raise ModelError(
@@ -232,14 +185,12 @@ class StateRealization(ParameterizedSystem):
         output.SetFromVector(self._state_entry.Eval(context))
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        control = [self._control_port.Eval(context)] if self._force_needs_control else []
-        output.SetFromVector(self._evaluate(self._force, context, *control))
+        output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
-        value = np.empty(self.dae.num_controls)
+        layout, value = self._layout, np.empty(self.dae.num_controls)
         coordinates = context.get_continuous_state_vector().CopyToVector()
-        value[self._chained] = coordinates[self._heads]
-        if self._direct.size:
-            control = self._control_port.Eval(context)
-            value[self._direct] = self._evaluate(self._output, context, control)
+        value[layout.dynamic] = coordinates[layout.heads]
+        if layout.direct.size:
+            value[layout.direct] = self._evaluate(self._output, context, needs_control=True)
         output.SetFromVector(value)

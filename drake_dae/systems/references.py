@@ -1,6 +1,7 @@
 """References as a LeafSystem, and Drake's trajectories as references."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -8,30 +9,32 @@ from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ReferenceSignal, stack_references
+from drake_dae.dae.references import Reference, stack_references
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems.block import DifferentiableSystem, Formula
 
 
-class TrajectorySignal:
-    """A Drake Trajectory, shape (k, 1), with the derivatives that it provides itself.
+@dataclass(frozen=True, eq=False)
+class TrajectoryReference(Reference):
+    """A Drake Trajectory, with the derivatives that it provides itself.
 
-    Args:
-        trajectory: Any column-valued Trajectory.
+    Attributes:
+        trajectory: Any column-valued Trajectory, shape (k, 1).
 
     Raises:
-        ReferenceSignalError: At preparation: no derivatives, or, for a PiecewisePolynomial, a
-            derivative below the highest one that jumps at a break. During a simulation: a time
-            outside the trajectory, which Drake would silently clip.
+        ReferenceSignalError: A Trajectory that is no column. At preparation: no derivatives, or,
+            for a PiecewisePolynomial, a derivative below the highest one that jumps at a break.
+            During a simulation: a time outside the trajectory, which Drake would silently clip.
     """
 
-    def __init__(self, trajectory: Trajectory) -> None:
-        if trajectory.cols() != 1:
+    trajectory: Trajectory
+
+    def __post_init__(self) -> None:
+        if self.trajectory.cols() != 1:
             raise ReferenceSignalError(
-                f"a reference Trajectory must be a column, this one is {trajectory.rows()} x "
-                f"{trajectory.cols()}"
+                "a reference Trajectory must be a column, this one is "
+                f"{self.trajectory.rows()} x {self.trajectory.cols()}"
             )
-        self.trajectory = trajectory
 
     @property
     def size(self) -> int:
@@ -94,32 +97,33 @@ class ReferenceGenerator(DifferentiableSystem):
             (sum (mu_i + 1),).
 
     Args:
-        signals: One below the other; together they cover all outputs.
+        references: One below the other; together they cover all outputs.
         degrees: mu_1, ..., mu_p, as `TrackingLaw.degrees`.
 
-    Converts to AutoDiffXd. A time that has derivatives itself asks each signal for one more.
+    Converts to AutoDiffXd. A time that has derivatives itself asks each reference for one more.
 
     Raises:
-        ReferenceSignalError: Signals that cover too few or too many outputs, or that are not
+        ReferenceSignalError: References that cover too few or too many outputs, or that are not
             smooth enough.
         NonFiniteError: During a simulation.
     """
 
-    def __init__(self, signals: Sequence[ReferenceSignal], degrees: Sequence[int]) -> None:
+    def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
         super().__init__()
         self.set_name("reference")
-        for index, signal in enumerate(signals):
-            if not (hasattr(signal, "size") and hasattr(signal, "derivatives")):
+        for index, reference in enumerate(references):
+            if not isinstance(reference, Reference):
                 raise ReferenceSignalError(
-                    f"references[{index}] must be a signal such as constant(0.3), got {signal!r}"
+                    f"references[{index}] must be a reference such as ConstantReference(0.3), got "
+                    f"{reference!r}"
                 )
-        covered = sum(signal.size for signal in signals)
+        covered = sum(reference.size for reference in references)
         if covered != len(degrees):
             raise ReferenceSignalError(
                 f"the references cover {covered} outputs, the law has {len(degrees)}"
             )
-        self._signals, self._degrees = tuple(signals), tuple(degrees)
-        self._evaluate = stack_references(signals, degrees)
+        self._references, self._degrees = tuple(references), tuple(degrees)
+        self._evaluate = stack_references(references, degrees)
         self.DeclareVectorOutputPort(
             "reference",
             sum(degree + 1 for degree in degrees),
@@ -135,24 +139,24 @@ class ReferenceGenerator(DifferentiableSystem):
         output.SetFromVector(self._evaluate(context.get_time()))
 
     def _formulas(self) -> dict[str, Formula]:
-        return {"reference": _ReferenceFormula(self._signals, self._degrees)}
+        return {"reference": _ReferenceFormula(self._references, self._degrees)}
 
 
 class _ReferenceFormula:
-    """R(t); its derivative by the time needs one more derivative of each signal."""
+    """R(t); its derivative by the time needs one more derivative of each reference."""
 
     sources = ("time",)
 
-    def __init__(self, signals: Sequence[ReferenceSignal], degrees: Sequence[int]) -> None:
-        self._evaluate = stack_references(signals, degrees)
-        self._signals, self._degrees = signals, degrees
+    def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
+        self._evaluate = stack_references(references, degrees)
+        self._references, self._degrees = references, degrees
 
     def value(self, time: float, *arguments: FloatArray) -> FloatArray:
         return self._evaluate(time).copy()
 
     @cached_property
     def _higher(self) -> Callable[[float], FloatArray]:
-        return stack_references(self._signals, [degree + 1 for degree in self._degrees])
+        return stack_references(self._references, [degree + 1 for degree in self._degrees])
 
     def slope(self, moving: tuple[int, ...], time: float, *arguments: FloatArray) -> FloatArray:
         ends = np.cumsum([degree + 2 for degree in self._degrees])

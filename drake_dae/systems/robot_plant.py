@@ -31,9 +31,9 @@ class RobotPlant(DaePlant):
     """
 
     def __init__(
-        self, model: RobotModel, structure: Structure | None = None, project: bool = True
+        self, model: RobotModel, *, structure: Structure | None = None, project: bool = True
     ) -> None:
-        super().__init__(structure or model.dae, project)
+        super().__init__(model.dae, structure=structure, project=project)
         self.model = model
         size = model.links.q.numel() + model.links.v.numel()
         parts = {"link_state": slice(0, size)}
@@ -51,11 +51,7 @@ class RobotPlant(DaePlant):
                 {self.xc_ticket()},
             )
         if model.joint_force is not None:
-            self._joint_force = TracedFunction(
-                "joint torque",
-                {"state": model.dae.state, "parameters": model.dae.parameter_symbol},
-                {"joint_torque": model.joint_force},
-            )
+            self._joint_force = model.dae.trace("joint torque", {"value": model.joint_force})
             self.DeclareVectorOutputPort(
                 "joint_torque",
                 model.joint_force.numel(),
@@ -74,7 +70,7 @@ class RobotPlant(DaePlant):
         formulas = super()._formulas()
         for name, part in self._parts.items():
             function = TracedFunction(name, {"state": state}, {"value": state[part]})
-            formulas[name] = TracedFormula(function, "value")
+            formulas[name] = TracedFormula(function)
         if self.model.joint_force is not None:
-            formulas["joint_torque"] = TracedFormula(self._joint_force, "joint_torque")
+            formulas["joint_torque"] = TracedFormula(self._joint_force)
         return formulas

@@ -149,6 +149,6 @@ class ForceSensor(DifferentiableSystem):
             measured = measured + self._deviation * noise
         output = TracedFunction("measured force", inputs, {"value": measured + self._bias})
         return {
-            "derivative": TracedFormula(rate, "value"),
-            "measured_force": TracedFormula(output, "value"),
+            "derivative": TracedFormula(rate),
+            "measured_force": TracedFormula(output),
         }

@@ -1,26 +1,46 @@
-"""Newton's method from a guess, damped, for equations that have to be solved now and then."""
+"""Newton's method from a guess, damped: the only one of the library."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray
 
+ROUND_OFF = 1e-12
+"""A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
+
+
+DEPENDENT = 1e-9
+"""Gradients of length one whose smallest singular value is below this depend on each other."""
+
 CONVERGED = 1e-8
 """A Newton step of this size, relative to the state, that does not get smaller is round-off."""
 
 
-PRECISION = 1e-15
+PRECISION = 1e-16
 """The error, relative to the state, that a search leaves."""
+
+ROUNDING = 1e-15
+"""After a Newton step of this size, relative to the state, only rounding is left."""
 
 
 LENGTHS = tuple(0.5**k for k in range(10))
 """The parts of a Newton step that are tried."""
 
 
-Linearization = tuple[Callable[[FloatArray], FloatArray], bool]
-"""x -> the Newton step from x by the matrix of another state; whether that matrix is regular."""
+class Linearization(NamedTuple):
+    """Equations linearized at an iterate.
+
+    Attributes:
+        step: x -> the Newton step from x by the matrix of the iterate, shape (n,).
+        is_regular: Whether that matrix is regular, so that a solution near it is isolated, or as
+            isolated as the equations are many.
+    """
+
+    step: Callable[[FloatArray], FloatArray]
+    is_regular: bool
 
 
 @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
@@ -47,6 +67,8 @@ def newton(
         step_from, regular = linearization
         step = step_from(x)
         size = np.linalg.norm(step / unit)
+        if size <= ROUNDING:
+            return x + step, regular
         for length in LENGTHS:
             trial = x + length * step
             following = step_from(trial)
@@ -82,17 +104,11 @@ def shortest_steps(
     q, r = scipy.linalg.qr(rows.T, mode="economic", check_finite=False)
     if len(rows) > len(q) or np.min(np.abs(np.diag(r)), initial=1.0) <= DEPENDENT:
         inverse = np.linalg.pinv(rows, DEPENDENT)
-        return lambda x: -inverse @ (residual(x) / length), False
+        return Linearization(lambda x: -inverse @ (residual(x) / length), False)
     solve = scipy.linalg.solve_triangular
-    return lambda x: -q @ solve(r, residual(x) / length, trans="T", check_finite=False), True
-
-
-ROUND_OFF = 1e-12
-"""A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
-
-
-DEPENDENT = 1e-9
-"""Gradients of length one whose smallest singular value is below this depend on each other."""
+    return Linearization(
+        lambda x: -q @ solve(r, residual(x) / length, trans="T", check_finite=False), True
+    )
 
 
 def are_dependent(gradients: FloatArray) -> bool:

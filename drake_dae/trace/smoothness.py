@@ -1,5 +1,7 @@
 """Whether an expression may be differentiated as often as the theory does."""
 
+from dataclasses import dataclass
+
 import casadi as ca
 import numpy as np
 
@@ -19,17 +21,44 @@ _KINKS = {
 """Operations of CasADi that are not smooth."""
 
 
-def flaw(expression: ca.SX, variable: ca.SX, other: ca.SX, name: str) -> str | None:
-    """A constant that is not finite, or an operation on a variable that is not smooth.
+@dataclass(frozen=True)
+class Flaw:
+    """What keeps an expression from being differentiated.
+
+    Attributes:
+        operation: One that is not smooth in the variable; empty if a constant is to blame.
+        constant: A constant that is not finite; 0 if the operation is to blame.
+    """
+
+    operation: str
+    constant: float = 0.0
+
+    def describe(self, variable: str) -> str:
+        """What to say of the expression, and what to write instead.
+
+        Args:
+            variable: How a message calls what the expression must be smooth in.
+        """
+        if self.operation:
+            return (
+                f"is not smooth: it takes {self.operation} of {variable}. Derivatives would be "
+                "those of one side without notice; write the one side that is needed, or a "
+                "smooth function such as tanh(x / e) or sqrt(x**2 + e**2)"
+            )
+        hint = "; math.sin of a symbol is nan, use casadi.sin" if np.isnan(self.constant) else ""
+        return f"holds a constant that is not finite, {self.constant}{hint}"
+
+
+def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> Flaw | None:
+    """Finds a constant that is not finite, or an operation on a variable that is not smooth.
 
     Args:
-        expression: Of the variable and of others.
+        expression: A function of the variable and of others.
         variable: Symbols, in which it shall be smooth.
         other: All other symbols, below each other.
-        name: Of the variable.
 
     Returns:
-        What to say of the expression; None if all is well.
+        The first flaw; None if there is none.
     """
     function = ca.Function("f", [variable, other], [expression])
     moving: dict[int, bool] = {}  # Whether what stands in a place of the work vector varies.
@@ -42,17 +71,12 @@ def flaw(expression: ca.SX, variable: ca.SX, other: ca.SX, name: str) -> str | N
         if operation == ca.OP_CONST:
             value = function.instruction_constant(i)
             if not np.isfinite(value):
-                hint = "; math.sin of a symbol is nan, use casadi.sin" if np.isnan(value) else ""
-                return f"holds a constant that is not finite, {value}{hint}"
+                return Flaw("", value)
         elif operation == ca.OP_INPUT:
             moves = inputs[0] == 0
         else:
             moves = any(moving[place] for place in inputs)
             if moves and operation in _KINKS:
-                return (
-                    f"is not smooth: it takes {_KINKS[operation]} of {name}. Derivatives would be "
-                    "those of one side without notice; write the one side that is needed, or a "
-                    "smooth function such as tanh(x / e) or sqrt(x**2 + e**2)"
-                )
+                return Flaw(_KINKS[operation])
         moving[function.instruction_output(i)[0]] = moves
     return None

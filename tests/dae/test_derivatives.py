@@ -1,9 +1,9 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS, Problem, changed
+from problems import PROBLEMS, changed
 
-from drake_dae.dae.derivatives import Motion
+from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem
@@ -12,19 +12,14 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative
 
 
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
-def motion_of(system: DaeSystem) -> Motion:
+def motion_of(system: DaeSystem) -> Derivatives:
     chains = []
     for i, degree in enumerate(find_structure(system).constraint_degrees):
         chain = system.k[i]
         for _ in range(degree - 1):
             chain = lie_derivative(chain, system.explicit.f, system.state)
         chains.append(chain)
-    return Motion(system, ca.vertcat(ca.SX(0, 1), *chains))
+    return Derivatives(system, ca.vertcat(ca.SX(0, 1), *chains))
 
 
 def test_derivatives_are_those_along_the_constrained_motion(problem):
@@ -203,7 +198,7 @@ def test_what_is_symmetric_at_the_default_parameters_alone_is_not_taken_as_symme
         nominal_state=[0.6, -0.8, 0.0, 0.0],
     )
     structure = find_structure(system)
-    motion = structure.motion
+    motion = structure.derivatives
     function = TracedFunction(
         "motion",
         {"x": x, "u": motion.control, "s": scale.symbol},

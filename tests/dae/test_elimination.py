@@ -1,16 +1,10 @@
 import casadi as ca
 import numpy as np
-import pytest
 from problems import PROBLEMS, Problem
 
 from drake_dae.dae.structure import find_structure
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along, lie_derivatives
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
 
 
 def states(problem: Problem) -> list[np.ndarray]:

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError
 
 
@@ -50,16 +50,16 @@ def test_a_star_stands_for_all_other_outputs():
 
 
 def test_coefficients_stand_lowest_derivative_first():
-    gains = coefficients([6.0, 5.0])(["a", "b"], [2, 2])
+    gains = gain_coefficients([6.0, 5.0])(["a", "b"], [2, 2])
     np.testing.assert_array_equal(gains.matrix, [[6, 5, 0, 0], [0, 0, 6, 5]])
     # s^2 + 5 s + 6 = (s + 2)(s + 3).
     np.testing.assert_allclose(sorted_poles(gains.poles), [-3, -3, -2, -2], rtol=1e-14)
-    single = coefficients({"a": [3.0], "c": 4.0})(["a", "b", "c"], [1, 0, 1])
+    single = gain_coefficients({"a": [3.0], "c": 4.0})(["a", "b", "c"], [1, 0, 1])
     np.testing.assert_array_equal(single.matrix, [[3, 0], [0, 0], [0, 4]])
 
 
 def test_error_matrix_is_the_companion_form():
-    gains = coefficients({"a": [1.0, 2.0, 3.0], "c": [4.0]})(["a", "b", "c"], [3, 0, 1])
+    gains = gain_coefficients({"a": [1.0, 2.0, 3.0], "c": [4.0]})(["a", "b", "c"], [3, 0, 1])
     np.testing.assert_array_equal(
         gains.error_matrix, [[0, 1, 0, 0], [0, 0, 1, 0], [-1, -2, -3, 0], [0, 0, 0, -4]]
     )
@@ -74,7 +74,7 @@ def test_matrices_couple_outputs_of_one_degree():
 
     The check stacks (e, e') and not (e_1, e_1', e_2, ...), as the library does.
     """
-    gains = matrices([LAMBDA_1, LAMBDA_2])(["a", "force", "b", "c"], [2, 0, 2, 2])
+    gains = gain_matrices([LAMBDA_1, LAMBDA_2])(["a", "force", "b", "c"], [2, 0, 2, 2])
     assert gains.matrix.shape == (4, 6)
     stacked = np.block([[np.zeros((3, 3)), np.eye(3)], [-LAMBDA_1, -LAMBDA_2]])
     np.testing.assert_allclose(
@@ -92,7 +92,7 @@ def test_matrices_couple_outputs_of_one_degree():
 
 
 def test_matrices_of_several_degrees_come_highest_first():
-    gains = matrices(
+    gains = gain_matrices(
         [np.diag([8.0, 27.0]), np.diag([12.0, 27.0]), np.diag([6.0, 9.0])],
         [[[2.0]]],
     )(["slow", "a", "b"], [1, 3, 3])
@@ -102,7 +102,7 @@ def test_matrices_of_several_degrees_come_highest_first():
 
 
 def test_1_by_1_matrices_may_be_numbers():
-    np.testing.assert_array_equal(matrices([4.0, [[5.0]]])(["z"], [2]).matrix, [[4.0, 5.0]])
+    np.testing.assert_array_equal(gain_matrices([4.0, [[5.0]]])(["z"], [2]).matrix, [[4.0, 5.0]])
 
 
 @pytest.mark.parametrize("degree", [1, 2, 4, 6])
@@ -198,11 +198,11 @@ NOT_HURWITZ = {
     "a zero pole": (poles(0.0), [1]),
     "one bad pole": (poles([-1.0, 0.5]), [2]),
     "an undamped pair": (poles([1j, -1j]), [2]),
-    "a missing gain": (coefficients([0.0, 1.0]), [2]),
-    "a negative gain": (coefficients([1.0, -1.0]), [2]),
+    "a missing gain": (gain_coefficients([0.0, 1.0]), [2]),
+    "a negative gain": (gain_coefficients([1.0, -1.0]), [2]),
     # s^3 + s^2 + s + 2 fails Routh's test although all coefficients are positive.
-    "positive coefficients": (coefficients([2.0, 1.0, 1.0]), [3]),
-    "a coupling": (matrices([[[1.0, 5.0], [5.0, 1.0]], np.eye(2)]), [2, 2]),
+    "positive coefficients": (gain_coefficients([2.0, 1.0, 1.0]), [3]),
+    "a coupling": (gain_matrices([[[1.0, 5.0], [5.0, 1.0]], np.eye(2)]), [2, 2]),
 }
 
 
@@ -227,19 +227,31 @@ REFUSED = {
     "an odd number of complex poles": (poles([-1 + 1j, -1 - 1j, -1 + 1j]), [3], "conjugate"),
     "NaN": (poles(np.nan), [2], "finite"),
     "text for poles": (poles("fast"), [2], "poles of output 'a' must be numbers, got 'fast'"),
-    "text for coefficients": (coefficients("ab"), [2], "coefficients of output 'a' must be real"),
-    "too few coefficients": (coefficients([1.0]), [2], r"takes 2 coefficients K_i1.*got 1"),
-    "coefficients in a matrix": (coefficients([[1.0, 2.0]]), [2], "takes 2 coefficients"),
-    "complex coefficients": (coefficients(np.array([1.0, 2.0j])), [2], "must be real numbers"),
-    "an infinite coefficient": (coefficients([1.0, np.inf]), [2], "finite"),
+    "text for coefficients": (
+        gain_coefficients("ab"),
+        [2],
+        "coefficients of output 'a' must be real",
+    ),
+    "too few coefficients": (gain_coefficients([1.0]), [2], r"takes 2 coefficients K_i1.*got 1"),
+    "coefficients in a matrix": (gain_coefficients([[1.0, 2.0]]), [2], "takes 2 coefficients"),
+    "complex coefficients": (gain_coefficients(np.array([1.0, 2.0j])), [2], "must be real numbers"),
+    "an infinite coefficient": (gain_coefficients([1.0, np.inf]), [2], "finite"),
     "unknown outputs": (poles({"b": -1.0}), [2], "unknown outputs: b; no gains for: a. Needed: a"),
-    "no outputs": (coefficients({}), [2], "no gains for: a"),
+    "no outputs": (gain_coefficients({}), [2], "no gains for: a"),
     "gains of an output met at once": (poles({"a": -1.0}), [0], "met at once and without gains: a"),
-    "too many groups": (matrices([1, 2], [3]), [2], "so 1 groups of matrices are needed, got 2"),
-    "a group too few": (matrices(), [2], r"degrees \[2\], so 1 groups.* got 0"),
-    "a matrix too few": (matrices([1.0]), [2], "degree 2 take 2 matrices, got 1"),
-    "a wrong matrix": (matrices([np.eye(2), 1.0]), [2], r"shape \(2, 2\), but a need \(1, 1\)"),
-    "text for a matrix": (matrices(["a", "b"]), [2], "a gain matrix must be real numbers"),
+    "too many groups": (
+        gain_matrices([1, 2], [3]),
+        [2],
+        "so 1 groups of matrices are needed, got 2",
+    ),
+    "a group too few": (gain_matrices(), [2], r"degrees \[2\], so 1 groups.* got 0"),
+    "a matrix too few": (gain_matrices([1.0]), [2], "degree 2 take 2 matrices, got 1"),
+    "a wrong matrix": (
+        gain_matrices([np.eye(2), 1.0]),
+        [2],
+        r"shape \(2, 2\), but a need \(1, 1\)",
+    ),
+    "text for a matrix": (gain_matrices(["a", "b"]), [2], "a gain matrix must be real numbers"),
 }
 
 

@@ -86,15 +86,6 @@ def test_small_projections_are_orthogonal():
         np.testing.assert_allclose(manifold.project((1 + offset) * point), point, atol=1e-15)
 
 
-def test_projection_converges_quadratically():
-    """10% off the circle: residuals 1e-1, 1e-2, 1e-5, 1e-10, 1e-20, so that five steps do."""
-    manifold = circle(radius=2.0)
-    state = manifold.project([2.2, 0.3], iterations=5)
-    assert np.hypot(*state) == pytest.approx(2.0, abs=1e-15)
-    with pytest.raises(InconsistentStateError, match="left after 2 Newton steps"):
-        manifold.project([2.2, 0.3], iterations=2)
-
-
 def test_projection_follows_the_parameters():
     manifold = circle(radius=2.0)
     assert np.hypot(*manifold.project([1.0, 1.0])) == pytest.approx(2.0, abs=1e-15)
@@ -115,9 +106,9 @@ def test_projection_takes_anything_like_a_state_and_changes_nothing():
 
 def test_wrong_sizes_are_refused():
     manifold = circle(radius=2.0)
-    with pytest.raises(ModelError, match="'state' has size 3, not 2"):
+    with pytest.raises(ModelError, match=r"a state has shape \(2,\), got \(3,\)"):
         manifold.project([1.0, 2.0, 3.0])
-    with pytest.raises(ModelError, match="'parameters' has size 2, not 1"):
+    with pytest.raises(ModelError, match=r"parameters must be finite and of shape \(1,\)"):
         manifold.project([1.0, 2.0], [1.0, 2.0])
     with pytest.raises(ModelError, match="'state' has size 1"):
         manifold.residual([1.0])

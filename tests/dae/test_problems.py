@@ -147,6 +147,7 @@ def test_linear_problems_by_matrices(name):
     assert len(invariant_zeros(a, longest)) == problem.zero_dynamics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_linear_systems_by_matrices(seed):
     """Degrees as built, index and zeros as the pencils have them, by the library and by SciPy."""
@@ -159,7 +160,7 @@ def test_linear_systems_by_matrices(seed):
     assert len(found) == structure.zero_dynamics_dimension == len(zeros)
     # What Rosenbrock's matrix and a basis change of condition 4 leave of 1e-16.
     np.testing.assert_allclose(found, zeros, rtol=1e-7, atol=1e-7)
-    dynamics = ZeroDynamics(structure)
+    dynamics = ZeroDynamics(structure.system, structure=structure)
     if len(zeros):
         values = np.sort_complex(dynamics.eigenvalues(np.zeros(system.num_states)))
         np.testing.assert_allclose(values, zeros, rtol=1e-7, atol=1e-7)
@@ -195,7 +196,7 @@ EIGENVALUES = {
 @pytest.mark.parametrize("name", EIGENVALUES)
 def test_zero_dynamics_have_the_eigenvalues_found_by_hand(name):
     problem = PROBLEMS[name]()
-    stability = ZeroDynamics(find_structure(problem.system)).stability()
+    stability = ZeroDynamics(problem.system).stability()
     expected = np.sort_complex(EIGENVALUES[name].astype(complex))
     np.testing.assert_allclose(np.sort_complex(stability.eigenvalues), expected, rtol=1e-7)
 
@@ -204,7 +205,7 @@ def test_zero_dynamics_have_the_eigenvalues_found_by_hand(name):
 def test_tanks_have_the_zeros_of_johansson(name):
     """At the equilibrium next to the nominal state, by his formula; and near his numbers."""
     problem, splits = PROBLEMS[name](), {"quadruple_tank": (0.70, 0.60)}.get(name, (0.43, 0.34))
-    stability = ZeroDynamics(find_structure(problem.system)).stability()
+    stability = ZeroDynamics(problem.system).stability()
     expected = np.sort(tank_eigenvalues(stability.state[2:], splits).real)
     np.testing.assert_allclose(np.sort(stability.eigenvalues.real), expected, rtol=1e-7)
     published = {"quadruple_tank": (-0.060, -0.018)}.get(name, (-0.057, 0.013))
@@ -220,13 +221,14 @@ def decided(request) -> Problem:
 
 
 def test_the_verdict_is_that_of_the_literature(decided):
-    verdict = ZeroDynamics(find_structure(decided.system)).stability().verdict
+    verdict = ZeroDynamics(decided.system).stability().verdict
     assert verdict is (Verdict.STABLE if decided.minimum_phase else Verdict.UNSTABLE)
 
 
 # ---- systems made from their normal form
 
 
+@pytest.mark.slow
 def test_hidden_normal_forms_are_of_all_kinds():
     """The property tests over them see every kind of degree and of output."""
     systems = [hidden_normal_form(seed) for seed in range(60)]
@@ -246,6 +248,7 @@ def test_hidden_normal_forms_are_of_all_kinds():
     assert len(felt) > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(30, 60))
 def test_hidden_normal_forms_are_found(seed):
     """As in test_structure.py, with other seeds."""

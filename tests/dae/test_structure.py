@@ -5,28 +5,23 @@ import numpy as np
 import pytest
 from problems import (
     PROBLEMS,
-    Problem,
     changed,
     double_integrator,
+    early_control,
     hidden_normal_form,
     in_other_units,
+    redundant,
+    system_of,
 )
 
-from drake_dae.dae import structure
+from drake_dae.dae import relative_degrees
+from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
-def system_of(n: int, **fields: Callable) -> DaeSystem:
-    return DaeSystem.from_functions(n, **{"name": "test", **fields})
+from drake_dae.trace.lie import lie_derivative
 
 
 def degrees(system: DaeSystem, **options) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -116,6 +111,7 @@ def test_spread_and_count():
             find_structure(system, spread=wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(30))
 def test_hidden_normal_forms_are_found(seed):
     """Systems of random degrees behind a diffeomorphism, a feedback, mixed inputs and orders."""
@@ -143,6 +139,7 @@ def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_units_do_not_matter(problem, seed):
     """Every state, input and output in its own unit, from 1e-4 to 1e4 of the original one.
@@ -323,19 +320,6 @@ def test_1_a_degree_that_is_lost_between_the_sampled_states():
     assert error.state[0] == pytest.approx(0.03, abs=1e-12)
 
 
-def redundant(k: Callable, **fields) -> DaeSystem:
-    """Two constraints k on the point x'' = v1 + v2, beside z'' = u + v2."""
-    base = {
-        "f": lambda x: [x[1], 0, x[3], 0],
-        "g": lambda x: [[0, 0], [1, 1], [0, 0], [0, 1]],
-        "h": lambda x: [0, 0, 0, 1],
-        "k": k,
-        "l": lambda x: x[2],
-        "m": lambda x: [[0, 0]],
-    }
-    return system_of(4, **{**base, **fields})
-
-
 @pytest.mark.parametrize(
     "k",
     [
@@ -351,7 +335,8 @@ def test_2_redundant_constraints(k):
     """Exactly, by a factor, on N* alone, by an identity, and but for round-off."""
     error = violation(redundant(k))
     assert error.assumption == 2
-    assert "A(x) of (2) loses rank: the constraints are redundant" in str(error)
+    assert "A(x) of (2) loses rank at x = " in str(error)
+    assert "The constraints are redundant" in str(error)
 
 
 def test_2_forces_that_do_not_act_independently():
@@ -395,7 +380,7 @@ def test_2_more_constraints_than_states():
         )
     )
     assert error.assumption == 2
-    assert "m = 2 constraints on n = 1 states" in str(error)
+    assert "m = 2 constraints are more than the states" in str(error)
 
 
 @pytest.mark.parametrize(
@@ -424,18 +409,7 @@ def test_2_no_force_keeps_the_constraint(k):
 
 
 def test_3_a_control_that_enters_before_the_force_does():
-    """x0' = x1 + u, x1' = v: u acts on k', v on k''."""
-    error = violation(
-        system_of(
-            3,
-            f=lambda x: [x[1], 0, 0],
-            g=lambda x: [0, 1, 0],
-            h=lambda x: [1, 0, 1],
-            k=lambda x: x[0],
-            l=lambda x: x[2],
-            m=lambda x: 0,
-        )
-    )
+    error = violation(early_control())
     assert error.assumption == 3
     assert "the control acts on derivative 1 of constraint 'y0', before any" in str(error)
     # At the same order it is allowed.
@@ -446,7 +420,7 @@ def test_4_a_degree_that_is_not_defined_at_the_nominal_state():
     error = violation(double_integrator(l=lambda x: x[0] + x[1] ** 2))
     assert error.assumption == 4
     assert "output 'z0' is not defined at x = [0., 0.]" in str(error)
-    assert "acts on its derivative 1 in the neighbourhood" in str(error)
+    assert "acts on its derivative 1 around this state" in str(error)
     # An output that is met at once nearly everywhere.
     tension = PROBLEMS["pendulum_tension"]().system
     error = violation(changed(tension, nominal_state=[0.0, -0.8, 0.0, 0.0]))
@@ -476,7 +450,7 @@ def test_5_outputs_that_repeat():
     ):
         error = violation(changed(system, l=ca.vertcat(*one_more[:row], output), m=no_force))
         assert error.assumption == 5
-        assert "B(x) of (16) is singular: the controlled outputs v1, q3, v2, q4" in str(error)
+        assert "the controlled outputs v1, q3, v2, q4 cannot be steered" in str(error)
     for output in (q[0], 3 * q[0] + q[1], q[0] ** 2, (q[0] - 1) * q[2], q[4], ca.SX(0), ca.SX(7)):
         error = violation(changed(system, l=ca.vertcat(*one_more[:3], output), m=no_force))
         assert error.assumption == 5
@@ -506,8 +480,8 @@ def derivatives_taken(monkeypatch) -> list[int]:
 
         return count
 
-    monkeypatch.setattr(structure.Motion, "derivative", counted(structure.Motion.derivative))
-    monkeypatch.setattr(structure, "lie_derivative", counted(structure.lie_derivative))
+    monkeypatch.setattr(Derivatives, "derivative", counted(Derivatives.derivative))
+    monkeypatch.setattr(relative_degrees, "lie_derivative", counted(lie_derivative))
     return taken
 
 
@@ -598,7 +572,7 @@ def test_2_redundant_constraints_that_fill_the_state():
         )
     )
     assert error.assumption == 2
-    assert "repeat each other or fill the state (n = 3)" in str(error)
+    assert "repeat each other or fill the state" in str(error)
 
 
 def test_5_a_b_that_is_singular_between_the_sampled_states():
@@ -615,6 +589,7 @@ def test_5_a_b_that_is_singular_between_the_sampled_states():
     assert error.state[2] == pytest.approx(0.02, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 15, 40, 46])
 def test_5_a_singular_b_hidden_in_a_random_system(seed):
     """In place of a second output of degree mu >= 1, a function of the first one and of k."""
@@ -658,7 +633,7 @@ def test_the_structure_of_a_singular_b_is_complete():
     with pytest.raises(AssumptionError, match=r"B\(x\) of \(16\) is singular") as caught:
         find_structure(unicycle)
     assert str(caught.value) == str(violation)
-    assert caught.value.system is unicycle
+    assert caught.value.violation.names == tuple(signal.name for signal in unicycle.output_signals)
 
 
 def test_a_vanishing_row_of_b():

@@ -124,9 +124,9 @@ def test_parameters_are_found_by_name():
         slice(3, 4),
     ]
     assert evaluated(system, "f", np.zeros(2))[1, 0] == 6.0
-    with pytest.raises(ModelError, match=r"no parameter 'mass'; it has a, b, c"):
+    with pytest.raises(ModelError, match=r"no parameter 'mass'; there are a, b, c"):
         system.parameter_slice("mass")
-    with pytest.raises(ModelError, match="it has none"):
+    with pytest.raises(ModelError, match="there are none"):
         double_integrator().parameter_slice("mass")
 
 
@@ -382,10 +382,10 @@ def test_states_must_be_a_column_of_different_symbols():
 @pytest.mark.parametrize(
     ("nominal", "message"),
     [
-        ([1.0, 2.0, 3.0], r"finite with shape \(2,\)"),
-        ([[1.0, 2.0]], r"finite with shape \(2,\)"),
-        (0.0, r"finite with shape \(2,\)"),
-        ([1.0, np.nan], r"finite with shape \(2,\)"),
+        ([1.0, 2.0, 3.0], r"finite and of shape \(2,\)"),
+        ([[1.0, 2.0]], r"finite and of shape \(2,\)"),
+        (0.0, r"finite and of shape \(2,\)"),
+        ([1.0, np.nan], r"finite and of shape \(2,\)"),
         (np.array([1.0, 2.0j]), "nominal_state must be real numbers"),
         ("up", "nominal_state must be real numbers, got 'up'"),
     ],

@@ -16,17 +16,12 @@ from problems import (
     wanted_outputs,
 )
 
-from drake_dae.dae.gains import FeedbackGains, coefficients, matrices, poles
+from drake_dae.dae.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import GainError, ModelError
-
-
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
 
 
 def starts(problem: Problem) -> np.ndarray:
@@ -71,7 +66,7 @@ LAMBDA_2 = np.array([[11.0, 2.0], [-1.0, 9.0]])
 def test_full_gain_matrices():
     """e'' + Lambda_2 e' + Lambda_1 e = 0 (60), against a matrix exponential made here."""
     problem = PROBLEMS["gantry"]()
-    law = TrackingLaw(problem.system, matrices([LAMBDA_1, LAMBDA_2]))
+    law = TrackingLaw(problem.system, gain_matrices([LAMBDA_1, LAMBDA_2]))
     start = problem.consistent(np.random.default_rng(4))
     times = np.linspace(0.0, 1.0, 6)
     outputs, _ = closed_loop_outputs(problem, law, start, times)
@@ -140,13 +135,13 @@ def test_the_reference_is_output_major():
 
 def test_control_by_hand():
     """Cart: u = m (r'' - K_2 (x' - r') - K_1 (x - r)) + c x'."""
-    law = TrackingLaw(PROBLEMS["cart"]().system, coefficients([6.0, 5.0]))
+    law = TrackingLaw(PROBLEMS["cart"]().system, gain_coefficients([6.0, 5.0]))
     x, r = np.array([2.0, -1.0]), np.array([1.5, 0.5, 3.0])
     expected = 4.0 * (3.0 - 5.0 * (-1.0 - 0.5) - 6.0 * (2.0 - 1.5)) + 0.3 * -1.0
     # Three operations.
     assert law.control(x, r) == pytest.approx([expected], rel=1e-15)
     assert law.error_coordinates(x, r) == pytest.approx([0.5, -1.5], rel=1e-15)
-    error = law.function(x, r, law.parameter_values())[1]
+    error = law.function(x, r, law.gain_vector(), law.system.parameter_values)[1]
     assert error == pytest.approx([0.5], rel=1e-15)
 
 
@@ -155,7 +150,8 @@ def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
     law = TrackingLaw(problem.system, poles(-3.0))
     state = problem.consistent(np.random.default_rng(5))
     reference = reference_at(problem, 0.2)
-    control, error, pivot = law.function(state, reference, law.parameter_values())
+    gains, parameters = law.gain_vector(), problem.system.parameter_values
+    control, error = law.function(state, reference, gains, parameters)
     closed_form = problem.known(state)
     for i, degree in enumerate(problem.output_degrees):
         if degree == 0:
@@ -163,7 +159,7 @@ def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
             output = closed_form.drift[i] + closed_form.control_matrix[i] @ control
             assert output == pytest.approx(reference[starts(problem)[i]], abs=1e-12)
             assert abs(error[i]) < 1e-12
-    assert 0.0 < pivot[0] <= 1.0 + 1e-15
+    assert 0.0 < law.function.pivot <= 1.0 + 1e-15
 
 
 def test_changed_parameters_need_no_new_trace():
@@ -178,7 +174,7 @@ def test_changed_parameters_need_no_new_trace():
         radius_rate = np.array([state[0], state[2]]) - reference[:2]
         wanted = reference[2] - np.array([9.0, 6.0]) @ radius_rate
         expected = (wanted - closed_form.drift[0]) / closed_form.control_matrix[0, 0]
-        found = law.control(state, reference, [mass, length, gravity])
+        found = law.control(state, reference, parameters=[mass, length, gravity])
         # Twenty operations.
         assert found == pytest.approx([expected], rel=1e-13)
         assert law.control(state, reference) != pytest.approx([expected], rel=1e-3)
@@ -186,17 +182,17 @@ def test_changed_parameters_need_no_new_trace():
 
 
 def test_gains_are_parameters_of_the_traced_law():
-    """The last numbers are the gains that are not zero: a study changes them without tracing."""
+    """They are those that are not zero: a study changes them without tracing."""
     system = PROBLEMS["gantry"]().system
-    first = matrices([np.diag([2.0, 3.0]), LAMBDA_2])
-    second = matrices([np.diag([5.0, 7.0]), 2 * LAMBDA_2])
+    first = gain_matrices([np.diag([2.0, 3.0]), LAMBDA_2])
+    second = gain_matrices([np.diag([5.0, 7.0]), 2 * LAMBDA_2])
     law = TrackingLaw(system, first)
-    changed = TrackingLaw(system, second, law.structure)
+    changed = TrackingLaw(system, second, structure=law.structure)
     # The diagonals of Lambda_1 and all of Lambda_2.
-    assert law.parameter_values().shape == (2 + 4,)
+    assert law.gain_vector().shape == (2 + 4,)
     state, reference = np.linspace(0.5, 1.2, 8), np.linspace(-1.0, 1.0, 8)
     np.testing.assert_array_equal(
-        law.function(state, reference, changed.parameter_values())[0],
+        law.function(state, reference, law.gain_vector(second), system.parameter_values)[0],
         changed.control(state, reference),
     )
 
@@ -206,8 +202,8 @@ def test_a_singular_b_shows_in_the_pivot():
     law = TrackingLaw(problem.system, poles(-3.0))
     state = problem.consistent(np.random.default_rng(0))
     state[5] = 0.0  # The heading rate, without which the thrust does not act on the force.
-    pivot = law.function(state, reference_at(problem, 0.0), law.parameter_values())[2]
-    assert pivot[0] < 1e-15
+    law.control(state, reference_at(problem, 0.0))
+    assert law.function.pivot < 1e-15
 
 
 def test_a_singular_a_shows_in_the_pivot():
@@ -229,10 +225,8 @@ def test_a_singular_a_shows_in_the_pivot():
     reference = np.array([10.0, 0.0, 20.0, 0.0])
     # A holds the products of the normals: its pivot is sin(a)^2, that of B only sin(a).
     for value in (1.0, 1e-3, 1e-7):
-        values = law.parameter_values()
-        values[0] = value
-        pivot = law.function(np.zeros(6), reference, values)[2]
-        assert pivot[0] == pytest.approx(np.sin(value) ** 2, rel=0.05)
+        law.control(np.zeros(6), reference, parameters=[value])
+        assert law.function.pivot == pytest.approx(np.sin(value) ** 2, rel=0.05)
 
 
 def test_wrong_arguments_are_refused():
@@ -241,8 +235,8 @@ def test_wrong_arguments_are_refused():
         law.control([1, 2, 3], [0, 0, 0])
     with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
         law.control([1, 2], [0, 0])
-    with pytest.raises(ModelError, match="'parameters' has size"):
-        law.control([1, 2], [0, 0, 0], [1.0])
+    with pytest.raises(ModelError, match="parameters must be finite and of shape"):
+        law.control([1, 2], [0, 0, 0], parameters=[1.0])
     with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
         law.error_coordinates([1, 2], [0, 0])
 
@@ -265,9 +259,9 @@ def test_gains_must_be_those_of_the_system():
 def test_the_structure_must_be_that_of_the_system():
     system, other = double_integrator(), double_integrator(name="another")
     structure = find_structure(system)
-    assert TrackingLaw(system, poles(-1.0), structure).structure is structure
-    with pytest.raises(ModelError, match="structure is that of another system, another"):
-        TrackingLaw(system, poles(-1.0), find_structure(other))
+    assert TrackingLaw(system, poles(-1.0), structure=structure).structure is structure
+    with pytest.raises(ModelError, match="structure is that of another system, 'another'"):
+        TrackingLaw(system, poles(-1.0), structure=find_structure(other))
 
 
 def test_measured_force_replaces_nothing_when_the_model_is_right():
@@ -275,7 +269,7 @@ def test_measured_force_replaces_nothing_when_the_model_is_right():
     problem = PROBLEMS["two_link_arm"]()
     plain = TrackingLaw(problem.system, poles(-3.0))
     measured = TrackingLaw(
-        problem.system, poles(-3.0), plain.structure, measured_force=True, force_gain=4.0
+        problem.system, poles(-3.0), structure=plain.structure, measured_force=True, force_gain=4.0
     )
     state = problem.consistent(np.random.default_rng(0))
     reference = reference_at(problem, 0.3)
@@ -299,7 +293,9 @@ def test_measured_force_takes_the_place_of_the_models():
     """(71): an output v1 of degree 1 is fed back from the measurement, its gain acts on v1 - r."""
     problem = PROBLEMS["mixed_degrees"]()
     plain = TrackingLaw(problem.system, poles(-3.0))
-    measured = TrackingLaw(problem.system, poles(-3.0), plain.structure, measured_force=True)
+    measured = TrackingLaw(
+        problem.system, poles(-3.0), structure=plain.structure, measured_force=True
+    )
     state = problem.consistent(np.random.default_rng(0))
     reference, closed_form = reference_at(problem, 0.3), problem.known(state)
     force = closed_form.alpha  # beta u does not act on v1.

@@ -22,7 +22,7 @@ from problems import (
 from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pinned_motion as module
-from drake_dae import DaePlant, ExpressionSignal, analyze, constant, make_closed_loop
+from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
 from drake_dae.dae.gains import poles
 from drake_dae.dae.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
@@ -40,13 +40,8 @@ from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
 Array = np.ndarray
 
 
-@pytest.fixture(params=PROBLEMS)
-def problem(request) -> Problem:
-    return PROBLEMS[request.param]()
-
-
 def zero_dynamics(system: DaeSystem) -> ZeroDynamics:
-    return ZeroDynamics(find_structure(system))
+    return ZeroDynamics(system)
 
 
 def derivatives(function: Callable[[ca.SX], list], degrees: tuple[int, ...]):
@@ -67,7 +62,7 @@ def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, P
     dynamics = zero_dynamics(problem.system)
     start = problem.consistent(np.random.default_rng(3))
     motion = dynamics.motion(lambda t: reference_at(problem, t), times, start)
-    assert (motion.failure, motion.failure_time) == ("", None)
+    assert motion.ending is None
     np.testing.assert_array_equal(motion.times, times)
     return dynamics, times, motion
 
@@ -286,6 +281,7 @@ def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
         np.testing.assert_allclose(el[:, 0] + em @ force, wanted, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     """The law (28) without an initial error moves the same way; integrated by DOP853."""
     _, times, motion = following(problem)
@@ -329,7 +325,7 @@ def test_a_state_on_the_reference_from_a_guess_off_it(problem):
     guess = problem.consistent(np.random.default_rng(3)) + 0.01
     reference = reference_at(problem, 0.0)
     state = dynamics.state(reference, guess)
-    law = TrackingLaw(problem.system, poles(-3.0), dynamics.structure)
+    law = TrackingLaw(problem.system, poles(-3.0), structure=dynamics.structure)
     # Newton's method ends at the round-off of numbers of order 10.
     np.testing.assert_allclose(problem.derivatives(state), 0.0, atol=1e-13)
     np.testing.assert_allclose(law.error_coordinates(state, reference), 0.0, atol=1e-12)
@@ -344,7 +340,7 @@ def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
     reference = derivatives(lambda t: [0.3 * ca.cos(2.0 * t)], (2,))
     times = np.linspace(0.0, 2.0, 21)
     motion = zero_dynamics(system).motion(reference, times)
-    assert motion.failure == ""
+    assert motion.ending is None
 
     def angle_rate(t, a):
         pushed = GRAVITY * np.sin(a[0]) - reference(t)[2] * np.cos(a[0])
@@ -359,12 +355,13 @@ def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
     np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 @pytest.mark.parametrize("kind", ["flexible", "damped", "motor"])
 def test_motions_of_robots_agree_with_multibody_plant(name, kind):
     """x' by differences of the states, and lambda, against MultibodyPlant with the same control."""
     robot = actuated(name, kind)
-    dynamics = ZeroDynamics(robot.structure)
+    dynamics = ZeroDynamics(robot.structure.system, structure=robot.structure)
     degrees = robot.structure.output_degrees
     rest, _ = at_rest(name, kind, start_position(name), 20.0)
 
@@ -375,7 +372,7 @@ def test_motions_of_robots_agree_with_multibody_plant(name, kind):
     step = 1e-3
     times = 1.0 + step * np.arange(-4, 5)
     motion = dynamics.motion(derivatives(function, degrees), [0.0, *times], rest)
-    assert motion.failure == ""
+    assert motion.ending is None
     states = motion.states[1:]
     weights = np.array([3, -32, 168, -672, 0, 672, -168, 32, -3]) / (840.0 * step)
     slope = weights @ states
@@ -394,9 +391,9 @@ def test_a_reference_out_of_reach_ends_the_motion_where_the_arm_is_straight():
     times = np.linspace(0.0, 3.0, 31)
     reference = derivatives(lambda t: [(1.2 + 0.3 * t) * d for d in direction], (2, 2))
     motion = dynamics.motion(reference, times)
-    assert "the reference leaves what the system can reach at t = 2 s: B(x) " in motion.failure
+    assert "the reference leaves what the system can reach at t = 2 s: B(x) " in str(motion.ending)
     # A step below a millionth of the grid's ends the search: twice that is not tried any more.
-    assert motion.failure_time == pytest.approx(2.0, abs=2e-6 * 0.1)
+    assert motion.ending.time == pytest.approx(2.0, abs=2e-6 * 0.1)
     np.testing.assert_allclose(motion.times, times[times < 2.0 - 1e-9])
     # B is the Jacobian of the tip: its determinant is l1 l2 sin q2, its size that of its entries.
     elbow = np.arccos((np.square(1.2 + 0.3 * motion.times) - 1.0 - 0.64) / 1.6)
@@ -433,10 +430,10 @@ def test_a_singular_arm_on_the_way():
     dynamics = zero_dynamics(free_arm())
     reference = derivatives(lambda t: [1.8 - 0.3 * (t - 1.0) ** 2, 0], (2, 2))
     motion = dynamics.motion(reference, np.linspace(0.0, 2.0, 11), [-0.5, 1.0, 0.0, 0.0])
-    assert re.search(r"at t = .* s B\(x\) becomes singular", motion.failure)
-    assert "the control would be unbounded" in motion.failure
+    assert re.search(r"at t = .* s B\(x\) becomes singular", str(motion.ending))
+    assert "the control would be unbounded" in str(motion.ending)
     # Up to where Newton's method cannot tell the two elbows from each other.
-    assert motion.failure_time == pytest.approx(1.0, abs=1e-5)
+    assert motion.ending.time == pytest.approx(1.0, abs=1e-5)
 
 
 def test_a_singular_b_under_running_zero_dynamics():
@@ -451,8 +448,8 @@ def test_a_singular_b_under_running_zero_dynamics():
     )
     times = np.linspace(0.0, 2.1, 8)  # 1 is not among them, and a step may pass it.
     motion = zero_dynamics(system).motion(derivatives(lambda t: [ca.sin(t)], (1,)), times)
-    assert "at t = 1 s B(x) becomes singular" in motion.failure
-    assert motion.failure_time == pytest.approx(1.0, abs=1e-6)
+    assert "at t = 1 s B(x) becomes singular" in str(motion.ending)
+    assert motion.ending.time == pytest.approx(1.0, abs=1e-6)
     np.testing.assert_allclose(motion.control_margins, 1.0 - motion.times, atol=1e-12)
     np.testing.assert_allclose(motion.controls[:, 0], np.cos(motion.times) / (1 - motion.times))
 
@@ -462,13 +459,15 @@ def test_unstable_zero_dynamics_end_the_motion_in_growth():
     still = derivatives(lambda t: [0], (1,))
     times = np.linspace(0.0, 30.0, 31)
     slow = zero_dynamics(internal(lambda s, z: s)).motion(still, times)
-    assert "the internal states grow without bound while the outputs follow: s = " in slow.failure
+    assert "the internal states grow without bound while the outputs follow: s = " in str(
+        slow.ending
+    )
     assert slow.times[-1] == pytest.approx(np.floor(8.0 * np.log(10.0)))
     # 1e-8 a step, 500 steps.
     np.testing.assert_allclose(slow.states[:, 1], np.exp(slow.times), rtol=5e-6)
     fast = zero_dynamics(internal(lambda s, z: s**2)).motion(still, np.linspace(0.0, 2.0, 21))
-    assert "grow without bound" in fast.failure
-    assert fast.failure_time == pytest.approx(1.0, abs=1e-5)
+    assert "grow without bound" in str(fast.ending)
+    assert fast.ending.time == pytest.approx(1.0, abs=1e-5)
     np.testing.assert_allclose(fast.states[:, 1], 1 / (1 - fast.times), rtol=1e-6)
 
 
@@ -477,11 +476,12 @@ def test_stiff_zero_dynamics_take_few_steps(monkeypatch):
     monkeypatch.setattr(module, "STEPS", 200)
     dynamics = zero_dynamics(internal(lambda s, z: 1e6 * (z - s)))
     motion = dynamics.motion(derivatives(lambda t: [ca.sin(t)], (1,)), [0.0, 5.0, 10.0])
-    assert motion.failure == ""
+    assert motion.ending is None
     # s lags behind z = sin t by 1e-6 s.
     np.testing.assert_allclose(motion.states[1:, 1], np.sin(motion.times[1:] - 1e-6), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_long_motion_does_not_drift(monkeypatch):
     """With errors of 1e-3 a step: outputs and rod to round-off, and the angle to a few steps."""
     monkeypatch.setattr(module, "TOLERANCE", 1e-3)
@@ -489,7 +489,7 @@ def test_a_long_motion_does_not_drift(monkeypatch):
     times = np.linspace(0.0, 200.0, 11)
     dynamics = zero_dynamics(cart_pendulum(damping=1.0, angle=np.pi))
     motion = dynamics.motion(reference, times)
-    assert motion.failure == ""
+    assert motion.ending is None
     np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
     rod = motion.states[:, 1:3] - motion.states[:, :1] * [1.0, 0.0]
     np.testing.assert_allclose(np.hypot(*rod.T), 0.7, atol=1e-11)
@@ -521,7 +521,7 @@ def test_long_chains_do_not_drift_away(monkeypatch):
     )
     times = np.linspace(0.0, 750.0, 4)
     motion = zero_dynamics(system).motion(derivatives(lambda t: [ca.sin(t)], (4,)), times)
-    assert motion.failure == ""
+    assert motion.ending is None
     expected = (np.sin(times) - np.cos(times)) / 2.0
     # A few steps of 1e-3; older ones are forgotten.
     np.testing.assert_allclose(motion.states[:, 4], expected, rtol=0, atol=5e-3)
@@ -533,8 +533,8 @@ def test_the_work_is_bounded(monkeypatch):
     motion = zero_dynamics(system).motion(
         derivatives(lambda t: [0], (2,)), [0.0, 1000.0], [0.0, 1.0, 0.0, 0.0]
     )
-    assert "after 50 steps the motion is at t = " in motion.failure
-    assert 0.0 < motion.failure_time < 1000.0
+    assert "after 50 steps the motion is at t = " in str(motion.ending)
+    assert 0.0 < motion.ending.time < 1000.0
 
 
 def test_motions_end_where_domain_and_reference_do():
@@ -548,22 +548,22 @@ def test_motions_end_where_domain_and_reference_do():
     )
     dynamics, times = zero_dynamics(tank), np.linspace(0.0, 2.0, 21)
     motion = dynamics.motion(derivatives(lambda t: [1 - 1.003 * t], (1,)), times)
-    assert "no state that continues the motion is found beyond t = 0.997" in motion.failure
-    assert motion.failure_time == pytest.approx(1 / 1.003, abs=1e-6)
+    assert "no state that continues the motion is found beyond t = 0.997" in str(motion.ending)
+    assert motion.ending.time == pytest.approx(1 / 1.003, abs=1e-6)
     assert motion.times.size == 10
 
     def jumping(t: float) -> Array:
         return np.array([1.0 if t < 0.55 else 3.0, 0.0])
 
     motion = dynamics.motion(jumping, times)
-    assert "the reference jumps" in motion.failure
-    assert motion.failure_time == pytest.approx(0.55, abs=1e-6)
+    assert "the reference jumps" in str(motion.ending)
+    assert motion.ending.time == pytest.approx(0.55, abs=1e-6)
 
     def short(t: float) -> Array:
         return np.array([1.0, 0.0]) if t <= 1.0 else np.array([np.nan, 0.0])
 
     motion = dynamics.motion(short, times)
-    assert "the reference is not finite at t = 1.1 s" in motion.failure
+    assert "the reference is not finite at t = 1.1 s" in str(motion.ending)
     assert motion.times[-1] == 1.0
 
     def raising(t: float) -> Array:
@@ -571,13 +571,13 @@ def test_motions_end_where_domain_and_reference_do():
             raise NonFiniteError("reference: over", t, [0.0])
         return np.array([1.0, 0.0])
 
-    assert dynamics.motion(raising, times).failure == "reference: over"
+    assert str(dynamics.motion(raising, times).ending) == "reference: over"
 
     # Upper tanks that run dry: the domain ends inside the integrator.
     tanks = zero_dynamics(quadruple_tank(**MINIMUM_PHASE))
     lowered = derivatives(lambda t: [12.4 - 0.5 * t, 12.7 - 0.5 * t], (1, 1))
     motion = tanks.motion(lowered, np.linspace(0.0, 20.0, 41))
-    assert "the domain of the system ends" in motion.failure
+    assert "the domain of the system ends" in str(motion.ending)
     assert 0 < motion.times.size < 41
     assert np.min(motion.states) > 0.0
 
@@ -585,9 +585,9 @@ def test_motions_end_where_domain_and_reference_do():
 def test_a_motion_that_has_no_start_is_empty():
     dynamics = zero_dynamics(free_arm())
     motion = dynamics.motion(lambda t: np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), [0.5, 1.0])
-    assert "the outputs x = 2, y = 0 are not reached" in motion.failure
-    assert "(t = 0.5 s)" in motion.failure
-    assert motion.failure_time == 0.5
+    assert "the outputs x = 2, y = 0 are not reached" in str(motion.ending)
+    assert "(t = 0.5 s)" in str(motion.ending)
+    assert motion.ending.time == 0.5
     assert motion.states.shape == (0, 4)
     assert motion.controls.shape == (0, 2)
     assert motion.constraint_inputs.shape == (0, 0)
@@ -596,7 +596,7 @@ def test_a_motion_that_has_no_start_is_empty():
 
 def test_a_motion_may_be_one_state():
     motion = zero_dynamics(aircraft()).motion(lambda t: np.zeros(6), [2.0])
-    assert motion.failure == ""
+    assert motion.ending is None
     np.testing.assert_allclose(motion.states, np.zeros((1, 6)), atol=1e-15)
 
 
@@ -630,17 +630,17 @@ def test_wrong_arguments_are_refused():
         dynamics.motion(lambda t: still, [0.0, np.inf])
     with pytest.raises(ModelError, match=r"reference must have size 6 .* \(2, 2\).*got 2"):
         dynamics.motion(lambda t: still[:2], [0.0, 1.0])
-    with pytest.raises(ModelError, match="reference must have size 6, got 2"):
+    with pytest.raises(ModelError, match=r"reference must be finite and of shape \(6,\)"):
         dynamics.state(still[:2])
-    with pytest.raises(ModelError, match="state must have size 4, got 3"):
+    with pytest.raises(ModelError, match=r"state must be finite and of shape \(4,\)"):
         dynamics.state(still, [0, 0, 0])
     with pytest.raises(ModelError, match="state must be finite"):
         dynamics.state(still, [0, np.nan, 0, 0])
-    with pytest.raises(ModelError, match="parameters must have size 0, got 1"):
+    with pytest.raises(ModelError, match=r"parameters must be finite and of shape \(0,\)"):
         dynamics.state(still, parameters=[1.0])
-    with pytest.raises(ModelError, match="outputs must have size 2, got 3"):
+    with pytest.raises(ModelError, match=r"outputs must be finite and of shape \(2,\)"):
         dynamics.equilibrium([1, 2, 3])
-    with pytest.raises(ModelError, match="outputs must be numbers"):
+    with pytest.raises(ModelError, match="outputs must be real numbers"):
         dynamics.equilibrium(["far", "away"])
 
 
@@ -752,7 +752,9 @@ def test_equilibrium_of_a_robot_against_multibody_plant():
     name, kind = "two_link", "damped"
     robot = actuated(name, kind)
     expected, _ = at_rest(name, kind, start_position(name), 25.0)
-    found = ZeroDynamics(robot.structure).equilibrium([*OFFSET[name], 25.0])
+    found = ZeroDynamics(robot.structure.system, structure=robot.structure).equilibrium(
+        [*OFFSET[name], 25.0]
+    )
     # The plant and the library differ by round-off of forces of 100 N over stiffnesses of 5e3.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -864,7 +866,7 @@ def test_the_closed_loop_has_the_poles_the_zero_dynamics_and_the_constraints(sys
     """
     dynamics = zero_dynamics(system)
     structure, degrees = dynamics.structure, dynamics.structure.output_degrees
-    law = TrackingLaw(system, poles(chosen), structure)
+    law = TrackingLaw(system, poles(chosen), structure=structure)
     rest = dynamics.stability()
     elimination = structure.elimination
     fields = ca.Function(
@@ -1033,7 +1035,7 @@ def test_a_singular_b_leaves_undecided_what_has_no_zero_dynamics(columns, where)
     )
     structure, violation = examine_structure(system)
     assert violation is not None
-    dynamics = ZeroDynamics(structure)
+    dynamics = ZeroDynamics(structure.system, structure=structure)
     assert dynamics.dimension == 0
     stability = dynamics.stability()
     assert (stability.verdict, stability.state) == (Verdict.UNDECIDED, None)
@@ -1059,7 +1061,7 @@ def test_the_force_that_is_asked_for_decides(force, rate):
     """The force is met at once, so that no state tells it: the eigenvalue is v - 40."""
     system = slider()
     structure = find_structure(system)
-    dynamics = ZeroDynamics(structure)
+    dynamics = ZeroDynamics(structure.system, structure=structure)
     outputs = [0.0, force]
     rest = dynamics.equilibrium(outputs)
     assert dynamics.eigenvalues(rest, outputs=outputs) == pytest.approx([rate], rel=1e-9)
@@ -1069,22 +1071,27 @@ def test_the_force_that_is_asked_for_decides(force, rate):
         system, reference=lambda t: np.array([0.0, 0.0, 0.0, force]), times=np.linspace(0, 0.1, 5)
     )
     assert told.zero_dynamics.verdict is verdict
-    law = TrackingLaw(system, poles(-3.0), structure)
+    law = TrackingLaw(system, poles(-3.0), structure=structure)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        make_closed_loop(DaePlant(structure), law, [constant(outputs)])
+        make_closed_loop(
+            DaePlant(structure.system, structure=structure), law, [ConstantReference(outputs)]
+        )
     assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
 
 
 def test_a_loop_is_judged_when_it_begins():
     """The force grows from 20 to 60 N in 2 s: unstable above 40 N."""
     law = TrackingLaw(slider(), poles(-3.0))
-    force = ExpressionSignal(lambda t: [20 + 20 * t])
+    force = ExpressionReference(lambda t: [20 + 20 * t])
     for start, unstable in ((0.0, False), (2.0, True)):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             make_closed_loop(
-                DaePlant(law.structure), law, [constant([0.0]), force], start_time=start
+                DaePlant(law.structure.system, structure=law.structure),
+                law,
+                [ConstantReference([0.0]), force],
+                start_time=start,
             )
         assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
 
@@ -1102,7 +1109,7 @@ def test_an_equilibrium_that_is_found_slowly_decides_nothing(rate, nominal):
         l=lambda x: [x[0]],
         nominal_state=[0.0, nominal],
     )
-    assert ZeroDynamics(find_structure(system)).stability().verdict is Verdict.UNDECIDED
+    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
 
 
 def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
@@ -1114,7 +1121,7 @@ def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
         h=lambda x: [[-2, 0], [2, 0], [0, 1]],
         l=lambda x: [2 * x[0], x[1] - 2 * x[2]],
     )
-    assert ZeroDynamics(find_structure(system)).stability().verdict is Verdict.UNDECIDED
+    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
 
 
 def test_rest_does_not_depend_on_the_unit_of_time():
@@ -1141,7 +1148,10 @@ def test_rest_does_not_depend_on_the_unit_of_time():
         l=lambda x: [q * gap * x[2] * (1 - x[0]) / e],
         nominal_state=[0.42, 0.0, 1.0],
     )
-    stability = ZeroDynamics(find_structure(system, spread=[0.02, 0.01, 0.02])).stability()
+    stability = ZeroDynamics(
+        find_structure(system, spread=[0.02, 0.01, 0.02]).system,
+        structure=find_structure(system, spread=[0.02, 0.01, 0.02]),
+    ).stability()
     assert stability.verdict is Verdict.UNSTABLE
     place, _, charge = stability.state
     voltage = q * gap * charge * (1 - place) / e

@@ -15,17 +15,20 @@ from arms import (
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from runs import run
 
-from drake_dae import RobotPlant, constant, make_closed_loop, matrices, simulate, sinusoids
+from drake_dae import (
+    ConstantReference,
+    RobotPlant,
+    SinusoidReference,
+    gain_matrices,
+    make_closed_loop,
+)
 
 ARMS = ["two_link", "seven_joint"]
 
 
-def run(loop, context, duration, config):
-    simulate(loop.diagram, context, duration, config)
-    return loop.record(context)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "position", "force", "residual"),
     [("two_link_wall", 1e-12, 1e-11, 1e-12), ("seven_joint_wall", 1e-9, 1e-8, 1e-12)],
@@ -51,6 +54,7 @@ def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
     assert np.max(np.abs(record["constraint_residual"])) < residual
 
 
+@pytest.mark.slow
 def test_error_with_full_matrices_is_the_matrix_exponential():
     """(60) with coupled outputs: (e, e')' = [[0, 1], [-Lambda_1, -Lambda_2]] (e, e')."""
     random = np.random.default_rng(1)
@@ -59,16 +63,16 @@ def test_error_with_full_matrices_is_the_matrix_exponential():
         root @ root.T + np.diag(diagonal)
         for root, diagonal in zip(roots, [np.full(6, 16.0), np.full(6, 8.0)], strict=True)
     )
-    chosen = law("seven_joint", matrices([stiffness, damping]))
+    chosen = law("seven_joint", gain_matrices([stiffness, damping]))
     found = arm("seven_joint")
     loop = make_closed_loop(
-        RobotPlant(found.model, found.structure),
+        RobotPlant(found.model, structure=found.structure),
         chosen,
         [
-            sinusoids(0.0, 0.1, 1.0),
-            sinusoids(0.6, 0.05, 2.0),
-            constant([0.0, 0.0, 0.0, 0.0]),
-            sinusoids(30.0, 10.0, 3.0),
+            SinusoidReference(0.0, 0.1, 1.0),
+            SinusoidReference(0.6, 0.05, 2.0),
+            ConstantReference([0.0, 0.0, 0.0, 0.0]),
+            SinusoidReference(30.0, 10.0, 3.0),
         ],
     )
     context = loop.diagram.CreateDefaultContext()
@@ -93,7 +97,7 @@ def test_error_with_full_matrices_is_the_matrix_exponential():
 def test_dynamics_are_those_of_multibody_plant(name):
     """The index-1 form [[M, -J'], [J, 0]] (v', lambda) = (B u - H, -Jdot v), solved densely."""
     found, random = arm(name), np.random.default_rng(2)
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     for state in consistent_states(name, 20):
         q, v = np.split(state, 2)
@@ -157,10 +161,10 @@ def test_residual_stays_at_zero_for_100_s_under_error_control():
     ends, largest = {}, {}
     for project in (True, False):
         found = arm("two_link")
-        plant = RobotPlant(found.model, found.structure, project=project)
+        plant = RobotPlant(found.model, structure=found.structure, project=project)
         chosen = law("two_link")
         loop = make_closed_loop(
-            plant, chosen, [sinusoids(0.3, 0.3, 1.5), sinusoids(20.0, 5.0, 2.0)]
+            plant, chosen, [SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
         )
         context = loop.diagram.CreateDefaultContext()
         record = run(loop, context, 100.0, error_controlled(1e-6))
@@ -185,7 +189,7 @@ def test_free_constrained_motion_conserves_energy(name):
     drift = {}
     for step in (8e-3, 4e-3):
         builder = DiagramBuilder()
-        plant = builder.AddSystem(RobotPlant(found.model, found.structure))
+        plant = builder.AddSystem(RobotPlant(found.model, structure=found.structure))
         source = builder.AddSystem(ConstantVectorSource(np.zeros(plant.dae.num_controls)))
         builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
         states = LogVectorOutput(plant.GetOutputPort("state"), builder)

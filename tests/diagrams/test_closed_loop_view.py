@@ -15,6 +15,7 @@ from recordings import animation, objects, transforms, vertices
 from two_arms import two_arms
 
 from drake_dae import (
+    ConstantReference,
     DaePlant,
     DaeSystem,
     ImplicitSurface,
@@ -25,8 +26,7 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     TrackingLaw,
-    build,
-    constant,
+    build_scenario,
     load_scenario,
     make_animation,
     make_closed_loop,
@@ -48,7 +48,7 @@ NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 def recorded(name, *settings):
     """A run of a scenario, and the page of its animation."""
     scenario = load_scenario(find_scenario(name), settings)
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     return loop, record, make_animation(loop, record, context)
@@ -188,7 +188,7 @@ def test_a_run_that_begins_later_is_shown_from_its_start():
 def test_a_parameter_moves_the_surface():
     """The wall stands where the context of the run has it, not where the scenario put it."""
     scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25", "start.errors={}"])
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     loop.plant.set_parameter(own, "wall.position", [1.1, 0.0, 0.0])
@@ -205,7 +205,7 @@ def test_a_parameter_moves_the_surface():
 def test_a_parameter_turns_the_arrow():
     """Of the normal of a dome that stands elsewhere."""
     scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     center = np.array([0.45, 0.02, 0.2])
@@ -234,7 +234,7 @@ def test_one_moment_is_an_animation_too():
 
 def test_an_animation_changes_nothing():
     scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25"])
-    loop, context = build(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario, start_meshcat(), live=False)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     state = context.get_continuous_state_vector().CopyToVector()
@@ -258,7 +258,7 @@ def test_frames():
 def test_live_view_draws_while_it_runs():
     meshcat = start_meshcat()
     scenario = load_scenario(find_scenario("two_link_wall"))
-    loop, context = build(scenario, meshcat, live=True)
+    loop, context = build_scenario(scenario, meshcat, live=True)
     simulator = Simulator(loop.diagram, context)
     simulator.AdvanceTo(0.5)
     page = meshcat.StaticHtml()
@@ -282,7 +282,7 @@ def test_without_live_view_the_steps_are_those_without_any():
     times = []
     for meshcat, live in ((None, True), (start_meshcat(), False), (start_meshcat(), True)):
         scenario = load_scenario(find_scenario("two_link_wall"), ["duration=1"])
-        loop, context = build(scenario, meshcat, live)
+        loop, context = build_scenario(scenario, meshcat, live)
         simulate(loop.diagram, context, 1.0, scenario.integrator)
         times.append(loop.record(context).time)
     np.testing.assert_array_equal(times[0], times[1])
@@ -330,10 +330,10 @@ def shown_at_rest(model, forces):
     """The page of a robot that holds still with given constraint forces."""
     meshcat = start_meshcat()
     plant = RobotPlant(model)
-    law = TrackingLaw(model.dae, poles(-4.0), plant.structure)
+    law = TrackingLaw(model.dae, poles(-4.0), structure=plant.structure)
     state = plant.structure.manifold.project(model.dae.nominal_state)
     names = [signal.name for signal in model.position_signals]
-    wanted = constant(np.concatenate([np.zeros(len(names)), forces]))
+    wanted = ConstantReference(np.concatenate([np.zeros(len(names)), forces]))
     loop = make_closed_loop(plant, law, [wanted], meshcat=meshcat, live=False)
     loads = ConstraintLoads(model)(state, forces)
     meshcat.StartRecording()
@@ -367,7 +367,7 @@ def test_a_surface_without_a_shape_is_drawn(surface):
 
 def test_the_force_of_a_pin_is_drawn():
     """At the pin, along what the one link does to the other; by Drake's forward kinematics."""
-    loop, _ = build(load_scenario(find_scenario("five_bar")))
+    loop, _ = build_scenario(load_scenario(find_scenario("five_bar")))
     model = loop.plant.model
     (pin,) = model.constraints
     state, page = shown_at_rest(model, np.array([30.0, -40.0]))
@@ -418,7 +418,7 @@ def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
     controls = TrackingLaw(model.dae, poles(-4.0))
     meshcat = start_meshcat()
     loop = make_closed_loop(
-        RobotPlant(model), controls, [constant([0.3, 0.4])], meshcat=meshcat, live=False
+        RobotPlant(model), controls, [ConstantReference([0.3, 0.4])], meshcat=meshcat, live=False
     )
     context = loop.diagram.CreateDefaultContext()
     own = loop.plant.GetMyMutableContextFromRoot(context)
@@ -432,8 +432,8 @@ def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
 
 
 def test_an_animation_needs_a_meshcat_and_a_robot():
-    robot = RobotPlant(arm("two_link").model, arm("two_link").structure)
-    references = [constant([0.3]), constant([20.0])]
+    robot = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
+    references = [ConstantReference([0.3]), ConstantReference([20.0])]
     loop = make_closed_loop(robot, law("two_link"), references)
     context = loop.diagram.CreateDefaultContext()
     simulate(loop.diagram, context, 0.01, fixed_step())
@@ -441,7 +441,9 @@ def test_an_animation_needs_a_meshcat_and_a_robot():
         make_animation(loop, loop.record(context), context)
     system = DaeSystem.from_functions(1, f=lambda x: [0.0], h=lambda x: [1.0], l=lambda x: [x[0]])
     plain = TrackingLaw(system, poles(-1.0))
-    loop = make_closed_loop(DaePlant(system), plain, [constant([1.0])], meshcat=start_meshcat())
+    loop = make_closed_loop(
+        DaePlant(system), plain, [ConstantReference([1.0])], meshcat=start_meshcat()
+    )
     context = loop.diagram.CreateDefaultContext()
     simulate(loop.diagram, context, 0.01, fixed_step())
     with pytest.raises(ModelError, match="RobotPlant"):

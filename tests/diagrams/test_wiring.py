@@ -3,24 +3,23 @@
 import numpy as np
 import pytest
 from arms import arm, fixed_step, law, touching
+from runs import run, run_scenario, scenario
 
 from drake_dae import (
+    ConstantReference,
     DcMotors,
     ForceSensor,
+    NormalForm,
     RobotPlant,
     StateRealization,
     TrackingLaw,
-    build,
-    constant,
-    load_scenario,
+    build_scenario,
     make_closed_loop,
     poles,
-    simulate,
 )
-from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import ScenarioError, WiringError
 
-REFERENCES = [constant(0.3), constant(20.0)]
+REFERENCES = [ConstantReference(0.3), ConstantReference(20.0)]
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 
 
@@ -29,11 +28,11 @@ def rigid(sensor=None, gain=1.0, measured=True):
     law = TrackingLaw(
         found.model.dae,
         poles(-8.0),
-        found.structure,
+        structure=found.structure,
         measured_force=measured,
         force_gain=gain if measured else 0.0,
     )
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     return make_closed_loop(plant, law, REFERENCES, sensor=sensor)
 
 
@@ -70,13 +69,15 @@ def test_a_law_for_another_system_is_refused_with_both_sizes():
         match=r"for 'seven_joint' with 14 states, 7 controls and 1 constraints, the plant "
         r"'two_link' has 4 states, 2 controls and 1 constraints\. .*TrackingLaw\(plant.dae",
     ):
-        make_closed_loop(RobotPlant(found.model, found.structure), law("seven_joint"), REFERENCES)
+        make_closed_loop(
+            RobotPlant(found.model, structure=found.structure), law("seven_joint"), REFERENCES
+        )
 
 
 def test_behind_motors_the_force_may_be_connected_directly():
     model = touching("two_link", [MOTORS])
     law = TrackingLaw(model.dae, poles(-8.0), measured_force=True)
-    loop = make_closed_loop(RobotPlant(model, law.structure), law, REFERENCES)
+    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, REFERENCES)
     assert loop.sensor is None
     assert not loop.diagram.HasAnyDirectFeedthrough()
 
@@ -87,40 +88,31 @@ def test_the_noise_follows_its_seed():
         loop = rigid(ForceSensor(1, time_constant=0.01, noise_deviation=0.5))
         context = loop.diagram.CreateDefaultContext()
         loop.set_seed(context, seed)
-        simulate(loop.diagram, context, 0.1, fixed_step())
-        records.append(loop.record(context)["measured_force"])
+        records.append(run(loop, context, 0.1, fixed_step())["measured_force"])
     np.testing.assert_array_equal(records[0], records[1])
     assert np.max(np.abs(records[0] - records[2])) > 0.1
 
 
-def scenario(name, *settings):
-    return load_scenario(find_scenario(name), settings)
-
-
-def run(name, *settings):
-    chosen = scenario(name, "duration=2", *settings)
-    loop, context = build(chosen)
-    simulate(loop.diagram, context, chosen.duration, chosen.integrator)
-    return loop, loop.record(context)
-
-
+@pytest.mark.slow
 def test_a_scenario_with_another_mass_in_the_plant():
     """Feedback shrinks the force error to 1 / (1 + 4) of what it is without, within 5 %."""
     quiet = (
+        "duration=2",
         "force.noise_deviation=[0]",
         "force.time_constant=0.002",
         "references.1.frequencies=[0.5]",
     )
-    loop, record = run("two_link_measured_force", *quiet)
+    loop, _, record = run_scenario(scenario("two_link_measured_force", *quiet))
     plant = loop.plant.GetMyContextFromRoot(loop.diagram.CreateDefaultContext())
     assert loop.plant.get_parameter(plant, "link2.mass") == pytest.approx([6.0])
-    _, without = run("two_link_measured_force", *quiet, "force=!ModelForce {}")
+    *_, without = run_scenario(scenario("two_link_measured_force", *quiet, "force=!ModelForce {}"))
     errors = [np.max(np.abs(r["tracking_error"][r.time > 0.5, 1])) for r in (record, without)]
     assert errors[1] > 1.0
     assert errors[0] / errors[1] == pytest.approx(0.2, rel=0.05)
     assert "measured_force" in record.signals
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["two_link_flexible", "two_link_motors", "two_link_hydraulics", "two_link_flexible_motors"],
@@ -128,7 +120,7 @@ def test_a_scenario_with_another_mass_in_the_plant():
 def test_scenarios_of_actuation_follow_their_prediction(name):
     """They start 2 cm and 5 N off. At a fixed 1 ms RK5 leaves less than 1e-7 of it."""
     fixed = ("integrator.use_error_control=false", "integrator.max_step_size=0.001")
-    loop, record = run(name, *fixed)
+    loop, _, record = run_scenario(scenario(name, "duration=2", *fixed))
     error = record["tracking_error"]
     np.testing.assert_allclose(error[0], [0.02, -5.0], atol=1e-7)
     off = np.max(np.abs(error - loop.predicted_error(record)), axis=0)
@@ -156,7 +148,7 @@ def test_scenarios_of_actuation_follow_their_prediction(name):
 )
 def test_refusals_name_the_key(name, setting, message):
     with pytest.raises(ScenarioError, match=message):
-        build(scenario(name, setting))
+        build_scenario(scenario(name, setting))
 
 
 @pytest.mark.parametrize(
@@ -169,7 +161,7 @@ def test_refusals_name_the_key(name, setting, message):
 )
 def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
     """The tip is on the plant's wall at the wanted height, at rest, with the wanted force."""
-    loop, context = build(scenario("two_link_flexible", setting))
+    loop, context = build_scenario(scenario("two_link_flexible", setting))
     own = loop.plant.GetMyContextFromRoot(context)
     state = loop.plant.state(own)
     q = state[:2]
@@ -183,11 +175,13 @@ def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
 
 def test_a_gain_without_effect_is_refused():
     with pytest.raises(ScenarioError, match=r"force or gains: .*degree 2 and takes the measured"):
-        build(scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}"))
+        build_scenario(
+            scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}")
+        )
 
 
 def test_a_state_realization_is_no_plant_for_the_closed_loop():
     chosen = law("two_link")
-    realization = StateRealization(chosen.structure)
+    realization = StateRealization(NormalForm(chosen.structure.system, structure=chosen.structure))
     with pytest.raises(WiringError, match="needs a DaePlant or RobotPlant, got StateRealization"):
-        make_closed_loop(realization, chosen, [constant([0.2, 20.0])])
+        make_closed_loop(realization, chosen, [ConstantReference([0.2, 20.0])])

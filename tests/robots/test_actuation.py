@@ -31,7 +31,7 @@ def test_dynamics_are_those_of_a_dense_solve(name, kind):
     Condition numbers of about 4000 on numbers of about 1e3.
     """
     found, d, random = actuated(name, kind), drive(name, kind), np.random.default_rng(1)
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     p = len(d.torque)
     ports = {"link_state": slice(0, 2 * p)}
@@ -135,7 +135,7 @@ def test_rest_state_needs_drives_that_hold_it():
 def test_parameters_act_in_the_context(kind, parameter, matrix, operation):
     """A study changes them by name; the dense solve with the changed matrix says what follows."""
     found, d = actuated("two_link", kind), drive("two_link", kind)
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     x, u = states("two_link", kind, 1)[0], np.array([7.0, -3.0])
     plant.set_state(context, x)
@@ -233,7 +233,7 @@ def test_more_refusals(actuation, message):
 def test_the_default_state_is_at_rest(kind):
     """Also where nominal_positions is off the wall: no spring is strained, no force acts."""
     found = actuated("two_link", kind)
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, np.zeros(2))
     force = plant.GetOutputPort("constraint_force").Eval(context)

@@ -24,15 +24,15 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from drake_dae import (
+    ConstantReference,
     DrakeDaeError,
     RobotPlant,
+    SinusoidReference,
     TrackingLaw,
-    constant,
+    gain_matrices,
     make_closed_loop,
-    matrices,
     poles,
     simulate,
-    sinusoids,
 )
 
 
@@ -147,6 +147,7 @@ def explicit_actuator(name, kind, x, reference, gains, force_gains):
     return inertia @ np.linalg.solve(b(q), -a + np.concatenate([wanted, pressed]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", [False, True], ids=["poles", "Lambda"])
 @pytest.mark.parametrize("kind", ["flexible", "motor", "hydraulic"])
 @pytest.mark.parametrize("name", ARMS)
@@ -165,8 +166,8 @@ def test_law_is_the_explicit_law(name, kind, full):
     design = poles(-4.0)
     if full:
         gains, force_gains = coupled(degree, count, random), coupled(force_degree, 1, random)
-        design = matrices(gains, force_gains)
-    law = TrackingLaw(found.model.dae, design, found.structure)
+        design = gain_matrices(gains, force_gains)
+    law = TrackingLaw(found.model.dae, design, structure=found.structure)
     for x in states(name, kind, 3, seed=6):
         reference = random.standard_normal(count * (degree + 1) + force_degree + 1)
         if kind == "flexible":
@@ -177,6 +178,7 @@ def test_law_is_the_explicit_law(name, kind, full):
         assert np.linalg.norm(control - explicit) < tolerance * np.linalg.norm(explicit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flexible motor", "flexible hydraulic", "damped"])
 @pytest.mark.parametrize("name", ARMS)
 def test_error_obeys_the_assigned_equation(name, kind):
@@ -189,7 +191,7 @@ def test_error_obeys_the_assigned_equation(name, kind):
     degree, force_degree = DEGREES[kind]
     count = len(found.model.position_signals)
     gains, force_gains = coupled(degree, count, random), coupled(force_degree, 1, random)
-    law = TrackingLaw(found.model.dae, matrices(gains, force_gains), found.structure)
+    law = TrackingLaw(found.model.dae, gain_matrices(gains, force_gains), structure=found.structure)
     d = drive(name, kind)
 
     for x in states(name, kind, 2, seed=8):
@@ -233,10 +235,14 @@ def closed_form(pole, start, times):
 
 
 REFERENCES = {
-    "two_link": [sinusoids(0.3, 0.1, 2.0)],
-    "seven_joint": [sinusoids(0.0, 0.05, 2.0), sinusoids(0.6, 0.05, 3.0), constant([0.0] * 4)],
+    "two_link": [SinusoidReference(0.3, 0.1, 2.0)],
+    "seven_joint": [
+        SinusoidReference(0.0, 0.05, 2.0),
+        SinusoidReference(0.6, 0.05, 3.0),
+        ConstantReference([0.0] * 4),
+    ],
 }
-PULL = sinusoids(20.0, 5.0, 3.0, 0.3)
+PULL = SinusoidReference(20.0, 5.0, 3.0, 0.3)
 
 
 def track(name, kind, step, duration):
@@ -248,9 +254,9 @@ def track(name, kind, step, duration):
     found = actuated(name, kind)
     names = [signal.name for signal in found.model.dae.output_signals]
     poles_of = dict.fromkeys(names, -14.0) | {names[-1]: -20.0}
-    law = TrackingLaw(found.model.dae, poles(poles_of), found.structure)
+    law = TrackingLaw(found.model.dae, poles(poles_of), structure=found.structure)
     loop = make_closed_loop(
-        RobotPlant(found.model, found.structure), law, [*REFERENCES[name], PULL]
+        RobotPlant(found.model, structure=found.structure), law, [*REFERENCES[name], PULL]
     )
     context = loop.diagram.CreateDefaultContext()
     start = at_rest(name, kind, start_position(name), 14.0)[0]
@@ -272,6 +278,7 @@ def track(name, kind, step, duration):
     return relative, record
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DEGREES)
 @pytest.mark.parametrize("name", ARMS)
 def test_errors_are_their_closed_forms(name, kind):
@@ -307,7 +314,7 @@ def test_stiff_joints_do_not_make_the_closed_loop_stiff():
     def hold(step):
         """How far the shafts move under a constant control, 1 urad off their rest."""
         builder = DiagramBuilder()
-        plant = builder.AddSystem(RobotPlant(found.model, found.structure))
+        plant = builder.AddSystem(RobotPlant(found.model, structure=found.structure))
         source = builder.AddSystem(ConstantVectorSource(u))
         builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
         shafts = LogVectorOutput(plant.GetOutputPort("motor_state"), builder)

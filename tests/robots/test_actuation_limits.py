@@ -61,7 +61,10 @@ def test_flexible_law_tends_to_the_rigid_law_at_rate_1_over_k(name):
     """
     kind, t = "flexible", 0.3
     found, d = actuated(name, kind), drive(name, kind)
-    chosen, dae = TrackingLaw(found.model.dae, poles(-4.0), found.structure), found.model.dae
+    chosen, dae = (
+        TrackingLaw(found.model.dae, poles(-4.0), structure=found.structure),
+        found.model.dae,
+    )
 
     def torque(t):
         return along_path(name, d, t[0])[2]
@@ -78,7 +81,7 @@ def test_flexible_law_tends_to_the_rigid_law_at_rate_1_over_k(name):
         x = standing(stiffer, link, tau, change(now))[0]
         values = dae.parameter_values
         values[dae.parameter_slice("flexible_joints.stiffness")] *= factor
-        control = chosen.control(x, reference(name, t, chosen.degrees), values)
+        control = chosen.control(x, reference(name, t, chosen.degrees), parameters=values)
         shift = d.inertia @ np.linalg.solve(stiffer.stiffness, slope(change, now, np.ones(1), 0.02))
         left = np.linalg.norm(control - rigid - shift) / np.linalg.norm(shift)
         assert left < 2e-8 * factor**2
@@ -92,7 +95,10 @@ def test_motor_law_tends_to_the_rigid_law_at_rate_l(name):
     """
     kind, t = "motor", 0.3
     found, d = actuated(name, kind), drive(name, kind)
-    chosen, dae = TrackingLaw(found.model.dae, poles(-4.0), found.structure), found.model.dae
+    chosen, dae = (
+        TrackingLaw(found.model.dae, poles(-4.0), structure=found.structure),
+        found.model.dae,
+    )
     link, _, tau = along_path(name, d, t)
     change = slope(lambda t: along_path(name, d, t[0])[2], np.array([t]), np.ones(1), 0.02)
     rigid = law(name).control(link, reference(name, t, law(name).degrees))
@@ -101,12 +107,13 @@ def test_motor_law_tends_to_the_rigid_law_at_rate_l(name):
     for factor in (1.0, 0.1, 0.01):
         values = dae.parameter_values
         values[dae.parameter_slice("dc_motors.inductance")] *= factor
-        control = chosen.control(x, reference(name, t, chosen.degrees), values)
+        control = chosen.control(x, reference(name, t, chosen.degrees), parameters=values)
         shift = factor * d.inductance @ np.linalg.solve(d.torque, change)
         left = np.linalg.norm(control - voltage - shift) / np.linalg.norm(shift)
         assert left < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "parameter", "matrix", "operation"),
     [
@@ -124,7 +131,7 @@ def test_trajectories_tend_to_those_of_the_rigid_robot(kind, parameter, matrix, 
     """
     name, q = "two_link", start_position("two_link")
     found, d = actuated(name, kind), drive(name, kind)
-    plant = RobotPlant(found.model, found.structure)
+    plant = RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     start, hold = at_rest(name, kind, q, 20.0)
     push = np.array([20.0, -10.0]) * {"flexible": 1.0, "motor": 0.1}[kind]

@@ -22,7 +22,7 @@ from pydrake.multibody.tree import (
     RpyFloatingJoint,
     SpatialInertia,
 )
-from two_arms import APART, GRASP, NOMINAL, two_arms
+from two_arms import APART, GRASP, NOMINAL, REFERENCES, two_arms
 
 from drake_dae import (
     CoincidentPoints,
@@ -36,12 +36,10 @@ from drake_dae import (
     Sphere,
     TrackingLaw,
     WeldedFrames,
-    constant,
     find_structure,
     make_closed_loop,
     poles,
     simulate,
-    sinusoids,
 )
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -270,7 +268,7 @@ def test_support_carries_half_of_a_rod():
 def test_moving_arms_obey_newton_and_euler():
     """Inverse dynamics of MultibodyPlant with the multipliers as external forces gives u."""
     model, structure = arms()
-    plant, system = model.links.plant, RobotPlant(model, structure)
+    plant, system = model.links.plant, RobotPlant(model, structure=structure)
     a, b = frames("object", "right::tool")
     context, context_here = plant.CreateDefaultContext(), system.CreateDefaultContext()
     random = np.random.default_rng(6)
@@ -451,7 +449,7 @@ def test_four_bar_moves_as_its_one_degree_of_freedom():
     assert structure.constraint_degrees == (2, 2)
     assert structure.output_degrees == (2, 0, 0)
     assert structure.index == 3
-    plant, links = RobotPlant(model, structure), model.links
+    plant, links = RobotPlant(model, structure=structure), model.links
     angle, rate, duration = 1.0, 5.0, 1.5
     b, c, k2, k3, _, _ = linkage(angle)
     start = [angle, b - angle, c, rate, (k2 - 1.0) * rate, k3 * rate]
@@ -506,22 +504,11 @@ def test_two_arms_track_motion_and_squeeze():
     # Far from singular: no output nearly repeats another.
     assert structure.constraint_margin.relative > 0.3
     assert structure.control_margin.relative > 0.3
-    law = TrackingLaw(model.dae, poles(-4.0), structure)
+    law = TrackingLaw(model.dae, poles(-4.0), structure=structure)
     loop = make_closed_loop(
-        RobotPlant(model, structure),
+        RobotPlant(model, structure=structure),
         law,
-        [
-            sinusoids(APART / 2, 0.05, 2.0),
-            sinusoids(0.0, 0.05, 3.0),
-            sinusoids(0.4, 0.04, 2.5),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 0.1, 2.0),
-            constant([0.0, 0.0]),
-            sinusoids(40.0, 15.0, 4.0),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 1.0, 3.0),
-            constant([0.0, 0.0]),
-        ],
+        REFERENCES,
     )
     context = loop.diagram.CreateDefaultContext()
     away = [APART / 2 + 0.03, -0.04, 0.42, 0.05, -0.04, 0.03, 0.1, -0.15]

@@ -205,6 +205,7 @@ def assert_terms_agree(plant, context, terms, masses):
     assert_close(energies[1], plant.CalcPotentialEnergy(context), "potential energy")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_terms_are_those_of_the_plant(seed):
     robot = random_robot(seed)
@@ -254,6 +255,7 @@ def test_accelerations_are_those_of_the_continuous_plant(seed):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_frames_are_where_the_plant_has_them(seed):
     robot = random_robot(seed)

@@ -12,6 +12,7 @@ from members import FixedDistance, RubbingPoint, Saddle, Skate, TorqueLag
 
 from drake_dae import (
     AxisCoordinates,
+    ConstantReference,
     ExpressionOutput,
     FlexibleJoints,
     JointPositions,
@@ -22,13 +23,12 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     Signal,
+    SinusoidReference,
     TrackingLaw,
-    constant,
     find_structure,
     make_closed_loop,
     poles,
     simulate,
-    sinusoids,
 )
 from drake_dae.trace.functions import TracedFunction
 
@@ -55,7 +55,7 @@ def run(plant, state, duration, step=1e-3):
 def follow(model, state, references, duration=1.0, step=2e-3):
     """The record of a closed loop with double poles at -4."""
     law = TrackingLaw(model.dae, poles(-4.0))
-    loop = make_closed_loop(RobotPlant(model, law.structure), law, references)
+    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, references)
     context = loop.diagram.CreateDefaultContext()
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_consistent_state(own, state)
@@ -81,7 +81,7 @@ def test_a_bob_on_a_rod_is_a_pendulum():
     angle, speed = 0.8, -1.5
     place = [length * np.sin(angle), 1.0 - length * np.cos(angle)]
     rate = [length * speed * np.cos(angle), length * speed * np.sin(angle)]
-    state, thrust = run(RobotPlant(model, structure), [*place, *rate], duration)
+    state, thrust = run(RobotPlant(model, structure=structure), [*place, *rate], duration)
     angle, speed = scipy.integrate.solve_ivp(
         lambda t, y: [y[1], -GRAVITY / length * np.sin(y[0])],
         (0.0, duration),
@@ -105,7 +105,7 @@ def test_an_arm_on_a_rod_tracks_motion_and_thrust():
     q = model.configuration([0.3], [1.2, -1.6])
     tip = TracedFunction("tip", {"q": model.links.q}, {"p": model.links.position("tool")})(q)[0]
     assert np.linalg.norm(tip - [1.6, 0.0, 0.0]) == pytest.approx(0.7, abs=1e-12)
-    wanted = [sinusoids(0.35, 0.05, 2.0), sinusoids(30.0, 10.0, 3.0)]
+    wanted = [SinusoidReference(0.35, 0.05, 2.0), SinusoidReference(30.0, 10.0, 3.0)]
     record = follow(model, [*q, 0.0, 0.0], wanted)
     error = double_pole(-0.05, -0.1, record.time)
     np.testing.assert_allclose(record["tracking_error"][:, 0], error, atol=1e-10)
@@ -170,7 +170,7 @@ def test_a_law_that_knows_the_friction_cancels_it():
     structure = find_structure(model.dae)
     assert structure.constraint_degrees == (2,)
     assert structure.output_degrees == (2, 0)
-    wanted = [sinusoids(0.3, 0.1, 1.5), sinusoids(20.0, 5.0, 2.0)]
+    wanted = [SinusoidReference(0.3, 0.1, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
     q = model.configuration([0.25], [1.2, -1.6])
     record = follow(model, [*q, 0.0, 0.0], wanted)
     error = double_pole(-0.05, -0.15, record.time)
@@ -205,7 +205,7 @@ def test_a_skate_on_a_slope_goes_along_a_cycloid():
     structure = find_structure(model.dae)
     assert structure.constraint_degrees == (1,)
     assert structure.output_degrees == (2, 2, 0)
-    plant = RobotPlant(model, structure)
+    plant = RobotPlant(model, structure=structure)
     state, force = run(plant, [0.0, 0.0, 0.0, 0.0, 0.0, spin], duration)
     turn, size = spin * duration, pull / (2.0 * spin**2)
     place = [size * np.sin(turn) ** 2, size * (turn - np.sin(2.0 * turn) / 2.0), turn]
@@ -230,10 +230,10 @@ def test_a_tool_stays_on_a_saddle():
     assert find_structure(model.dae).output_degrees == (2,) * 6 + (0,)
     q = model.configuration([0.55, 0.05, 0.0, 0.0, 0.0, 0.0], nominal)
     wanted = [
-        sinusoids(0.5, 0.1, 2.0),
-        sinusoids(0.05, 0.1, 2.0),
-        constant([0.0] * 4),
-        sinusoids(20.0, 5.0, 2.0),
+        SinusoidReference(0.5, 0.1, 2.0),
+        SinusoidReference(0.05, 0.1, 2.0),
+        ConstantReference([0.0] * 4),
+        SinusoidReference(20.0, 5.0, 2.0),
     ]
     record = follow(model, [*q, *np.zeros(7)], wanted, step=4e-3)
     context = plant.CreateDefaultContext()

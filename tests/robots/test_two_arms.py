@@ -6,23 +6,22 @@
 from functools import cache
 
 import numpy as np
+import pytest
 from actuated import slope
 from arms import fixed_step
 from pydrake.multibody.tree import JacobianWrtVariable
 from test_actuation_laws import closed_form, coupled, new_input
-from two_arms import APART, NOMINAL, two_arms
+from two_arms import APART, NOMINAL, REFERENCES, two_arms
 
 from drake_dae import (
     FlexibleJoints,
     RobotPlant,
     TrackingLaw,
-    constant,
     find_structure,
+    gain_matrices,
     make_closed_loop,
-    matrices,
     poles,
     simulate,
-    sinusoids,
 )
 
 STIFFNESS = np.tile([2e4, 2e4, 1e4, 1e4, 5e3, 2e3, 2e3], 2)
@@ -120,6 +119,7 @@ class Truth:
         return np.concatenate([q, v, q + torque / STIFFNESS, v + rate])
 
 
+@pytest.mark.slow
 def test_law_commands_the_highest_derivatives():
     """z^(4) and lambda'' under u are r^(mu) - sum Lambda_k+1 (z^(k) - r^(k)), for full Lambda.
 
@@ -132,7 +132,7 @@ def test_law_commands_the_highest_derivatives():
     np.testing.assert_array_equal(model.links.actuation_matrix, np.eye(14))
     truth, random = Truth(model.links.plant), np.random.default_rng(11)
     gains, force_gains = coupled(4, 8, random), coupled(2, 6, random)
-    law = TrackingLaw(model.dae, matrices(gains, force_gains), structure)
+    law = TrackingLaw(model.dae, gain_matrices(gains, force_gains), structure=structure)
     for _ in range(3):
         x = truth.state(model, structure, random)
         reference = random.standard_normal(8 * 5 + 6 * 3)
@@ -150,6 +150,7 @@ def test_law_commands_the_highest_derivatives():
             np.testing.assert_allclose(found[-1], wanted, rtol=0, atol=1e-7 * scale)
 
 
+@pytest.mark.slow
 def test_errors_are_their_closed_forms():
     """All positions off by cm, all forces off by some N, poles at -14 and -20.
 
@@ -158,22 +159,11 @@ def test_errors_are_their_closed_forms():
     model, structure = flexible()
     names = [signal.name for signal in model.dae.output_signals]
     poles_of = dict.fromkeys(names, -14.0) | {name: -20.0 for name in names[8:]}
-    law = TrackingLaw(model.dae, poles(poles_of), structure)
+    law = TrackingLaw(model.dae, poles(poles_of), structure=structure)
     loop = make_closed_loop(
-        RobotPlant(model, structure),
+        RobotPlant(model, structure=structure),
         law,
-        [
-            sinusoids(APART / 2, 0.05, 2.0),
-            sinusoids(0.0, 0.05, 3.0),
-            sinusoids(0.4, 0.04, 2.5),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 0.1, 2.0),
-            constant([0.0, 0.0]),
-            sinusoids(40.0, 15.0, 4.0),
-            constant([0.0, 0.0]),
-            sinusoids(0.0, 1.0, 3.0),
-            constant([0.0, 0.0]),
-        ],
+        REFERENCES,
     )
     context = loop.diagram.CreateDefaultContext()
     q = model.configuration(START, NOMINAL)

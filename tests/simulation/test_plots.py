@@ -133,6 +133,7 @@ def test_controls_with_limits_that_are_in_sight():
     assert texts(plot_controls(record()[0])) == ["u0 [N m]", "u1 [N m]", "u2 [N m]"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 7])
 def test_no_cell_is_empty_and_nothing_overlaps(count):
     figure = plot_outputs(record(count)[0])
@@ -153,6 +154,7 @@ def test_no_cell_is_empty_and_nothing_overlaps(count):
         assert figure.axes[0].get_window_extent().width < 0.5 * width
 
 
+@pytest.mark.slow
 def test_saved_as_png(tmp_path):
     run, predicted = record()
     paths = save_plots(run, predicted, None, tmp_path)

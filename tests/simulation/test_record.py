@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, TriggerType
 from pydrake.systems.primitives import LogVectorOutput
+from runs import run_scenario, scenario
 
-from drake_dae import Record, build, load_scenario, simulate
+from drake_dae import Record, build_scenario, load_scenario, simulate
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import ModelError
@@ -17,10 +18,7 @@ from drake_dae.simulation.record import Recorded
 
 @pytest.fixture(scope="module")
 def run():
-    scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.5"])
-    loop, context = build(scenario)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    return loop, context, loop.record(context)
+    return run_scenario(scenario("two_link_wall", "duration=0.5"))
 
 
 def small():
@@ -177,7 +175,7 @@ def test_of_a_run_that_failed_while_it_was_logged(good):
 
 
 def test_of_nothing():
-    loop, context = build(load_scenario(find_scenario("two_link_wall")))
+    loop, context = build_scenario(load_scenario(find_scenario("two_link_wall")))
     record = loop.record(context)
     assert record.time.size == 0
     assert record["tracking_error"].shape == (0, 2)

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 
+import casadi as ca
 import numpy as np
 import pytest
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
@@ -13,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_dae import DaePlant, DaeSystem, build, load_scenario
+from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation import simulate as module
@@ -195,21 +196,41 @@ def test_what_drake_says_gets_time_and_state():
 
 def two_link(*settings):
     scenario = load_scenario(find_scenario("two_link_wall"), settings)
-    return *build(scenario), scenario
+    return *build_scenario(scenario), scenario
 
 
 def test_a_projection_that_fails_gets_time_and_state():
-    """Steps of 10 ms jump over the singularity at z = 1.6 m, and off the manifold."""
-    loop, context, scenario = two_link(
-        "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}",
-        "integrator.use_error_control=false",
-        "integrator.max_step_size=0.01",
+    """A circle, as the zero of a function that is flat where a step of 1 s at 50 m/s leads."""
+
+    def gradient(p):
+        return 8 * ca.sumsqr(p) ** 3 / (1 + ca.sumsqr(p) ** 4) ** 2 * p
+
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy"],
+        f=lambda s: [s[2], s[3], 0, 0],
+        g=lambda s: ca.vertcat(0, 0, gradient(s[:2])),
+        h=lambda s: [0, 0, 0, 1],
+        k=lambda s: [0.5 - 1 / (1 + ca.sumsqr(s[:2]) ** 4)],
+        l=lambda s: [s[1]],
+        m=lambda s: [[0]],
+        nominal_state=[1, 0, 0, 1],
+        name="flat",
     )
-    with pytest.raises(SimulationError, match=r"t = 0\.1\d* s, state \[.*wall.distance") as caught:
-        simulate(loop.diagram, context, 0.5, scenario.integrator)
-    assert 0.1 < caught.value.time < 0.2
-    assert caught.value.state.shape == (4,)
-    assert loop.record(context).time[-1] == pytest.approx(caught.value.time)
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(system))
+    control = builder.AddSystem(ConstantVectorSource([0.0]))
+    builder.Connect(control.get_output_port(), plant.get_input_port())
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), [1.0, 0.0, 0.0, 50.0])
+    config = SimulatorConfig(
+        integration_scheme="explicit_euler", max_step_size=1.0, use_error_control=False
+    )
+    with pytest.raises(SimulationError, match=r"too far at t = 1 s, state \[.*y0") as caught:
+        simulate(diagram, context, 3.0, config)
+    assert caught.value.time == 1.0
+    # Newton's law with v = 0: a straight line.
+    np.testing.assert_allclose(caught.value.state[:2], [1.0, 50.0], rtol=1e-12)
 
 
 def test_a_start_off_the_manifold_keeps_its_own_message():

@@ -62,7 +62,7 @@ def test_a_stretched_arm_is_named_singular():
     context.SetTime(1.5)
     system.GetInputPort("estimated_state").FixValue(context, [0.0, 0.0, 0.0, 0.0])
     system.GetInputPort("reference").FixValue(context, np.zeros(4))
-    with pytest.raises(SingularityError, match=r"singular at t = 1.5 s.*wall.force") as info:
+    with pytest.raises(SingularityError, match=r"wall.force is singular at t = 1.5 s") as info:
         system.GetOutputPort("control").Eval(context)
     assert info.value.time == 1.5
 
@@ -71,7 +71,7 @@ def test_an_input_that_is_not_finite_is_named():
     system, context = controller()
     system.GetInputPort("estimated_state").FixValue(context, [1.2, -1.6, np.nan, 0.0])
     system.GetInputPort("reference").FixValue(context, np.zeros(4))
-    with pytest.raises(NonFiniteError, match="input estimated_state is not finite at t = 0 s"):
+    with pytest.raises(NonFiniteError, match="its input joint1_w is not finite at t = 0 s"):
         system.GetOutputPort("control").Eval(context)
 
 

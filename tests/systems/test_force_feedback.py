@@ -9,24 +9,24 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
 
 from drake_dae import (
+    ConstantReference,
     DcMotors,
     ElectrohydraulicServos,
     FlexibleJoints,
     ForceSensor,
     ReferenceGenerator,
     RobotPlant,
+    SinusoidReference,
     TrackingController,
     TrackingLaw,
-    constant,
     poles,
-    sinusoids,
 )
 from drake_dae.errors import GainError, ModelError
 
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 SERVOS = ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
-MOVE = [sinusoids(0.3, 0.1, 1.5), sinusoids(20.0, 5.0, 2.0)]
-HOLD = [constant(0.3), constant(20.0)]
+MOVE = [SinusoidReference(0.3, 0.1, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
+HOLD = [ConstantReference(0.3), ConstantReference(20.0)]
 
 
 def run(
@@ -48,7 +48,7 @@ def run(
     """
     chosen = TrackingLaw(model.dae, poles(-10.0), measured_force=measured, force_gain=gain)
     builder = DiagramBuilder()
-    plant = builder.AddSystem(RobotPlant(model, chosen.structure))
+    plant = builder.AddSystem(RobotPlant(model, structure=chosen.structure))
     controller = builder.AddSystem(TrackingController(chosen))
     reference = builder.AddSystem(ReferenceGenerator(references, chosen.degrees))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
@@ -85,11 +85,12 @@ def run(
     return times, log.data().T - wanted, chosen, state, parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 4.0])
 def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     """(61) with a wrong mass: within 5 %, of which the lag takes about 1 %; position untouched."""
     model = arm("two_link").model
-    slow, sensor = [MOVE[0], sinusoids(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
+    slow, sensor = [MOVE[0], SinusoidReference(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
     times, without, *_ = run(model, slow)
     _, feedback, *_ = run(model, slow, measured=True, gain=gain, sensor=sensor)
     later = times > 1.0
@@ -101,6 +102,7 @@ def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [MOTORS, SERVOS], ids=["motors", "servos"])
 def test_measured_force_removes_the_static_error_behind_motors(stage):
     """At rest I_a' = 0 and the model's lambda' is 0, so (81) leaves Lambda_4 (lambda - r_2) = 0."""
@@ -113,6 +115,7 @@ def test_measured_force_removes_the_static_error_behind_motors(stage):
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_measured_force_removes_the_misprediction_behind_springs():
     """At rest (71) leaves Lambda_5 (lambda - r_2) = -lambda'' of the model, not 0.
 
@@ -127,7 +130,7 @@ def test_measured_force_removes_the_misprediction_behind_springs():
         reference[0], reference[5] = 0.3, 20.0
         force = error[-1, 1] + 20.0
         given = {"measured_force": [force]} if measured else {}
-        u = chosen.control(state, reference, parameters, **given)
+        u = chosen.control(state, reference, parameters=parameters, **given)
         values = _evaluate(structure, state, parameters, u)
         predicted, second_rate = values
         stiffness = 100.0  # Lambda_5 of two poles at -10
@@ -161,8 +164,8 @@ def test_with_a_right_model_measured_force_changes_nothing():
     for stages in ([MOTORS], [FlexibleJoints(8000.0, inertia=1.0)]):
         model = touching("two_link", stages)
         plain = TrackingLaw(model.dae, poles(-4.0))
-        fed = TrackingLaw(model.dae, poles(-4.0), plain.structure, measured_force=True)
-        plant = RobotPlant(model, plain.structure)
+        fed = TrackingLaw(model.dae, poles(-4.0), structure=plain.structure, measured_force=True)
+        plant = RobotPlant(model, structure=plain.structure)
         context = plant.CreateDefaultContext()
         random = np.random.default_rng(5)
         for state in plain.structure.states[:4]:
@@ -180,7 +183,11 @@ def test_law_59_with_measured_force():
     """u of (59) less u without Gbar is J^T Gbar (lambda - r_2)."""
     found, gain = arm("two_link"), 3.0
     fed = TrackingLaw(
-        found.model.dae, poles(-4.0), found.structure, measured_force=True, force_gain=gain
+        found.model.dae,
+        poles(-4.0),
+        structure=found.structure,
+        measured_force=True,
+        force_gain=gain,
     )
     for state in consistent_states("two_link", 5):
         reference = np.array([0.1, 0.2, 0.3, 20.0])
@@ -255,6 +262,7 @@ def test_sampling_holds():
     np.testing.assert_allclose(values[0, middle], np.sin(3.0 * (times[middle] - 0.05)), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_has_its_deviation_and_its_seed():
     sensor = lambda: ForceSensor(2, 0.01, noise_deviation=[0.5, 2.0])  # noqa: E731
     still = ConstantVectorSource([0.0, 0.0])

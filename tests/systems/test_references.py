@@ -9,12 +9,12 @@ from pydrake.math import BsplineBasis
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
 
 from drake_dae import (
-    ExpressionSignal,
+    ConstantReference,
+    ExpressionReference,
+    PointToPointReference,
     ReferenceGenerator,
-    TrajectorySignal,
-    constant,
-    point_to_point,
-    sinusoids,
+    SinusoidReference,
+    TrajectoryReference,
 )
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
 
@@ -26,7 +26,9 @@ def table(signal, degree, time):
 
 
 def test_layout_is_output_major():
-    generator = ReferenceGenerator([sinusoids(1.0, 2.0, 3.0), constant([7.0, 8.0])], [2, 1, 0])
+    generator = ReferenceGenerator(
+        [SinusoidReference(1.0, 2.0, 3.0), ConstantReference([7.0, 8.0])], [2, 1, 0]
+    )
     expected = [1.0, 6.0, 0.0, 7.0, 0.0, 8.0]
     np.testing.assert_allclose(generator.reference(0.0), expected, atol=1e-15)
     context = generator.CreateDefaultContext()
@@ -37,7 +39,7 @@ def test_layout_is_output_major():
 
 def test_sums_of_sinusoids():
     t, a, w, p = 0.7, np.array([0.5, -2.0]), np.array([3.0, 0.4]), np.array([0.1, 1.0])
-    found = table(sinusoids(4.0, a, w, p), 4, t)[0]
+    found = table(SinusoidReference(4.0, a, w, p), 4, t)[0]
     angle = w * t + p
     expected = [
         4.0 + np.sum(a * np.sin(angle)),
@@ -51,7 +53,7 @@ def test_sums_of_sinusoids():
 
 def test_quintic():
     """Order 2 is 10 s^3 - 15 s^4 + 6 s^5."""
-    signal = point_to_point(1.0, 3.0, 2.0, 4.0)
+    signal = PointToPointReference(1.0, 3.0, 2.0, 4.0)
     for time in (2.3, 3.0, 3.9):
         s = (time - 2.0) / 2.0
         expected = [
@@ -64,7 +66,7 @@ def test_quintic():
 
 @pytest.mark.parametrize("order", [2, 4, 6])
 def test_moves_are_smooth_at_both_ends_and_held_outside(order):
-    signal = point_to_point([0.0, 5.0], [1.0, 4.0], 1.0, 2.0, order)
+    signal = PointToPointReference([0.0, 5.0], [1.0, 4.0], 1.0, 2.0, order)
     for time, value in ((0.5, [0.0, 5.0]), (2.5, [1.0, 4.0])):
         found = table(signal, order, time)
         np.testing.assert_array_equal(found[:, 0], value)
@@ -77,7 +79,7 @@ def test_moves_are_smooth_at_both_ends_and_held_outside(order):
 
 
 def test_expressions_of_time():
-    signal = ExpressionSignal(lambda t: [t**3, ca.exp(-t) * t])
+    signal = ExpressionReference(lambda t: [t**3, ca.exp(-t) * t])
     np.testing.assert_allclose(
         table(signal, 2, 2.0),
         [[8.0, 12.0, 12.0], np.exp(-2.0) * np.array([2.0, -1.0, 0.0])],
@@ -94,7 +96,7 @@ def test_drake_trajectories():
     )
     points = list(np.arange(9.0)[:, None, None])
     for path in (spline, BsplineTrajectory(BsplineBasis(6, 9), points)):
-        signal, time = TrajectorySignal(path), path.start_time() + 0.37
+        signal, time = TrajectoryReference(path), path.start_time() + 0.37
         found = table(signal, 2, time)
         for order in range(3):
             np.testing.assert_allclose(
@@ -104,7 +106,7 @@ def test_drake_trajectories():
 
 def test_trajectories_and_expressions_stack():
     path = PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]])
-    generator = ReferenceGenerator([constant(3.0), TrajectorySignal(path)], [1, 1])
+    generator = ReferenceGenerator([ConstantReference(3.0), TrajectoryReference(path)], [1, 1])
     np.testing.assert_allclose(generator.reference(0.5), [3.0, 0.0, 0.5, 1.5], atol=1e-15)
 
 
@@ -116,22 +118,22 @@ def hold(values):
     ("make", "message"),
     [
         (
-            lambda: ReferenceGenerator([constant(1.0)], [2, 2]),
+            lambda: ReferenceGenerator([ConstantReference(1.0)], [2, 2]),
             "cover 1 outputs, the law has 2",
         ),
         (
-            lambda: ReferenceGenerator([point_to_point(0, 1, 0, 1)], [4]),
+            lambda: ReferenceGenerator([PointToPointReference(0, 1, 0, 1)], [4]),
             "2 continuous derivatives, the law needs 4: pass order=4",
         ),
         (
-            lambda: ReferenceGenerator([TrajectorySignal(hold([0, 1, 0]))], [2]),
+            lambda: ReferenceGenerator([TrajectoryReference(hold([0, 1, 0]))], [2]),
             "derivative 1 of row 0 .* jumps by -2 at t = 1 s",
         ),
-        (lambda: point_to_point(0, 1, 1, 1), "end_time 1 must be after"),
-        (lambda: sinusoids(0.0, [1, 2], [1, 2, 3]), "same length"),
-        (lambda: ExpressionSignal(lambda t: ca.SX.sym("a") * t), "with a other symbols"),
+        (lambda: PointToPointReference(0, 1, 1, 1), "end_time 1 must be after"),
+        (lambda: SinusoidReference(0.0, [1, 2], [1, 2, 3]), "amplitudes has 2, frequencies has 3"),
+        (lambda: ExpressionReference(lambda t: ca.SX.sym("a") * t), "with a other symbols"),
         (
-            lambda: TrajectorySignal(PiecewisePolynomial(np.eye(2))),
+            lambda: TrajectoryReference(PiecewisePolynomial(np.eye(2))),
             "must be a column, this one is 2 x 2",
         ),
     ],
@@ -142,13 +144,13 @@ def test_refusals(make, message):
 
 
 def test_a_time_outside_a_trajectory_is_refused():
-    generator = ReferenceGenerator([TrajectorySignal(hold([0, 1]))], [1])
+    generator = ReferenceGenerator([TrajectoryReference(hold([0, 1]))], [1])
     with pytest.raises(ReferenceSignalError, match=r"covers 0 to 1 s and was asked for t = 1.5 s"):
         generator.reference(1.5)
 
 
 def test_a_reference_that_is_not_finite_raises():
-    generator = ReferenceGenerator([ExpressionSignal(lambda t: ca.log(t))], [1])
+    generator = ReferenceGenerator([ExpressionReference(lambda t: ca.log(t))], [1])
     with pytest.raises(NonFiniteError, match="reference is not finite at t = 0 s"):
         generator.GetOutputPort("reference").Eval(generator.CreateDefaultContext())
 
@@ -156,7 +158,7 @@ def test_a_reference_that_is_not_finite_raises():
 @pytest.mark.parametrize("order", [8, 16, 30])
 def test_high_orders_do_not_cancel(order):
     """The move stays between its ends and mirrors itself; all its terms are positive."""
-    signal = point_to_point(0.0, 1.0, 0.0, 1.0, order)
+    signal = PointToPointReference(0.0, 1.0, 0.0, 1.0, order)
     values = [table(signal, 0, t)[0, 0] for t in np.linspace(0.0, 1.0, 41)]
     assert np.all(np.diff(values) >= -1e-13)
     np.testing.assert_allclose(np.array(values) + values[::-1], 1.0, atol=1e-12)
@@ -165,11 +167,11 @@ def test_high_orders_do_not_cancel(order):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: point_to_point([1, 2, 3], [1, 2], 0, 1), r"start \(3,\), end \(2,\)"),
-        (lambda: point_to_point([1], [1, 2], 0, 1), "same length"),
-        (lambda: sinusoids(0.0, [1], [1, 2]), "same length"),
-        (lambda: point_to_point(0, 1, 0, 1, order=600), "order must be from 0 to 30"),
-        (lambda: sinusoids(0.0, "a", 1.0), "must be numbers"),
+        (lambda: PointToPointReference([1, 2, 3], [1, 2], 0, 1), "start has 3, end has 2"),
+        (lambda: PointToPointReference([1], [1, 2], 0, 1), "as many entries"),
+        (lambda: SinusoidReference(0.0, [1], [1, 2]), "as many entries"),
+        (lambda: PointToPointReference(0, 1, 0, 1, order=600), "order must be from 0 to 30"),
+        (lambda: SinusoidReference(0.0, "a", 1.0), "must be numbers"),
     ],
 )
 def test_more_refusals(make, message):
@@ -188,24 +190,24 @@ NOT_SMOOTH = {
 @pytest.mark.parametrize("what", NOT_SMOOTH)
 def test_kinks_and_steps_are_refused_where_derivatives_are_needed(what):
     """CasADi would take the derivatives of one side, and the error would leave its prediction."""
-    signal = ExpressionSignal(NOT_SMOOTH[what])
+    signal = ExpressionReference(NOT_SMOOTH[what])
     message = rf"^row 0 of the reference is not smooth: it takes {what} of the time\. .* needs 1 d"
     with pytest.raises(ReferenceSignalError, match=message):
-        ReferenceGenerator([constant(0.0), signal], [0, 1])
+        ReferenceGenerator([ConstantReference(0.0), signal], [0, 1])
     # A force that is met at once may jump.
     generator = ReferenceGenerator([signal], [0])
     assert np.isfinite(generator.reference(0.5)).all()
 
 
 def test_a_signal_of_which_one_row_is_not_smooth():
-    signal = ExpressionSignal(lambda t: [ca.sin(t), ca.fabs(t)])
+    signal = ExpressionReference(lambda t: [ca.sin(t), ca.fabs(t)])
     assert ReferenceGenerator([signal], [2, 0]).reference(-1.0)[3] == 1.0
     with pytest.raises(ReferenceSignalError, match=r"^row 1 of the reference is not smooth"):
         ReferenceGenerator([signal], [0, 2])
 
 
 def test_the_function_of_the_real_numbers_is_no_reference():
-    signal = ExpressionSignal(lambda t: math.sin(t))
+    signal = ExpressionReference(lambda t: math.sin(t))
     with pytest.raises(ReferenceSignalError, match=r"not finite, nan; .* use casadi\.sin"):
         ReferenceGenerator([signal], [2])
 
@@ -213,12 +215,12 @@ def test_the_function_of_the_real_numbers_is_no_reference():
 @pytest.mark.parametrize("value", [None, "a", [None], {}])
 def test_what_is_no_expression_is_refused(value):
     with pytest.raises(ReferenceSignalError, match="must be an expression of the time"):
-        ExpressionSignal(lambda t: value)
+        ExpressionReference(lambda t: value)
 
 
-def test_what_is_no_signal_is_refused():
-    with pytest.raises(ReferenceSignalError, match="constant: values must be numbers, got 'a'"):
-        constant("a")
-    message = r"references\[1\] must be a signal such as constant\(0\.3\), got 0\.5$"
+def test_what_is_no_reference_is_refused():
+    with pytest.raises(ReferenceSignalError, match="values: must be numbers, got 'a'"):
+        ConstantReference("a")
+    message = r"references\[1\] must be a reference such as ConstantReference\(0\.3\), got 0\.5$"
     with pytest.raises(ReferenceSignalError, match=message):
-        ReferenceGenerator([constant(0.3), 0.5], [0, 0])
+        ReferenceGenerator([ConstantReference(0.3), 0.5], [0, 0])

@@ -1,8 +1,17 @@
 """How far a matrix of the state is from losing its rank."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
-from drake_dae.arrays import FloatArray
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.dae.states.region import ConsistentRegion, Region
+from drake_dae.dae.states.samples import Samples
+from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
 SINGULAR = 1e-6
 """A matrix with a singular value below this, its rows and columns scaled, is singular."""
@@ -29,3 +38,127 @@ class Margin:
     def is_singular(self) -> bool:
         """Whether the rank is lost at `state`."""
         return self.relative < SINGULAR
+
+
+def find_margin(
+    samples: Samples, matrix: ca.SX, round_off: Booleans | None = None, search: bool = False
+) -> Margin:
+    """The smallest singular values of a matrix at sampled states and at what lies between.
+
+    The determinant of a square matrix that changes its sign on the way from the first state is
+    zero there, unless N* has no way, or the determinant is infinite on it.
+
+    Args:
+        samples: The states.
+        matrix: Shape (k, l), k <= l.
+        round_off: Which entries are taken as zero; none if None.
+        search: Also go downhill from the worst states, in the box that the states span and the
+            region.
+    """
+    scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
+    candidates = list(samples.states)
+    if matrix.is_square():
+        crossings = (_crossing(samples, scaled, there) for there in samples.states[1:])
+        candidates += [state for state in crossings if state is not None]
+    if search:
+        box = ConsistentRegion(samples.manifold, _surroundings(samples))
+        starts = sorted(candidates, key=scaled.distance)[:3]
+        candidates += [box.descend(scaled.slope, start) for start in starts]
+    state = min(candidates, key=scaled.distance)
+    length = np.linalg.norm(scaled(state), axis=1)
+    return Margin(
+        singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
+        relative=scaled.distance(state),
+        state=state,
+        vanishing_row=int(np.argmin(length)) if length.min() < SINGULAR else None,
+    )
+
+
+def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = None) -> bool:
+    """Whether a square matrix is regular at every sampled state itself."""
+    scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
+    return all(scaled.distance(state) >= SINGULAR for state in samples.states)
+
+
+def _surroundings(samples: Samples) -> Region:
+    """The box that the states span, within the region that they were drawn from."""
+    low, high = samples.states.min(axis=0), samples.states.max(axis=0)
+    given = samples.consistent.region
+    if given is not None:
+        # The edge of what is not named may lie a little beyond the random states.
+        more = 0.5 * (high - low)
+        low = np.where(np.isfinite(given.low), given.low, low - more)
+        high = np.where(np.isfinite(given.high), given.high, high + more)
+    return Region(low, high)
+
+
+def _crossing(samples: Samples, matrix: "_ScaledMatrix", there: FloatArray) -> FloatArray | None:
+    """Where the determinant changes its sign on the way from the first state, if it does."""
+    here = samples.states[0]
+
+    def sign(state: FloatArray) -> float:
+        return float(np.linalg.slogdet(matrix(state))[0])
+
+    start, end = sign(here), sign(there)
+    if start == end:
+        return None
+    for _ in range(60):
+        try:
+            middle = samples.manifold.project((here + there) / 2.0)
+        except InconsistentStateError:
+            return None
+        if not np.all(np.isfinite(matrix(middle))):
+            return None
+        if sign(middle) == start:
+            here = middle
+        else:
+            there = middle
+    return here
+
+
+class _ScaledMatrix:
+    """A matrix of the state, rows and columns scaled to about length one over all samples."""
+
+    def __init__(self, samples: Samples, matrix: ca.SX) -> None:
+        self._matrix, self._system = matrix, samples.system
+        self._function = samples.system.trace("margin", {"matrix": matrix}, often=False)
+        sizes = np.mean([np.abs(value) for (value,) in samples.values(matrix=matrix)], axis=0)
+        self._rows, self._columns = equilibration(sizes)
+
+    def plain(self, state: FloatArray) -> FloatArray:
+        """The matrix as it is, not scaled."""
+        value = self._function(state, self._system.parameter_values)[0]
+        return value.reshape(self._matrix.shape)
+
+    def __call__(self, state: FloatArray) -> FloatArray:
+        return self.plain(state) / self._rows[:, None] / self._columns
+
+    def distance(self, state: FloatArray) -> float:
+        """The smallest singular value; infinite where the matrix is not finite."""
+        value = self(state)
+        return smallest_singular_value(value) if np.all(np.isfinite(value)) else np.inf
+
+    def slope(self, state: FloatArray) -> tuple[float, FloatArray]:
+        """The smallest singular value s and its gradient d(a' M b)/dx, where M b = s a."""
+        value = self(state)
+        if not np.all(np.isfinite(value)):
+            return np.inf, np.zeros(state.size)
+        left, values, right = np.linalg.svd(value, full_matrices=False)
+        a, b = left[:, -1] / self._rows, right[-1] / self._columns
+        gradient = self._gradient(state, a, b, self._system.parameter_values)[0]
+        return float(values[-1]), np.where(np.isfinite(gradient), gradient, 0.0)
+
+    @cached_property
+    def _gradient(self) -> TracedFunction:
+        rows, columns = self._matrix.shape
+        a, b = ca.SX.sym("a", rows), ca.SX.sym("b", columns)
+        product = ca.gradient(ca.bilin(self._matrix, a, b), self._system.state)
+        outputs, inputs = {"gradient": product}, {"a": a, "b": b}
+        return self._system.trace("slope of a margin", outputs, inputs, often=False)
+
+
+def _masked(matrix: ca.SX, zero: Booleans | None) -> ca.SX:
+    result = ca.SX(matrix)
+    for i, j in np.argwhere(zero) if zero is not None else ():
+        result[int(i), int(j)] = 0.0
+    return ca.sparsify(result)

@@ -2,16 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
-import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold import Manifold
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import ROUND_OFF
+from drake_dae.trace.newton import Linearization, newton
 
 _SLACK = 1e-6
 """How far out of a box a state may be, relative to the box, as Newton's method leaves it."""
@@ -51,21 +48,6 @@ class ConsistentRegion:
     def __init__(self, manifold: Manifold, region: Region | None) -> None:
         self.manifold = manifold
         self.region = region
-
-    def _gradients(self, state: FloatArray) -> FloatArray:
-        """C = d(residual)/dx, shape (sum r_i, n)."""
-        values = self._gradient(state, self.manifold.system.parameter_values)[0]
-        return values.reshape(-1, state.size)
-
-    @cached_property
-    def _gradient(self) -> TracedFunction:
-        system = self.manifold.system
-        return TracedFunction(
-            f"{system.name} constraints",
-            {"x": system.state, "p": system.parameter_symbol},
-            {"gradient": ca.jacobian(self.manifold.residual_expression, system.state)},
-            often=False,
-        )
 
     def project(self, guess: FloatArray) -> FloatArray:
         """A consistent state in the region, near a guess.
@@ -155,7 +137,7 @@ class ConsistentRegion:
         self, region: Region, state: FloatArray, gradient: FloatArray, width: FloatArray
     ) -> FloatArray:
         """Against the gradient, along N* and not out of the box, in units of the box."""
-        rows = self._gradients(state) * width
+        rows = self.manifold.gradients(state) * width
         slope = gradient * width
         held = np.zeros(state.size, dtype=bool)
         while True:
@@ -179,17 +161,20 @@ class ConsistentRegion:
             return float(np.min((edge - state)[moving] / step[moving], initial=np.inf))
 
     def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
-        """Newton's method for the constraints that does not leave the box."""
-        state = np.clip(guess, region.low, region.high)
-        for _ in range(30):
-            residual, gradient = self.manifold.residual(state), self._gradients(state)
-            if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(gradient))):
-                break
-            step = _bounded_step(gradient, residual, region.low - state, region.high - state)
-            state = np.clip(state + step, region.low, region.high)
-            if np.max(np.abs(step), initial=0.0) <= ROUND_OFF * np.max(np.abs(state)):
-                break
-        return state
+        """Where Newton's method for the constraints ends that does not leave the box."""
+
+        def linearize(state: FloatArray) -> Linearization | None:
+            gradient = self.manifold.gradients(state)
+            if not np.all(np.isfinite(gradient)):
+                return None
+
+            def step(x: FloatArray) -> FloatArray:
+                residual = self.manifold.residual(x)
+                return _bounded_step(gradient, residual, region.low - x, region.high - x)
+
+            return Linearization(step, True)
+
+        return newton(np.clip(guess, region.low, region.high), linearize)[0]
 
 
 def _bounded_step(

@@ -9,6 +9,7 @@ x' = f* + h* u.
 """
 
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 
 import casadi as ca
@@ -24,6 +25,15 @@ from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
 VANISHED = 1e-9
 """Below this part of its usual margin A or B counts as singular, also where it is one number."""
+
+
+class Regularity(Enum):
+    """Whether the motion is determined at a point; the value says what is wrong."""
+
+    REGULAR = ""
+    MATRIX_NOT_FINITE = "A(x) or B(x) is not finite"
+    SINGULAR = "A(x) or B(x) is singular"
+    RATE_NOT_FINITE = "x' is not finite"
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +66,7 @@ class Point:
 
     @cached_property
     def signs(self) -> tuple[float, ...]:
-        """Of det A and det B."""
+        """The signs of det A and det B."""
         return tuple(float(np.linalg.slogdet(_square(matrix))[0]) for matrix in (self.A, self.B))
 
 
@@ -64,12 +74,10 @@ class PinnedOutputs:
     """Z(R) and the motion on it; all arguments are arrays of the right sizes.
 
     Args:
-        structure: Of the system.
+        structure: What is assumed of the system.
 
     Attributes:
-        size: Of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), sum (mu_i + 1).
-        starts: Where r_1, r_2, ... stand in R.
-        met: The outputs of degree 0, which the control meets at once.
+        layout: How R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) is stacked.
         residual_signals: What is zero on Z(R): the constraints, then the output errors, each with
             its derivatives.
     """
@@ -77,53 +85,44 @@ class PinnedOutputs:
     def __init__(self, structure: Structure) -> None:
         self.structure = structure
         self.system = system = structure.system
-        ends = np.cumsum([degree + 1 for degree in structure.output_degrees])
-        self.size, self.starts = int(ends[-1]), np.array([0, *ends[:-1]])
-        self.met = [i for i, degree in enumerate(structure.output_degrees) if degree == 0]
-        self._R = goal = ca.SX.sym("R", self.size)
-        errors, signals = [], list(structure.manifold.residual_signals)
-        for chain, start, signal in zip(
-            structure.output_chains, self.starts, system.output_signals, strict=True
-        ):
-            errors += [element - goal[int(start) + j] for j, element in enumerate(chain)]
-            signals += [signal.derivative(j) for j in range(len(chain))]
-        self.residual_signals = tuple(signals)
-        residual = ca.vertcat(structure.manifold.residual_expression, *errors)
-
-        motion, highest = structure.motion, goal[(ends - 1).tolist()]
+        self.layout = layout = structure.layout
+        self._R = goal = ca.SX.sym("R", layout.reference_size)
+        self.residual_signals = (
+            *structure.manifold.residual_signals,
+            *layout.chain_signals(system.output_signals),
+        )
+        errors = structure.chain - goal[layout.chained.tolist(), :]
+        residual = ca.vertcat(structure.manifold.residual_expression, errors)
+        derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
         factors = Factorization(structure.control_matrix)
         control = factors.solve(highest - structure.drift)
         self._rate, force = (
-            ca.substitute(motion.expand(unknown), motion.control, control)
-            for unknown in (motion.rate, motion.constraint_input)
+            ca.substitute(derivatives.expand(unknown), derivatives.control, control)
+            for unknown in (derivatives.rate, derivatives.constraint_input)
         )
-        x, p = system.state, system.parameter_symbol
-        self._inputs = {"state": x, "reference": goal, "parameters": p}
-        self._residual = TracedFunction(
-            f"{system.name} pinned outputs", self._inputs, {"residual": residual}
-        )
-        self._gradient = TracedFunction(
-            f"{system.name} gradient of the pinned outputs",
-            {"state": x, "parameters": p},
-            {"gradient": ca.jacobian(ca.cse(residual), x)},
+        self._inputs = {"reference": goal}
+        self._residual = system.trace("pinned outputs", {"residual": residual}, self._inputs)
+        self._gradient = system.trace(
+            "gradient of the pinned outputs",
+            {"gradient": ca.jacobian(ca.cse(residual), system.state)},
             often=False,  # It shares what the residual does; to find more takes long.
         )
         # E x' = f + g v + h u, and the sizes of what cancels in it at rest.
         mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
-        sizes = ca.mtimes(mass, ca.fmax(1.0, ca.fabs(x))) + ca.fabs(system.f)
+        sizes = ca.mtimes(mass, ca.fmax(1.0, ca.fabs(system.state))) + ca.fabs(system.f)
         sizes += ca.mtimes(g, ca.fabs(force)) + ca.mtimes(h, ca.fabs(control))
-        self._motion = TracedFunction(
-            f"{system.name} pinned motion",
-            self._inputs,
+        self._motion = system.trace(
+            "pinned motion",
             {
                 "rate": self._rate,
                 "control": control,
-                "force": force,
+                "constraint_input": force,
                 "constraint_matrix": structure.elimination.constraint_matrix,
                 "control_matrix": structure.control_matrix,
                 "pivot": ca.fmin(factors.pivot, structure.elimination.pivot),
                 "unrest": ca.fabs(ca.mtimes(system.mass_matrix, self._rate)) / sizes,
             },
+            self._inputs,
         )
 
     def state(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -170,7 +169,7 @@ class PinnedOutputs:
 
     def describe(self, reference: FloatArray) -> str:
         """The outputs of a reference, for a message."""
-        values = zip(self.system.output_signals, reference[self.starts], strict=True)
+        values = zip(self.system.output_signals, self.layout.values(reference), strict=True)
         return "the outputs " + ", ".join(f"{signal.name} = {v:.6g}" for signal, v in values)
 
     def residual(
@@ -191,12 +190,15 @@ class PinnedOutputs:
     @cached_property
     def _slope(self) -> TracedFunction:
         """The derivative of x' along a direction of state and reference."""
-        dx, dr = ca.SX.sym("dx", self.system.num_states), ca.SX.sym("dR", self.size)
+        dx, dr = (
+            ca.SX.sym("dx", self.system.num_states),
+            ca.SX.sym("dR", self.layout.reference_size),
+        )
         at, along = ca.vertcat(self.system.state, self._R), ca.vertcat(dx, dr)
-        return TracedFunction(
-            f"{self.system.name} slope of the pinned motion",
-            {**self._inputs, "dx": dx, "dR": dr},
+        return self.system.trace(
+            "slope of the pinned motion",
             {"slope": ca.jtimes(ca.cse(self._rate), at, along)},
+            {**self._inputs, "dx": dx, "dR": dr},
             often=False,
         )
 
@@ -204,10 +206,11 @@ class PinnedOutputs:
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """dx'/dx, shape (n, n), and dx'/dr_i for the outputs of degree 0."""
-        n, directions = state.size, np.eye(state.size + self.size)
-        chosen = directions[[*range(n), *(n + self.starts[self.met])]]
+        n, directions = state.size, np.eye(state.size + self.layout.reference_size)
+        direct = self.layout.lowest[self.layout.direct]
+        chosen = directions[[*range(n), *(n + direct)]]
         columns = [
-            self._slope.evaluate(state, reference, parameters, along[:n], along[n:])[0].copy()
+            self._slope.evaluate(state, reference, along[:n], along[n:], parameters)[0].copy()
             for along in chosen
         ]
         slopes = np.array(columns).T
@@ -225,15 +228,14 @@ class PinnedOutputs:
     @cached_property
     def _balance(self) -> TracedFunction:
         """E, and the slope of f + g v + h u - E x' with all but the state fixed."""
-        system, motion = self.system, self.structure.motion
-        rate = ca.SX.sym("x'", system.num_states)
-        u, v = motion.control, ca.SX.sym("v", system.num_constraints)
+        system, u = self.system, self.structure.derivatives.control
+        rate, v = ca.SX.sym("x'", system.num_states), ca.SX.sym("v", system.num_constraints)
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
         balance -= ca.mtimes(system.mass_matrix, rate)
-        return TracedFunction(
-            f"{system.name} balance",
-            {"state": system.state, "rate": rate, "u": u, "v": v, "p": system.parameter_symbol},
+        return system.trace(
+            "balance",
             {"mass": system.mass_matrix, "slope": ca.jacobian(balance, system.state)},
+            {"rate": rate, "u": u, "v": v},
             often=False,
         )
 
@@ -242,22 +244,21 @@ class PinnedOutputs:
         values = self._motion.evaluate(state, reference, parameters)
         return Point(state, *(value.copy() for value in values))
 
-    def flaw(self, point: Point) -> str:
-        """Why the motion is not determined at a point; empty if it is."""
+    def regularity(self, point: Point) -> Regularity:
+        """Whether the motion is determined at a point."""
         if not (np.all(np.isfinite(point.A)) and np.all(np.isfinite(point.B))):
-            return "A(x) or B(x) is not finite"
+            return Regularity.MATRIX_NOT_FINITE
         pairs = zip(point.margins, self._usual_margins, strict=True)
-        if not point.pivot[0] > SINGULAR_PIVOT or any(
-            now < VANISHED * usual for now, usual in pairs
-        ):
-            return "A(x) or B(x) is singular"
+        vanished = any(now < VANISHED * usual for now, usual in pairs)
+        if vanished or not point.pivot[0] > SINGULAR_PIVOT:
+            return Regularity.SINGULAR
         moving = np.concatenate([point.rate, point.control, point.constraint_input])
-        return "" if np.all(np.isfinite(moving)) else "x' is not finite"
+        return Regularity.REGULAR if np.all(np.isfinite(moving)) else Regularity.RATE_NOT_FINITE
 
     @cached_property
     def _usual_margins(self) -> tuple[float, float]:
         """The largest margins of A and B at the states of the structure."""
-        reference, parameters = np.zeros(self.size), self.system.parameter_values
+        reference, parameters = np.zeros(self.layout.reference_size), self.system.parameter_values
         margins = [
             self.point(state, reference, parameters).margins for state in self.structure.states
         ]

@@ -5,66 +5,24 @@ that is 0, the reference alone determines the motion. All is done in the state x
 on the choice of xi in (22).
 """
 
-from dataclasses import dataclass
-from enum import StrEnum
-
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.states.samples import default_spread
-from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.dae.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion, Reference, follow
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point
+from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pursuit import Reference, follow
+from drake_dae.dae.zero_dynamics.stability import (
+    ComplexArray,
+    Stability,
+    Verdict,
+    judge,
+    linearized_eigenvalues,
+)
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
-
-AT_REST = 1e-8
-"""A state is at rest if its forces balance to this, relative to their sizes."""
-
-
-LINEARIZED = 1e-11
-"""The error of a linearization, relative to its norm: that of the equilibrium, and round-off."""
-
-
-SHIFT = 1e-7
-"""How far off an equilibrium may be, relative to the size of the states."""
-
-
-ComplexArray = np.typing.NDArray[np.complex128]
-
-
-class Verdict(StrEnum):
-    """What the linearization says of the zero dynamics."""
-
-    STABLE = "exponentially stable"
-    UNSTABLE = "unstable"
-    UNDECIDED = "undecided"
-
-
-@dataclass(frozen=True, eq=False)
-class Stability:
-    """Whether the internal states stay near an equilibrium while the outputs are held.
-
-    The verdict is local: it is about states near this equilibrium and outputs near its outputs.
-    What suffices for Assumption 2.2 everywhere, (i) and (ii) below (36), is not examined.
-
-    Attributes:
-        verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
-            one; undecided if one is on the imaginary axis up to round-off, or if no equilibrium is
-            found. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
-        eigenvalues: Of the zero dynamics in 1/s, largest real part first, shape (dimension,);
-            empty if no equilibrium is found.
-        state: The equilibrium, shape (n,); None if none is needed, or found.
-        reason: A sentence.
-    """
-
-    verdict: Verdict
-    eigenvalues: ComplexArray
-    state: FloatArray | None
-    reason: str
 
 
 class ZeroDynamics:
@@ -75,7 +33,8 @@ class ZeroDynamics:
     None; and `parameters` are the values of all parameters, the defaults if None.
 
     Args:
-        structure: Of the system, or the system.
+        system: (1)-(3).
+        structure: If it is known already; found otherwise.
 
     Attributes:
         dimension: dim xi = n - sum r_i - sum mu_i.
@@ -83,16 +42,13 @@ class ZeroDynamics:
             its derivatives.
     """
 
-    def __init__(self, structure: Structure | DaeSystem) -> None:
-        if not isinstance(structure, Structure):
-            structure = find_structure(structure)
-        self.structure = structure
-        self.system = structure.system
+    def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
+        self.structure = structure = structure_of("ZeroDynamics", system, structure)
+        self.system = system
         self.dimension = structure.zero_dynamics_dimension
         self._pinned = PinnedOutputs(structure)
+        self._equilibria = Equilibria(self._pinned)
         self.residual_signals = self._pinned.residual_signals
-        examined = np.abs(structure.states).max(axis=0)
-        self._sizes = np.maximum(examined, default_spread(self.system.nominal_state))
 
     def state(
         self,
@@ -109,8 +65,10 @@ class ZeroDynamics:
             InconsistentStateError: Newton's method does not reach Z(R) from there.
             ModelError: A wrong shape, or a number that is not finite.
         """
-        goal = self._vector("reference", reference, self._pinned.size)
-        return self._pinned.state(goal, self._guess(guess), self._parameters(parameters))
+        goal = self._vector("reference", reference, self._pinned.layout.reference_size)
+        return self._pinned.state(
+            goal, self._guess(guess), self.system.parameter_vector(parameters)
+        )
 
     def motion(
         self,
@@ -132,12 +90,12 @@ class ZeroDynamics:
 
         Raises:
             ModelError: A wrong shape, or times that do not increase. Any other failure is told by
-                the motion that comes back; see `PinnedMotion.failure`.
+                the motion that comes back; see `PinnedMotion.ending`.
         """
         grid = self._vector("times", times)
         if grid.size == 0 or np.any(np.diff(grid) <= 0.0):
             raise ModelError(f"{self.system.name}: times must increase, got {times!r}")
-        start, p = self._guess(guess), self._parameters(parameters)
+        start, p = self._guess(guess), self.system.parameter_vector(parameters)
         return follow(self._pinned, reference, grid, start, p)
 
     def equilibrium(
@@ -164,7 +122,9 @@ class ZeroDynamics:
             ModelError: A wrong shape, or a number that is not finite.
         """
         goal = self._constant(outputs)
-        return self._rest(goal, self._guess(guess), self._parameters(parameters))
+        return self._equilibria.find(
+            goal, self._guess(guess), self.system.parameter_vector(parameters)
+        )
 
     def eigenvalues(
         self,
@@ -191,18 +151,18 @@ class ZeroDynamics:
         Raises:
             ModelError: The state is not an equilibrium on N*.
         """
-        x, p = self._guess(state), self._parameters(parameters)
-        goal = self._held(x, p) if outputs is None else self._constant(outputs)
+        x, p = self._guess(state), self.system.parameter_vector(parameters)
+        goal = self._goal(x, outputs, p)
         onto, _ = self._pinned.project(x, goal, p)
-        unrest = self._unrest(self._pinned.point(x, goal, p), goal, p)
-        if np.any(np.abs(onto - x) > AT_REST * np.maximum(1.0, np.abs(x))):
-            unrest = "it is off N*, or its outputs change"
-        if unrest:
+        unrest = self._equilibria.unrest(self._pinned.point(x, goal, p), goal, p)
+        off = np.any(np.abs(onto - x) > AT_REST * np.maximum(1.0, np.abs(x)))
+        if off or unrest:
+            reason = "it is off N*, or its outputs change" if off else unrest
             raise ModelError(
-                f"{self.system.name}: x = {show(x)} is no regular equilibrium: {unrest}. "
+                f"{self.system.name}: x = {show(x)} is no regular equilibrium: {reason}. "
                 "Eigenvalues belong to an equilibrium; 'equilibrium' finds one"
             )
-        return self._eigenvalues(x, goal, p)[0]
+        return linearized_eigenvalues(self._pinned, self._equilibria.sizes, x, goal, p)[0]
 
     def stability(
         self,
@@ -237,174 +197,34 @@ class ZeroDynamics:
                     return Stability(Verdict.UNDECIDED, nothing, None, reason)
             reason = "no zero dynamics: the reference alone determines the motion"
             return Stability(Verdict.STABLE, nothing, None, reason)
-        p = self._parameters(parameters)
+        p = self.system.parameter_vector(parameters)
         start = self.structure.manifold.project(self._guess(state), p)
         try:
-            goal = self._held(start, p) if outputs is None else self._constant(outputs)
-            rest = self._rest(goal, start, p)
+            goal = self._goal(start, outputs, p)
+            rest = self._equilibria.find(goal, start, p)
         except InconsistentStateError as error:
             return Stability(Verdict.UNDECIDED, nothing, None, str(error))
-        values, errors = self._eigenvalues(rest, goal, p)
+        sizes = self._equilibria.sizes
+        values, errors = linearized_eigenvalues(self._pinned, sizes, rest, goal, p)
         place = f"at the equilibrium with {self._pinned.describe(goal)}"
-        largest = f"the largest real part of an eigenvalue is {values[0].real:.4g} 1/s {place}"
-        if np.any(values.real > errors):
-            return Stability(Verdict.UNSTABLE, values, rest, f"non-minimum phase: {largest}")
-        if np.all(values.real < -errors):
-            return Stability(Verdict.STABLE, values, rest, f"minimum phase: {largest}")
-        count = np.count_nonzero(np.abs(values.real) <= errors)
-        return Stability(
-            Verdict.UNDECIDED,
-            values,
-            rest,
-            f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
-            f"imaginary axis, up to round-off, {place}",
-        )
+        return judge(values, errors, rest, place)
 
     def _vector(self, what: str, value: ArrayLike, size: int | None = None) -> FloatArray:
-        try:
-            vector = np.array(value, dtype=float).reshape(-1)
-        except (TypeError, ValueError):
-            raise ModelError(f"{self.system.name}: {what} must be numbers, got {value!r}") from None
-        if size not in (None, vector.size):
-            raise ModelError(f"{self.system.name}: {what} must have size {size}, got {vector.size}")
-        if not np.all(np.isfinite(vector)):
-            raise ModelError(f"{self.system.name}: {what} must be finite, got {vector}")
-        return vector
+        return vector(f"{self.system.name}: {what}", np.ravel(value), size)
 
     def _guess(self, guess: ArrayLike | None) -> FloatArray:
         given = self.system.nominal_state if guess is None else guess
         return self._vector("state", given, self.system.num_states)
 
-    def _parameters(self, parameters: ArrayLike | None) -> FloatArray:
-        default = self.system.parameter_values
-        given = default if parameters is None else parameters
-        return self._vector("parameters", given, default.size)
-
-    def _eigenvalues(
-        self, state: FloatArray, reference: FloatArray, parameters: FloatArray
-    ) -> tuple[ComplexArray, FloatArray]:
-        """Of d(f* + h* u)/dx on the tangent space of Z(R), and how far off each may be.
-
-        That is by the round-off of what cancels in it, and by what a shift of the equilibrium
-        changes, which is not known better where Newton's method converges slowly.
-        """
-        pinned, scale = self._pinned, self._sizes
-        slopes, _ = pinned.slopes(state, reference, parameters)
-        tangent = scipy.linalg.null_space(pinned.gradients(state, parameters))
-        sizes = pinned.sizes_of_slopes(state, reference, parameters) / scale[:, None] * scale
-        noise = LINEARIZED * max(_scale(slopes), float(np.linalg.norm(sizes)))
-        values, errors = _eigenvalues(tangent.T @ slopes @ tangent, noise)
-        along = tangent @ np.random.default_rng(0).standard_normal(tangent.shape[1])
-        along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
-        beside, _ = pinned.slopes(state + SHIFT * along, reference, parameters)
-        if np.all(np.isfinite(beside)):
-            others = np.linalg.eigvals(tangent.T @ beside @ tangent)
-            errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
-        return values, errors
+    def _goal(
+        self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
+    ) -> FloatArray:
+        """R of constant outputs: those given, or those of a state."""
+        if outputs is None:
+            return self._equilibria.held_outputs(state, parameters)
+        return self._constant(outputs)
 
     def _constant(self, outputs: ArrayLike) -> FloatArray:
         """R of outputs that stay as they are."""
-        reference = np.zeros(self._pinned.size)
         values = self._vector("outputs", outputs, self.system.num_controls)
-        reference[self._pinned.starts] = values
-        return reference
-
-    def _held(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """R of constant outputs as they are at a state.
-
-        The state does not tell outputs of degree 0; they are as brings it nearest to rest.
-        """
-        pinned, reference = self._pinned, np.zeros(self._pinned.size)
-        errors = pinned.residual(state, reference, parameters)
-        first = sum(self.structure.constraint_degrees)
-        for start, degree in zip(pinned.starts, self.structure.output_degrees, strict=True):
-            if degree:
-                reference[start] = errors[first]
-            first += degree
-        if pinned.met:
-            _, slopes = pinned.slopes(state, reference, parameters)
-            rate = pinned.rate(state, reference, parameters)
-            if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
-                reference[pinned.starts[pinned.met]] = -np.linalg.pinv(slopes, DEPENDENT) @ rate
-        return reference
-
-    def _rest(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """An equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
-
-        T spans the tangent space of Z(R), in which x' is. Where there is a continuum, the step
-        along it is the shortest.
-        """
-        pinned = self._pinned
-
-        def linearize(x: FloatArray) -> Linearization | None:
-            gradients = pinned.gradients(x, parameters)
-            onto = shortest_steps(gradients, lambda x: pinned.residual(x, reference, parameters))
-            slopes, _ = pinned.slopes(x, reference, parameters)
-            if onto is None or not np.all(np.isfinite(slopes)):
-                return None
-            step_onto, regular = onto
-            tangent = scipy.linalg.null_space(gradients)
-            along = tangent.T @ slopes @ tangent
-            noise = ROUND_OFF * _scale(slopes) / (np.linalg.norm(along) or 1.0)
-            inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
-
-            def step(x: FloatArray) -> FloatArray:
-                across = step_onto(x)
-                return across - inner @ (pinned.rate(x, reference, parameters) + slopes @ across)
-
-            return step, regular
-
-        start = pinned.state(reference, guess, parameters)
-        state, converged = newton(start, linearize)
-        point = pinned.point(state, reference, parameters)
-        unrest = self._unrest(point, reference, parameters)
-        if converged and not unrest:
-            return state
-        raise InconsistentStateError(
-            f"{self.system.name}: {pinned.describe(reference)} have no regular state at rest near "
-            f"the given one: the search ends at x = {show(state)}, where "
-            f"{unrest or 'the equations are singular'}",
-            point.rate,
-        )
-
-    def _unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> str:
-        """What moves at a point, or is singular, if anything is.
-
-        Neither moves what a tiny change of the state brings to rest, as in a fast system.
-        """
-        flaw = self._pinned.flaw(point)
-        if flaw:
-            return flaw
-        slopes, _ = self._pinned.slopes(point.state, reference, parameters)
-        slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self._sizes
-        unrest = np.where(slow, 0.0, point.unrest)
-        worst = int(np.argmax(unrest))
-        if unrest[worst] <= AT_REST:
-            return ""
-        return f"{self.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
-
-
-def first_outputs(structure: Structure, reference: ArrayLike) -> FloatArray:
-    """r_1, ..., r_p of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape (p,)."""
-    starts = np.cumsum([0, *[degree + 1 for degree in structure.output_degrees[:-1]]])
-    return np.asarray(reference, dtype=float).reshape(-1)[starts]
-
-
-def _scale(matrix: FloatArray) -> float:
-    """The norm of a matrix without the units of its state."""
-    return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
-
-
-def _eigenvalues(matrix: FloatArray, error: float) -> tuple[ComplexArray, FloatArray]:
-    """Eigenvalues, largest real part first, and how far off each may be.
-
-    To first order an error E of the matrix moves an eigenvalue by at most |E| / |y^H x|, with its
-    left and right eigenvectors y and x of length one. Balancing takes the units out first.
-    """
-    if not matrix.size:
-        return np.zeros(0, dtype=complex), np.zeros(0)
-    balanced = scipy.linalg.matrix_balance(matrix, permute=False)[0]
-    values, left, right = scipy.linalg.eig(balanced, left=True, right=True)
-    errors = error / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), 1e-300)
-    order = np.lexsort((values.imag, -values.real))
-    return values[order], errors[order]
+        return self._pinned.layout.constant(values)

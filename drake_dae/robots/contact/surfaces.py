@@ -280,7 +280,8 @@ def _unit(name: str, value: ArrayLike) -> Vector:
     length = float(np.linalg.norm(array))
     if length == 0.0:
         raise ModelError(f"{name} must not be zero")
-    return _vector(name, array / length)
+    # A unit vector stays as it is, so that what was saved reads back equal.
+    return _vector(name, array if abs(length - 1.0) < 1e-15 else array / length)
 
 
 def _positive(name: str, value: float) -> None:

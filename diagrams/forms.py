@@ -1,0 +1,300 @@
+"""Dataclasses as forms of plain data: checked by pydantic, all that is wrong told at once.
+
+A dataclass is its own form: its fields, defaults and checks are those that data must keep. A type
+that is no data is `written` as another one; a member of a family is chosen by a tag.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
+from types import UnionType
+from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pydantic
+from pydantic_core import CoreSchema, ErrorDetails, core_schema
+
+from drake_dae.diagrams.typed_yaml import TAG
+from drake_dae.errors import ScenarioError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """Annotates a dataclass, or a Drake class with `__fields__`: data have the keys of its fields.
+
+    Attributes:
+        written: Annotation of a field -> the type that stands for it in data.
+        defaults: Name of a field -> value where data leave it out, if not that of the class.
+        tag: With which data choose the class, "!Sphere"; empty if there is no choice.
+        needs_tag: Whether data without a tag mean another class.
+    """
+
+    written: Mapping[Any, Any] = field(default_factory=dict)
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    tag: str = ""
+    needs_tag: bool = False
+
+    def __get_pydantic_core_schema__(
+        self, source: type[Any], handler: pydantic.GetCoreSchemaHandler
+    ) -> CoreSchema:
+        entries = {
+            name: core_schema.typed_dict_field(
+                handler.generate_schema(self._type_in_data(hint)),
+                required=required and name not in self.defaults,
+            )
+            for name, hint, required in _fields_of(source)
+        }
+        names, tag = list(entries), {TAG: self.tag} if self.tag else {}
+        if tag:
+            literal = core_schema.literal_schema([self.tag])
+            entries[TAG] = core_schema.typed_dict_field(literal, required=self.needs_tag)
+
+        def make(data: dict[str, Any]) -> Any:
+            data.pop(TAG, None)
+            return source(**{**self.defaults, **data})
+
+        def dump(made: Any, dump_data: Callable[[Any], Any]) -> Any:
+            return dump_data({**tag, **{name: getattr(made, name) for name in names}})
+
+        data = core_schema.typed_dict_schema(
+            entries,
+            cls=source,
+            extra_behavior="forbid",
+            config=core_schema.CoreConfig(strict=True, allow_inf_nan=False),
+        )
+        return core_schema.no_info_after_validator_function(
+            make,
+            data,
+            serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=data),
+        )
+
+    def _type_in_data(self, hint: Any) -> Any:
+        """What stands in data for a field with an annotation."""
+        if is_dataclass(hint):
+            return Annotated[hint, Form(self.written)]
+        members = _members(hint)
+        for annotation, form in self.written.items():
+            if _members(annotation) <= members:
+                return form | None if type(None) in members else form
+        return hint
+
+
+def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, bool]]:
+    """Name, annotation, and whether there is no default."""
+    if not is_dataclass(source):
+        yield from ((item.name, item.type, False) for item in source.__fields__)
+        return
+    hints = get_type_hints(source, include_extras=True)
+    for item in fields(source):
+        if item.init:
+            required = item.default is MISSING and item.default_factory is MISSING
+            yield item.name, hints[item.name], required
+
+
+def _members(hint: Any) -> set[Any]:
+    """Those of a Union; what is none stands for itself."""
+    return set(get_args(hint)) if get_origin(hint) in (Union, UnionType) else {hint}
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Annotates a Union of dataclasses: a tag chooses one, by default the first.
+
+    The tag is the name of the class. A member that is annotated with a `Form` has its tag and its
+    defaults.
+
+    Attributes:
+        written: As in `Form`, for all of them.
+    """
+
+    written: Mapping[Any, Any] = field(default_factory=dict)
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: pydantic.GetCoreSchemaHandler
+    ) -> CoreSchema:
+        forms: dict[type[Any], Form] = {}
+        for member in get_args(source):
+            cls, own = get_args(member) or (member, Form())
+            tag = own.tag or f"!{cls.__name__}"
+            forms[cls] = replace(own, written=self.written, tag=tag, needs_tag=bool(forms))
+        first = next(iter(forms.values())).tag
+
+        def chosen(value: Any) -> str | None:
+            if isinstance(value, dict):
+                return str(value.get(TAG, first))
+            return forms[type(value)].tag if type(value) in forms else None
+
+        choices = {
+            form.tag: handler.generate_schema(Annotated[cls, form]) for cls, form in forms.items()
+        }
+        return core_schema.tagged_union_schema(choices, chosen)
+
+
+def _numbers(value: Any) -> Any:
+    """A number, a list of numbers or a list of rows; a list of one number is that number."""
+    rows = value if isinstance(value, list) else [value]
+    is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if is_matrix else rows
+    for entry in entries:
+        if type(entry) not in (int, float) or not np.isfinite(entry):
+            wanted = "a number, a list of numbers, or a matrix as a list of rows"
+            raise ValueError(f"expected {wanted}, got {_show(entry)}")
+    if is_matrix and len({len(row) for row in rows}) > 1:
+        raise ValueError(f"the rows of {_show(value)} have different lengths")
+    if not entries:
+        raise ValueError("empty; give one number, or one for each")
+    numbers = np.array(value, dtype=float)
+    return numbers.tolist() if numbers.size > 1 else numbers.item()
+
+
+_NUMBER = {"type": "number"}
+_LIST = {"type": "array", "items": _NUMBER}
+
+Numbers = Annotated[
+    Any,
+    pydantic.PlainValidator(_numbers),
+    pydantic.PlainSerializer(lambda value: np.asarray(value, dtype=float).tolist()),
+    pydantic.WithJsonSchema({"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]}),
+]
+"""A number, a list of numbers, or a matrix row by row."""
+
+Row = Annotated[tuple[float, ...], pydantic.Strict(False)]
+"""A list of numbers."""
+
+Triple = Annotated[Row, pydantic.Field(min_length=3, max_length=3)]
+"""Three numbers."""
+
+
+class Reader(Generic[T]):
+    """Reads a dataclass from plain data, and writes it as such."""
+
+    def __init__(self, form: type[T]) -> None:
+        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
+        self.schema: dict[str, Any] = self._adapter.json_schema()
+        #: Dotted keys of the dictionaries with any names.
+        self.free_names = set(_free_names(self.schema, ""))
+
+    def read(self, data: Any) -> T:
+        """The dataclass.
+
+        Raises:
+            ScenarioError: All keys that are unknown or missing, and all values that are wrong.
+        """
+        try:
+            return self._adapter.validate_python(data)
+        except pydantic.ValidationError as error:
+            problems = [self._problem(details, data) for details in error.errors()]
+            raise ScenarioError(*problems) from None
+
+    def write(self, value: T) -> Any:
+        """Plain data that `read` makes the same of."""
+        return self._adapter.dump_python(value, mode="json")
+
+    def _problem(self, details: ErrorDetails, data: Any) -> tuple[str, str]:
+        """Dotted key and text."""
+        kind, loc, value = details["type"], details["loc"], details["input"]
+        if kind in ("missing", "extra_forbidden"):
+            place = _place(loc[:-1], self.schema, data)
+            return place.key, _wrong_key(place, str(loc[-1]), value, kind == "missing")
+        place = _place(loc, self.schema, data)
+        if kind == "value_error":
+            return place.key, str(details["ctx"]["error"])
+        return place.key, _wrong_value(place.schema, value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A place in data: its dotted key, its schema, and the tag that chose it, with all tags."""
+
+    key: str
+    schema: Mapping[str, Any]
+    data: Any
+    tag: str = ""
+    tags: str = ""
+
+
+def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _Place:
+    """Where pydantic's location is, in which a chosen tag is a part."""
+    keys: list[str] = []
+    tag = tags = ""
+    for part in loc:
+        if "oneOf" in schema:
+            tag, tags = str(part), _tags(schema)
+            schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
+        else:
+            keys.append(str(part))
+            inner = schema.get("items", schema.get("additionalProperties"))
+            schema = schema.get("properties", {}).get(part, inner)
+            data, tag = data[part], ""
+    return _Place(".".join(keys) or "scenario", schema, data, tag, tags)
+
+
+def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
+    """What is wrong about a key that is missing or should not be there."""
+    if name == TAG:
+        return f"takes no tag, got {value}"
+    names = [name for name in place.schema["properties"] if name != TAG]
+    title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
+    if is_missing:
+        return f"{title}needs the key '{name}'; {known}"
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    text = f"{title}has no key '{name}'; {hint}{known}"
+    if place.tag and TAG not in place.data:
+        text += f". No tag is given; there are {place.tags}"
+    return text
+
+
+def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
+    """What a schema expects instead of a value."""
+    if "oneOf" in schema:
+        expected = f"one of {_tags(schema)}"
+    elif "properties" in schema:
+        expected = f"keys {', '.join(schema['properties'])}"
+    elif "minItems" in schema:
+        expected = f"{schema['minItems']} numbers"
+    else:
+        expected = _IN_WORDS[schema["type"]]
+    text = f"expected {expected}, got {_show(value)}"
+    if schema.get("type") == "string" and isinstance(value, (bool, int, float)):
+        text += "; text that reads as something else goes in quotes"
+    return text
+
+
+_IN_WORDS = {
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "string": "text",
+    "array": "a list",
+    "object": "names with values",
+}
+
+
+def _tag(schema: Mapping[str, Any]) -> str:
+    return str(schema["properties"][TAG]["const"])
+
+
+def _tags(schema: Mapping[str, Any]) -> str:
+    return ", ".join(map(_tag, schema["oneOf"]))
+
+
+def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:
+    if isinstance(schema.get("additionalProperties"), dict):
+        yield path
+    for one in schema.get("oneOf", ()):
+        yield from _free_names(one, path)
+    for name, inner in schema.get("properties", {}).items():
+        yield from _free_names(inner, f"{path}.{name}" if path else name)
+
+
+def _show(data: Any) -> str:
+    """A value as the user wrote it, but short."""
+    if data is None:
+        return "nothing"
+    if isinstance(data, dict) and TAG in data:
+        return str(data[TAG])
+    text = repr(data)
+    return text if len(text) <= 60 else f"{text[:57]}..."

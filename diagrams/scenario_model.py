@@ -1,0 +1,169 @@
+"""From a scenario to its robot, with what it touches and what it shall steer."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.diagrams.scenario import FOLDER, Scenario
+from drake_dae.diagrams.scenario_parts import Robot, Written, made
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
+from drake_dae.robots.actuation import Stage
+from drake_dae.robots.contact import Constraint
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.outputs import PositionOutput
+
+T = TypeVar("T")
+S = TypeVar("S")
+
+
+def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
+    """The robot of a scenario, with what it touches and what it shall steer.
+
+    Args:
+        scenario: As loaded.
+        scene_graph: Where its geometry is registered, or None.
+
+    Raises:
+        ScenarioError: What does not fit, with the key.
+    """
+    # The robot.
+    name = Path(scenario.robot.file).name.split(".")[0]  # Of "two_arms.dmd.yaml", too.
+    links = _links(scenario.robot, scene_graph or SceneGraph())
+
+    # What it touches or holds.
+    constraints = _constraints(scenario.constraints, links)
+
+    # What it shall steer, from where, and by what.
+    outputs = _outputs(scenario.outputs, constraints, links)
+    guess = start_guess(scenario.start.positions, links)
+    stages = _stages(scenario.actuation, links)
+    with at("actuation" if stages else "outputs"):
+        return RobotModel(links, constraints, outputs, guess, name, stages)
+
+
+def scenario_structure(model: RobotModel) -> Structure:
+    """The structure of a scenario's robot.
+
+    Raises:
+        AssumptionError: An assumption that it violates.
+        ScenarioError: It starts nowhere near its constraints.
+    """
+    try:
+        return find_structure(model.dae)
+    except InconsistentStateError as error:
+        raise ScenarioError(("constraints or start.positions", str(error))) from error
+
+
+@contextmanager
+def at(key: str) -> Iterator[None]:
+    """Puts the key of the scenario before whatever goes wrong."""
+    try:
+        yield
+    except ScenarioError:
+        raise  # It has a key already.
+    except DrakeDaeError as error:
+        raise ScenarioError((key, str(error))) from error
+
+
+def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
+    """What is made of each item; an error bears the key and the item's index."""
+    results = []
+    for index, item in enumerate(items):
+        with at(f"{key}.{index}"):
+            results.append(make(item))
+    return results
+
+
+@at("robot.file")
+def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
+    links = MultibodyExpressions(_parse(robot, scene_graph))
+    if not links.actuator_signals:
+        raise ModelError(
+            f"'{Path(robot.file).name}' has no actuators; in a URDF, give each driven joint a "
+            "<transmission>"
+        )
+    return links
+
+
+def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
+    is_url = robot.file.startswith("package://")
+    if not is_url and not Path(robot.file).is_file():
+        raise ModelError(f"no file '{robot.file}'; a relative path starts in the scenario's folder")
+    # Continuous: only then are the plant's own dynamics those of (37).
+    plant = MultibodyPlant(0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    parser = Parser(plant)
+    try:
+        parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
+        for name, folder in robot.packages.items():
+            parser.package_map().Add(name, folder)
+        if is_url:
+            parser.AddModelsFromUrl(robot.file)
+        else:
+            parser.AddModels(robot.file)
+        plant.Finalize()
+    except RuntimeError as error:
+        raise ModelError(str(error)) from None
+    return plant
+
+
+def _constraints(
+    forms: Sequence[Constraint | Written[Constraint]], links: Links
+) -> list[Constraint]:
+    constraints = each("constraints", forms, lambda form: made(form, ()))
+    each("constraints", constraints, lambda constraint: constraint.residual(links))
+    names = [constraint.name for constraint in constraints]
+    for index, name in enumerate(names):
+        if not name or name in names[:index]:
+            key = f"constraints.{index}.name"
+            raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
+    return constraints
+
+
+def _outputs(
+    forms: Sequence[PositionOutput | Written[PositionOutput]],
+    constraints: Sequence[Constraint],
+    links: Links,
+) -> list[PositionOutput]:
+    outputs = each("outputs", forms, lambda form: made(form, constraints))
+    each("outputs", outputs, lambda output: output.expression(links))
+    return outputs
+
+
+def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
+    each("actuation", stages, lambda stage: stage.attach(links))
+    return stages
+
+
+@at("start.positions")
+def start_guess(positions: dict[str, float], links: Links) -> FloatArray:
+    """q near which the robot starts."""
+    guess = links.default_positions.copy()
+    for name, value in positions.items():
+        index = index_of(name, links.position_signals, "joint position")
+        low, high = (limits[index] for limits in links.position_limits)
+        if not low <= value <= high:
+            unit = links.position_signals[index].unit
+            raise ModelError(
+                f"{name} = {value:g} {unit} is outside its limits, {low:g} to {high:g} {unit}"
+            )
+        guess[index] = value
+    return guess
+
+
+def index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
+    """Where a name stands among signals."""
+    names = [signal.name for signal in signals]
+    if name not in names:
+        raise ModelError(unknown_name(kind, name, names))
+    return names.index(name)

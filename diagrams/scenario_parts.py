@@ -1,0 +1,203 @@
+"""Parts of a scenario that the library has not, or not as data: the others are its own classes."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Generic, TypeVar, cast
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.gains import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.diagrams.forms import Numbers, Triple
+from drake_dae.errors import GainError, ModelError
+from drake_dae.robots import contact, outputs
+from drake_dae.systems.sensors import ForceSensor
+
+T = TypeVar("T")
+
+
+class Written(ABC, Generic[T]):
+    """What a scenario writes in another way than the library holds it."""
+
+    @abstractmethod
+    def made(self, constraints: Sequence[contact.Constraint]) -> T:
+        """What the library holds.
+
+        Args:
+            constraints: Those of the scenario, as far as they are made.
+
+        Raises:
+            ModelError: What does not fit.
+        """
+
+
+def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
+    """What the library holds; its own classes are their forms."""
+    return form.made(constraints) if isinstance(form, Written) else form
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot that Drake's Parser reads.
+
+    Attributes:
+        file: A URDF, SDFormat or model-directives file, relative to the scenario, or
+            "package://drake_dae_models/<file>" for a shipped one.
+        packages: Name -> folder, relative to the scenario, for other "package://<name>/...".
+    """
+
+    file: str
+    packages: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
+
+    translation: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class WeldedFrames(Written[contact.Constraint]):
+    """`robots.contact.WeldedFrames`, its pose by angles."""
+
+    frame_a: str
+    frame_b: str
+    pose: Pose = Pose()
+    name: str = "weld"
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
+        pose = RigidTransform(rotation, self.pose.translation)
+        return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+
+
+@dataclass(frozen=True)
+class SurfaceCoordinates(Written[outputs.PositionOutput]):
+    """`robots.outputs.SurfaceCoordinates` of the constraint with a name."""
+
+    constraint: str
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        named = {constraint.name: constraint for constraint in constraints}
+        if self.constraint not in named:
+            raise ModelError(unknown_name("constraint", self.constraint, named))
+        return outputs.SurfaceCoordinates(cast(contact.PointOnSurface, named[self.constraint]))
+
+
+@dataclass(frozen=True)
+class ModelForce:
+    """The law uses the force of its model: (28)."""
+
+    is_measured: ClassVar = False
+    seed: ClassVar = 0
+    gain: ClassVar = 0.0
+
+    def sensor(self, size: int) -> ForceSensor | None:
+        """None is needed."""
+        return None
+
+
+@dataclass(frozen=True)
+class MeasuredForce:
+    """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
+
+    Attributes:
+        time_constant: Of the sensor's lag, in s.
+        sample_period: In s; 0 for none.
+        bias: In N (N m for a moment), one number for all forces or one each.
+        noise_deviation: Likewise.
+        seed: Of the noise.
+        gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
+    """
+
+    time_constant: float = 0.0
+    sample_period: float = 0.0
+    bias: Numbers = 0.0
+    noise_deviation: Numbers = 0.0
+    seed: int = 0
+    gain: Numbers = 0.0
+    is_measured: ClassVar = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**32:
+            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
+
+    def sensor(self, size: int) -> ForceSensor | None:
+        """The sensor of a number of forces."""
+        return ForceSensor(
+            size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
+        )
+
+
+@dataclass(frozen=True)
+class PerOutput:
+    """Numbers for all outputs, or per output name ("*" for all others)."""
+
+    all: list[float] = field(default_factory=list)
+    outputs: dict[str, list[float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.all and self.outputs:
+            raise GainError("give either 'all' or 'outputs', not both")
+
+
+@dataclass(frozen=True)
+class Poles(PerOutput):
+    """`dae.gains.poles`; complex ones are written as Coefficients."""
+
+    def design(self) -> GainDesign:
+        """The gains."""
+        return poles(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Coefficients(PerOutput):
+    """`dae.gains.gain_coefficients`: K_i1, ..., K_i mu_i."""
+
+    def design(self) -> GainDesign:
+        """The gains."""
+        return gain_coefficients(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """`dae.gains.gain_matrices`: for each degree, highest first, its Lambda_1, Lambda_2, ..."""
+
+    groups: list[list[list[list[float]]]]
+
+    def __post_init__(self) -> None:
+        for matrix in (matrix for group in self.groups for matrix in group):
+            if len({len(row) for row in matrix}) != 1:
+                raise GainError(f"groups: the rows of {matrix} have different lengths")
+
+    def design(self) -> GainDesign:
+        """The gains."""
+        return gain_matrices(*self.groups)
+
+
+@dataclass(frozen=True)
+class Start:
+    """At rest, on the constraint, with given errors of the position outputs.
+
+    Attributes:
+        positions: Joint name -> position near which the robot starts, in rad or m; the robot's
+            default where not given.
+        errors: Output name -> z - r at the start; 0 where not given. Forces can start off their
+            references where actuators have dynamics.
+    """
+
+    positions: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Write:
+    """What a run leaves in its folder, beside the scenario and the summary."""
+
+    record: bool = True
+    plots: bool = True
+    animation: bool = True

@@ -1,0 +1,144 @@
+"""The states that an analysis is asked to examine, and how it says which these are."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.analysis.tables import count_of
+from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.states.region import Region
+from drake_dae.dae.system import DaeSystem, usual_spread
+from drake_dae.errors import InconsistentStateError, ModelError
+
+Bounds = Mapping[str, tuple[float, float]]
+"""State name -> (lowest, highest)."""
+
+_NEIGHBOURS = 5
+"""Beside states that are given, where the first of them may have a zero that others have not."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExaminedStates:
+    """What an analysis starts from.
+
+    Attributes:
+        guesses: States near which consistent ones are looked for, shape (count, n).
+        num_given: How many of them, the first ones, were given as they are; 0 if they were drawn.
+        bounds: What region was asked for; empty if none was.
+        region: The same as a box; None if none was.
+    """
+
+    guesses: FloatArray
+    num_given: int
+    bounds: Bounds
+    region: Region | None
+
+    @classmethod
+    def drawn(
+        cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
+    ) -> "ExaminedStates":
+        """The nominal state first, then random ones, in a region or around the nominal one.
+
+        Raises:
+            ModelError: A region that is none.
+        """
+        nominal = system.nominal_state
+        drawn = nominal + system.nominal_spread * random.standard_normal((count, nominal.size))
+        if bounds is None:
+            return cls(np.vstack([nominal, drawn]), 0, {}, None)
+        region = _box(system, bounds)
+        named = np.isfinite(region.low)
+        low, high = region.low[named], region.high[named]
+        drawn[:, named] = random.uniform(low, high, (count, low.size))
+        guesses = np.vstack([np.clip(nominal, region.low, region.high), drawn])
+        return cls(guesses, 0, bounds, region)
+
+    @classmethod
+    def given(
+        cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
+    ) -> "ExaminedStates":
+        """The given states, and a few close to the first: what is zero at one alone is not zero.
+
+        Raises:
+            ModelError: Not finite numbers of shape (k, n).
+        """
+        given = numbers(f"{system.name}: states", states)
+        shape = (len(given) if given.ndim else 0, system.num_states)
+        if given.shape != shape or not given.size or not np.all(np.isfinite(given)):
+            raise ModelError(
+                f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
+                f"got {states!r}"
+            )
+        around = usual_spread(given[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
+        return cls(np.vstack([given, given[0] + 0.1 * around]), len(given), {}, None)
+
+    def describe(self, kept: int, noun: str) -> str:
+        """Which states were examined, in words.
+
+        Args:
+            kept: How many of the drawn ones were inside the domain and on N*.
+            noun: What they are called.
+        """
+        if self.num_given:
+            return f"{count_of(self.num_given, noun)} as given"
+        place = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
+        left_out = len(self.guesses) - kept
+        missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
+        return f"{count_of(kept, noun)} {place}{missing}"
+
+    def describe_region(self) -> str:
+        """The bounds as "x in [0, 1], ..."."""
+        return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.bounds.items())
+
+
+def check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) -> None:
+    """Refuses given states that are not consistent, or that are outside the domain.
+
+    Args:
+        manifold: N*.
+        given: Shape (k, n).
+        taken: Those that were found consistent and inside the domain, shape (l, n).
+
+    Raises:
+        InconsistentStateError, ModelError: Which one, and why.
+    """
+    name = manifold.system.name
+    for number, state in enumerate(given):
+        if not manifold.is_consistent(state):
+            residual = manifold.residual(state)
+            worst = int(np.argmax(np.abs(residual)))
+            raise InconsistentStateError(
+                f"{name}: states[{number}] is not consistent: "
+                f"{manifold.residual_signals[worst].name} = {residual[worst]:.3g}; project it, for "
+                "example with `find_structure(system).manifold.project`",
+                residual,
+            )
+        near = 1e-4 * np.maximum(np.abs(state), np.abs(taken).max(axis=0))
+        if not np.any(np.all(np.abs(taken - state) <= near, axis=1)):
+            raise ModelError(
+                f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
+                "finite there"
+            )
+
+
+def _box(system: DaeSystem, bounds: Bounds) -> Region:
+    if not isinstance(bounds, Mapping):
+        raise ModelError(
+            f"{system.name}: region must be state name -> (lowest, highest), got {bounds!r}"
+        )
+    low, high = np.full(system.num_states, -np.inf), np.full(system.num_states, np.inf)
+    names = [signal.name for signal in system.state_signals]
+    for name, interval in bounds.items():
+        if name not in names:
+            raise ModelError(f"{system.name}: region: {unknown_name('state', name, names)}")
+        pair = numbers(f"{system.name}: region: the bounds of '{name}'", interval)
+        if pair.shape != (2,) or not np.all(np.isfinite(pair)) or pair[0] > pair[1]:
+            raise ModelError(
+                f"{system.name}: region: '{name}' needs two finite numbers, the lowest and the "
+                f"highest value, got {interval!r}"
+            )
+        low[names.index(name)], high[names.index(name)] = pair
+    return Region(low, high)

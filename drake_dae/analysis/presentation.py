@@ -1,0 +1,260 @@
+"""An analysis as text, tables and data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.analysis.findings import OF_VERDICT, Finding
+from drake_dae.analysis.tables import Part, Table, count_of, digits
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.states.margins import SINGULAR, Margin
+from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
+
+if TYPE_CHECKING:
+    from drake_dae.analysis.report import Analysis
+
+
+def as_dict(analysis: Analysis) -> dict[str, Any]:
+    """What is printed as plain numbers, lists and texts, with the states of the margins."""
+    system = analysis.system
+    zero, motion = analysis.zero_dynamics, analysis.motion
+    return {
+        "name": system.name,
+        "num_states": system.num_states,
+        "num_constraints": system.num_constraints,
+        "num_controls": system.num_controls,
+        "states": [signal.name for signal in system.state_signals],
+        "examined_at": analysis.where,
+        "constraint_degrees": _by_name(
+            system.constraint_output_signals, analysis.constraint_degrees
+        ),
+        "index": analysis.index,
+        "manifold_dimension": analysis.manifold_dimension,
+        "output_degrees": _by_name(system.output_signals, analysis.output_degrees),
+        "output_order": None
+        if analysis.output_order is None
+        else [system.output_signals[i].name for i in analysis.output_order],
+        "zero_dynamics_dimension": analysis.zero_dynamics_dimension,
+        "assumptions": [
+            {
+                "number": a.number,
+                "statement": a.statement,
+                "finding": str(a.finding),
+                "margin": _margin(a.margin),
+                "reason": a.reason,
+            }
+            for a in analysis.assumptions
+        ],
+        "independence": _margin(analysis.independence),
+        "zero_dynamics": None
+        if zero is None
+        else {
+            "verdict": str(zero.verdict),
+            "eigenvalues": [[float(e.real), float(e.imag)] for e in zero.eigenvalues],
+            "state": None if zero.state is None else zero.state.tolist(),
+            "reason": zero.reason,
+        },
+        "reference": None if motion is None else _motion(motion),
+        "problems": list(analysis.problems),
+    }
+
+
+def parts_of(analysis: Analysis) -> list[Part]:
+    """Paragraphs and tables, without the problems."""
+    system = analysis.system
+    counts = (
+        count_of(system.num_states, "state"),
+        count_of(system.num_constraints, "constraint"),
+        count_of(system.num_controls, "control"),
+    )
+    parts: list[Part] = [[f"{system.name}: {', '.join(counts)}", f"examined at {analysis.where}"]]
+    if system.num_constraints:
+        rows = [
+            [signal.name, _known(analysis.constraint_degrees, i)]
+            for i, signal in enumerate(system.constraint_output_signals)
+        ]
+        parts.append(Table(["constraint", "r"], rows))
+    order = analysis.output_order
+    rows = [
+        [
+            signal.name,
+            _known(analysis.output_degrees, i),
+            "?" if order is None else str(order.index(i) + 1),
+        ]
+        for i, signal in enumerate(system.output_signals)
+    ]
+    parts.append(Table(["output", "mu", "order in (15)"], rows))
+    index, manifold, zero = (
+        "?" if number is None else str(number)
+        for number in (
+            analysis.index,
+            analysis.manifold_dimension,
+            analysis.zero_dynamics_dimension,
+        )
+    )
+    parts.append([f"index {index}, N* of dimension {manifold}, zero dynamics of dimension {zero}"])
+    parts.append(_findings(analysis))
+    margins = [a.margin for a in analysis.assumptions if a.margin] + [analysis.independence]
+    if any(margins):
+        parts.append(
+            [
+                "margin: smallest singular value after rows and columns are scaled to about "
+                f"length one; below {SINGULAR:.0e} it counts as singular."
+            ]
+        )
+    parts += _places(analysis)
+    if analysis.motion is not None and analysis.motion.times.size:
+        parts.append(_along(analysis.motion))
+    return parts
+
+
+def _findings(analysis: Analysis) -> Table:
+    free = "" if analysis.system.num_constraints else ": m = 0"
+    rows = [
+        [
+            f"({a.number})  {a.statement}{free if a.number <= 3 else ''}",
+            str(a.finding),
+            *_figures(a.margin),
+        ]
+        for a in analysis.assumptions
+    ]
+    chains, zero = Finding.NOT_EXAMINED, Finding.NOT_EXAMINED
+    if analysis.output_degrees is not None:
+        singular = analysis.independence is not None and analysis.independence.is_singular
+        chains = Finding.FAILS if singular else Finding.SATISFIED
+    if analysis.zero_dynamics is not None:
+        zero = OF_VERDICT[analysis.zero_dynamics.verdict]
+    none = ": there are none" if analysis.zero_dynamics_dimension == 0 else ""
+    rows += [
+        [
+            "2.1  theorem: gradients of all chains are independent",
+            chains,
+            *_figures(analysis.independence),
+        ],
+        [f"2.2  zero dynamics are stable{none}", zero, "", ""],
+    ]
+    return Table(["assumption", "finding", "margin", "singular value"], rows, left=2)
+
+
+def _places(analysis: Analysis) -> list[Part]:
+    """Where the margins are smallest, and what the zero dynamics do."""
+    lines = []
+    found = analysis.structure
+    if found is not None:
+        matrices = {2: found.elimination.constraint_matrix, 5: found.control_matrix}
+        lines = [
+            _nearest(analysis, a.number, matrices[a.number], a.margin)
+            for a in analysis.assumptions
+            if a.margin is not None and a.finding is Finding.SATISFIED
+        ]
+    zero = analysis.zero_dynamics
+    if zero is not None and zero.eigenvalues.size:
+        lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")
+    if zero is not None and analysis.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:
+        lines.append(f"Zero dynamics {zero.verdict}: {zero.reason}.")
+    return [lines] if lines else []
+
+
+def _nearest(analysis: Analysis, number: int, matrix: ca.SX, margin: Margin) -> str:
+    """Where A(x) or B(x) is nearest to singular, in the states that it depends on."""
+    letter, system = "A" if number == 2 else "B", analysis.system
+    used = ca.which_depends(ca.vec(matrix), system.state, 1, False)
+    if not any(used):
+        return f"{letter}(x) is the same at all states."
+    value = system.trace("margin", {"value": matrix}, often=False)
+    values = np.array(
+        [
+            value(state, system.parameter_values)[0]
+            for state in np.vstack([analysis.states, margin.state])
+        ]
+    )
+    if np.all(np.ptp(values, axis=0) <= 1e-9 * np.abs(values).max()):
+        return f"{letter}(x) is the same at all examined states."
+    return f"{letter}(x) is nearest to singular at {named(system, margin.state, used)}."
+
+
+def named(system: DaeSystem, state: FloatArray, chosen: Sequence[bool] | None = None) -> str:
+    """A state, or what is chosen of it, as name=value with unit, ..."""
+    return ", ".join(
+        f"{signal.name}={digits(value)} {signal.unit}".rstrip()
+        for i, (signal, value) in enumerate(zip(system.state_signals, state, strict=True))
+        if chosen is None or chosen[i]
+    )
+
+
+def _known(values: Sequence[int] | None, index: int) -> str:
+    return "?" if values is None else str(values[index])
+
+
+def _figures(margin: Margin | None) -> list[str]:
+    return (
+        ["", ""] if margin is None else [f"{margin.relative:.2g}", f"{margin.singular_value:.4g}"]
+    )
+
+
+def _along(motion: PinnedMotion) -> Table:
+    """The margins along the reference."""
+    rows = [
+        [letter, f"{smallest:.4g}", f"{time:.4g} s"]
+        for letter, (smallest, time) in _worst(motion).items()
+    ]
+    title = f"along the reference, {motion.times[0]:g} to {motion.times[-1]:g} s"
+    return Table([title, "smallest singular value", "at"], rows)
+
+
+def _worst(motion: PinnedMotion) -> dict[str, tuple[float, float]]:
+    """The smallest margins of A(x) and B(x), and when."""
+    found = {}
+    for letter, margins in (("A", motion.constraint_margins), ("B", motion.control_margins)):
+        if margins.size and np.all(np.isfinite(margins)):
+            worst = int(np.argmin(margins))
+            found[f"{letter}(x)"] = (float(margins[worst]), float(motion.times[worst]))
+    return found
+
+
+def _complex(values: ComplexArray) -> str:
+    """A conjugate pair as one."""
+    size = np.abs(values).max(initial=0.0)
+    texts = []
+    for value in values:
+        real = 0.0 if abs(value.real) < 1e-9 * size else value.real
+        if value.imag > 0.0:
+            texts.append(f"{real:.4g} ± {value.imag:.4g}i")
+        elif value.imag == 0.0:
+            texts.append(f"{real:.4g}")
+    return ", ".join(texts)
+
+
+def _by_name(signals: Sequence[Signal], values: Sequence[int] | None) -> dict[str, int] | None:
+    if values is None:
+        return None
+    return {signal.name: value for signal, value in zip(signals, values, strict=True)}
+
+
+def _margin(margin: Margin | None) -> dict[str, Any] | None:
+    if margin is None:
+        return None
+    return {
+        "singular_value": float(margin.singular_value),
+        "relative": float(margin.relative),
+        "state": margin.state.tolist(),
+    }
+
+
+def _motion(motion: PinnedMotion) -> dict[str, Any]:
+    return {
+        "times": [float(time) for time in motion.times[[0, -1]]] if motion.times.size else [],
+        "failure": "" if motion.ending is None else str(motion.ending),
+        "failure_time": None if motion.ending is None else float(motion.ending.time),
+        "margins": {
+            letter: {"smallest": smallest, "time": time}
+            for letter, (smallest, time) in _worst(motion).items()
+        },
+    }

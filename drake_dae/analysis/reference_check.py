@@ -1,0 +1,71 @@
+"""Whether a reference is what it says: each entry the derivative of the one before."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.layout import Layout
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+
+
+def check_reference(
+    system: DaeSystem, layout: Layout, reference: Callable[[float], FloatArray], times: ArrayLike
+) -> None:
+    """Refuses a reference whose derivatives are not those of its values.
+
+    They are compared with central differences of two steps: where these do not agree with each
+    other, as at a kink of the highest derivative, nothing is said.
+
+    Args:
+        system: (1)-(3).
+        layout: How R(t) is stacked.
+        reference: t -> R(t).
+        times: In s, shape (k,); where on the reference.
+
+    Raises:
+        ModelError: The size is wrong, or an entry is not the derivative of the one before.
+    """
+    grid = numbers(f"{system.name}: times", times).reshape(-1)
+
+    def value(time: float) -> FloatArray:
+        given = reference(time)
+        found = None if given is None else numbers(f"{system.name}: reference({time:g})", given)
+        if found is None or found.size != layout.reference_size:
+            raise ModelError(
+                f"{system.name}: the reference must have size {layout.reference_size} (each output "
+                f"and its derivatives up to its degree {layout.degrees}), got "
+                f"{'None' if found is None else found.size}"
+            )
+        return found.reshape(-1)
+
+    if not grid.size or not np.all(np.isfinite(grid)):
+        return
+    value(float(grid[0]))
+    length = float(grid[-1] - grid[0])
+    step = 1e-6 * length
+    if step <= 1e-9 * np.max(np.abs(grid)):
+        return
+    # Not at round fractions, where references have their breaks.
+    tried = grid[0] + length * (0.05 + 0.9 * (np.arange(1, 10) * 0.6180339887 % 1.0))
+    values = np.array([value(time) for time in tried])
+    slopes, coarse = (
+        np.array([(value(t + h) - value(t - h)) / (2 * h) for t in tried]) for h in (step, 2 * step)
+    )
+    signals = layout.reference_signals(system.output_signals)
+    for i in map(int, layout.chained):
+        told, found = values[:, i + 1], slopes[:, i]
+        scale = max(np.abs(told).max(), np.abs(found).max())
+        round_off = 1e-13 * np.abs(values[:, i]).max() / step
+        unsure = 4.0 * np.abs(found - coarse[:, i])
+        excess = np.abs(told - found) - 1e-3 * scale - round_off - unsure
+        worst = int(np.argmax(excess))
+        if excess[worst] > 0.0:
+            raise ModelError(
+                f"{system.name}: the reference contradicts itself: it tells "
+                f"{signals[i + 1].name} = {told[worst]:.4g} at t = {tried[worst]:.4g} s, but "
+                f"{signals[i].name} changes by {found[worst]:.4g} per second. Give the derivatives "
+                "of r, output by output: r_1, r_1', ..., r_2, ..."
+            )

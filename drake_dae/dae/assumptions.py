@@ -1,0 +1,140 @@
+"""How a system can violate Assumptions (1)-(5), as values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.states.margins import Margin
+from drake_dae.errors import AssumptionError
+
+
+class Cause(Enum):
+    """What a violation is; the value says what can be done about it."""
+
+    COUNT = "Remove the redundant ones"
+    CONSTRAINT_DEGREE = (
+        "Keep away from this state, or write the constraint so that its gradient does not vanish"
+    )
+    OUTPUT_DEGREE = "Choose another output, or keep away from this state"
+    EARLY_CONTROL = (
+        "The constraint then binds the control instead of the state. Take that control out, or add "
+        "an actuator state in front of it"
+    )
+    NO_FORCE = "It is redundant, or no force keeps it"
+    NO_CONTROL = "Choose another output"
+    CONSTRAINT_RANK = (
+        "The constraints are redundant or their forces cannot act independently. Remove a "
+        "redundant constraint, or keep away from this state"
+    )
+    CONTROL_RANK = (
+        "An output may repeat a constraint or another output; choose other outputs, keep away from "
+        "this state, or see whether `dynamic_extension` finds integrators that help"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Violation:
+    """How a system violates one of Assumptions (1)-(5).
+
+    Attributes:
+        assumption: Its number in the paper.
+        cause: What is wrong.
+        names: The constraints or outputs that it is about.
+        order: The order of the derivative of a constraint or output that it is about, if any.
+        state: A consistent state where the assumption fails, shape (n,); None if it fails
+            everywhere.
+        singular_value: The smallest one there of A(x) or B(x), rows and columns scaled, if the
+            rank is lost.
+    """
+
+    assumption: int
+    cause: Cause
+    names: tuple[str, ...]
+    order: int | None = None
+    state: FloatArray | None = None
+    singular_value: float | None = None
+
+    def __str__(self) -> str:
+        return f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
+
+    def error(self) -> AssumptionError:
+        """The exception to raise where the violation ends what was asked for."""
+        return AssumptionError(str(self), self.assumption, self.state, self)
+
+    def _found(self) -> str:
+        names = ", ".join(f"'{name}'" for name in self.names)
+        where = "" if self.state is None else f" at x = {show(self.state)}"
+        value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
+        match self.cause:
+            case Cause.COUNT:
+                return (
+                    f"the m = {len(self.names)} constraints are more than the states, so they "
+                    "depend on each other"
+                )
+            case Cause.CONSTRAINT_DEGREE:
+                return (
+                    f"the relative degree of constraint {names} is not defined{where}: the "
+                    f"constraint inputs act on its derivative {self.order} around this state, but "
+                    "not there"
+                )
+            case Cause.OUTPUT_DEGREE:
+                return (
+                    f"the relative degree of output {names} is not defined{where}: the control "
+                    f"acts on its derivative {self.order} around this state, but not there"
+                )
+            case Cause.EARLY_CONTROL:
+                return (
+                    f"the control acts on derivative {self.order} of constraint {names}, before "
+                    f"any constraint input does{where}"
+                )
+            case Cause.NO_FORCE:
+                return (
+                    f"no constraint input ever acts on constraint {names}: no force reaches it, or "
+                    "its derivatives repeat each other or fill the state"
+                )
+            case Cause.NO_CONTROL:
+                return (
+                    f"the control never acts on output {names}: its derivatives repeat those of "
+                    "the constraints, or no control reaches it, so it has no relative degree and "
+                    "B(x) no row for it"
+                )
+            case Cause.CONSTRAINT_RANK:
+                return (
+                    f"A(x) of (2) loses rank{where}: smallest singular value {value} (rows and "
+                    "columns scaled)"
+                )
+            case Cause.CONTROL_RANK:
+                return (
+                    f"B(x) of (16) is singular{where}: the controlled outputs "
+                    f"{', '.join(self.names)} cannot be steered independently; smallest singular "
+                    f"value {value} (rows and columns scaled)"
+                )
+
+
+def rank_violation(
+    margin: Margin | None,
+    signals: Sequence[Signal],
+    degrees: Sequence[int],
+    vanishing: tuple[int, Cause],
+    dependent: tuple[int, Cause],
+) -> Violation | None:
+    """What a singular matrix violates: one assumption if a whole row vanishes, another if not.
+
+    Args:
+        margin: How far the matrix is from singular; None if there is no matrix.
+        signals: What its rows are about.
+        degrees: The order of the derivative that each row belongs to.
+        vanishing, dependent: The number of the assumption, and the cause.
+
+    Returns:
+        None if the matrix is regular.
+    """
+    if margin is None or not margin.is_singular:
+        return None
+    row = margin.vanishing_row
+    if row is not None:
+        return Violation(*vanishing, (signals[row].name,), degrees[row], margin.state)
+    names = tuple(signal.name for signal in signals)
+    return Violation(*dependent, names, state=margin.state, singular_value=margin.relative)

@@ -1,0 +1,200 @@
+"""Relative degrees by Assumptions (1), (3) and (4), and the chains that they end.
+
+Whether an input acts on a derivative is decided by the structure of the expression first, then by
+its numbers at consistent states.
+"""
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.dae.assumptions import Cause, Violation
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.elimination import Elimination, affine, eliminate_numbers
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.states.region import Region
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.system import DaeSystem
+from drake_dae.trace.lie import lie_derivative, lie_derivative_along
+from drake_dae.trace.round_off import Sized
+
+MANY = 10
+"""So many random states have no zero in common of a function that is not zero."""
+
+
+def constraint_chains(
+    system: DaeSystem, guesses: FloatArray, region: Region | None
+) -> list[list[ca.SX]]:
+    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3).
+
+    Args:
+        system: (1)-(3).
+        guesses: States near which consistent ones are looked for, shape (count, n).
+        region: Where these must be; None for anywhere.
+
+    Raises:
+        AssumptionError: A violation of (1) or (3), or a constraint that no constraint input acts
+            on.
+    """
+    explicit = system.explicit
+    x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
+    chains = [[system.k[i]] for i in range(system.num_constraints)]
+    undecided = list(range(system.num_constraints))
+    while undecided:
+        last = ca.vertcat(*[chains[i][-1] for i in undecided])
+        by_force = lie_derivative_along(last, explicit.g, x)
+        by_control = lie_derivative_along(last, explicit.h, x)
+        samples = Samples(Manifold(system, chains), guesses, region)
+        force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
+        control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
+        still, stuck = [], []
+        for row, i in enumerate(undecided):
+            order = len(chains[i])
+            if force_acts[row].all():
+                continue
+            if force_acts[row].any():
+                state = samples.states[int(np.argmin(force_acts[row]))]
+                raise Violation(1, Cause.CONSTRAINT_DEGREE, (names[i],), order, state).error()
+            if control_acts[row].any():
+                state = samples.states[int(np.argmax(control_acts[row]))]
+                raise Violation(3, Cause.EARLY_CONTROL, (names[i],), order, state).error()
+            still.append(i)
+            if not _reaches(explicit.g, f, last[row], x) or (
+                by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
+            ):
+                stuck.append(i)
+        if sum(len(chain) for chain in chains) + len(still) > system.num_states:
+            stuck = still
+        if stuck:
+            raise Violation(2, Cause.NO_FORCE, tuple(names[i] for i in stuck)).error()
+        for i in still:
+            chains[i].append(lie_derivative(chains[i][-1], f, x))
+        undecided = still
+    return chains
+
+
+class OutputChains(NamedTuple):
+    """What Assumption (4) decides of the outputs; the attributes are those of `Structure`."""
+
+    chains: tuple[tuple[ca.SX, ...], ...]
+    drift: ca.SX
+    control_matrix: ca.SX
+    highest_derivatives: ca.SX
+    need_force: bool
+    round_off: Booleans
+
+
+def output_chains(
+    derivatives: Derivatives, elimination: Elimination, samples: Samples
+) -> OutputChains:
+    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x).
+
+    Args:
+        derivatives: Time derivatives along the constrained motion.
+        elimination: (9)-(14).
+        samples: The consistent states at which numbers decide.
+
+    Raises:
+        AssumptionError: A violation of (4), or an output that no control acts on.
+    """
+    system, control = derivatives.system, derivatives.control
+    x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
+    names, count = [s.name for s in system.output_signals], system.num_controls
+    moving = system.l + ca.mtimes(system.m, derivatives.constraint_input)
+    h_star_values, n_star_values = eliminated_at(samples, elimination)
+    drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
+    highest_derivatives = ca.SX(count, 1)
+    round_off, need_force = np.zeros((count, count), dtype=bool), False
+    chains: list[list[ca.SX]] = [[] for _ in range(count)]
+    slopes = np.array([value for value, _ in n_star_values])
+    following, rows = elimination.l_star, elimination.n_star
+    undecided = list(range(count))
+    while True:
+        acts, still = _acts(slopes), []
+        for row, i in enumerate(undecided):
+            if acts[row].all():
+                drift[i] = following[row]
+                control_matrix[i, :] = rows[row, :]
+                round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
+                highest_derivatives[i] = moving[row]
+            elif acts[row].any():
+                state = samples.states[int(np.argmin(acts[row]))]
+                order = len(chains[i])
+                raise Violation(4, Cause.OUTPUT_DEGREE, (names[i],), order, state).error()
+            else:
+                still.append(i)
+                chains[i].append(following[row])
+                need_force = need_force or derivatives.has_unknowns(moving[row])
+        if not still:
+            break
+        last = ca.vertcat(*[chains[i][-1] for i in still])
+        # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
+        moving = derivatives.derivative(moving[[undecided.index(i) for i in still]])
+        following, rows = affine(derivatives.expand(moving), control)
+        slopes = samples.derivatives(rows, last, h_star_values)
+        acts, stuck = _acts(slopes), []
+        for row, i in enumerate(still):
+            if acts[row].any():
+                continue
+            # By Theorem 2.1 these differentials are independent if the output has a degree; worth
+            # a look where nothing acts although the structure says that it could.
+            used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
+            if (
+                used.numel() >= system.num_states
+                or not _reaches(h_star, f_star, last[row], x)
+                or (rows[row, :].nnz() and samples.dependent(used))
+            ):
+                stuck.append(names[i])
+        if stuck:
+            raise Violation(5, Cause.NO_CONTROL, tuple(stuck)).error()
+        undecided = still
+    return OutputChains(
+        chains=tuple(tuple(chain) for chain in chains),
+        drift=drift,
+        control_matrix=control_matrix,
+        highest_derivatives=highest_derivatives,
+        need_force=need_force,
+        round_off=round_off,
+    )
+
+
+def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Sized], list[Sized]]:
+    """h* (10) and n* (12) at each state, without their round-off."""
+    factors = samples.values(
+        gradient=elimination.constraint_gradient, matrix=elimination.constraint_matrix
+    )
+    pairs = [
+        eliminate_numbers(fields, gradient, matrix, samples.scale)
+        for fields, (gradient, matrix) in zip(samples.fields, factors, strict=True)
+    ]
+    return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
+
+
+def _acts(numbers: FloatArray) -> Booleans:
+    """Which rows are not zero where: shape (a, samples), of numbers of shape (samples, a, k)."""
+    return np.asarray(numbers.any(axis=2)).T
+
+
+def _reaches(fields: ca.SX, drift: ca.SX, expression: ca.SX, state: ca.SX) -> bool:
+    """Whether an input along the fields can influence an expression at all, by structure."""
+    influence = _pattern(drift, state)
+    needed = _pattern(expression, state)[0]
+    for _ in range(state.numel()):
+        needed = needed | influence[needed].any(axis=0)
+    moved = _nonzeros(fields).any(axis=1)
+    return bool((needed & moved).any())
+
+
+def _pattern(expression: ca.SX, state: ca.SX) -> Booleans:
+    """Which entries (rows) depend on which states (columns)."""
+    return _nonzeros(ca.SX(ca.jacobian_sparsity(expression, state), 1))
+
+
+def _nonzeros(matrix: ca.SX) -> Booleans:
+    """Which entries are structurally nonzero."""
+    result = np.zeros(matrix.shape, dtype=bool)
+    rows, columns = matrix.sparsity().get_triplet()
+    result[rows, columns] = True
+    return result

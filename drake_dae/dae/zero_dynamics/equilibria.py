@@ -1,0 +1,123 @@
+"""States at rest with constant outputs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point, Regularity
+from drake_dae.dae.zero_dynamics.stability import balanced_norm
+from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
+
+AT_REST = 1e-8
+"""A state is at rest if its forces balance to this, relative to their sizes."""
+
+
+@dataclass(frozen=True)
+class Unrest:
+    """Why a state is no regular equilibrium.
+
+    Attributes:
+        regularity: Whether the motion is determined there.
+        moving: If it is, the state that moves most, relative to the forces that it balances.
+        rate: Its time derivative.
+    """
+
+    regularity: Regularity
+    moving: str = ""
+    rate: float = 0.0
+
+    def __str__(self) -> str:
+        return self.regularity.value or f"{self.moving}' = {self.rate:.3g}"
+
+
+class Equilibria:
+    """The states at rest on Z(R); all arguments are arrays of the right sizes.
+
+    Args:
+        pinned: Z(R).
+
+    Attributes:
+        sizes: How large the states are, shape (n,).
+    """
+
+    def __init__(self, pinned: PinnedOutputs) -> None:
+        self._pinned = pinned
+        examined = np.abs(pinned.structure.states).max(axis=0)
+        self.sizes = np.maximum(examined, pinned.system.nominal_spread)
+
+    def held_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
+        """R of constant outputs as they are at a state.
+
+        The state does not tell outputs of degree 0; they are as brings it nearest to rest.
+        """
+        pinned, layout = self._pinned, self._pinned.layout
+        reference = np.zeros(layout.reference_size)
+        chain = pinned.residual(state, reference, parameters)[-layout.chain_size :]
+        if layout.chain_size:
+            reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
+        if layout.direct.size:
+            _, slopes = pinned.slopes(state, reference, parameters)
+            rate = pinned.rate(state, reference, parameters)
+            if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
+                nearest = -np.linalg.pinv(slopes, DEPENDENT) @ rate
+                reference[layout.lowest[layout.direct]] = nearest
+        return reference
+
+    def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
+        """An equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
+
+        T spans the tangent space of Z(R), in which x' is. Where there is a continuum, the step
+        along it is the shortest.
+        """
+        pinned = self._pinned
+
+        def linearize(x: FloatArray) -> Linearization | None:
+            gradients = pinned.gradients(x, parameters)
+            onto = shortest_steps(gradients, lambda x: pinned.residual(x, reference, parameters))
+            slopes, _ = pinned.slopes(x, reference, parameters)
+            if onto is None or not np.all(np.isfinite(slopes)):
+                return None
+            step_onto, regular = onto
+            tangent = scipy.linalg.null_space(gradients)
+            along = tangent.T @ slopes @ tangent
+            noise = ROUND_OFF * balanced_norm(slopes) / (np.linalg.norm(along) or 1.0)
+            inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
+
+            def step(x: FloatArray) -> FloatArray:
+                across = step_onto(x)
+                return across - inner @ (pinned.rate(x, reference, parameters) + slopes @ across)
+
+            return Linearization(step, regular)
+
+        start = pinned.state(reference, guess, parameters)
+        state, converged = newton(start, linearize)
+        point = pinned.point(state, reference, parameters)
+        unrest = self.unrest(point, reference, parameters)
+        if converged and not unrest:
+            return state
+        raise InconsistentStateError(
+            f"{pinned.system.name}: {pinned.describe(reference)} have no regular state at rest "
+            f"near the given one: the search ends at x = {show(state)}, where "
+            f"{unrest or 'the equations are singular'}",
+            point.rate,
+        )
+
+    def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
+        """What moves at a point, or is singular, if anything is.
+
+        Neither moves what a tiny change of the state brings to rest, as in a fast system.
+        """
+        regularity = self._pinned.regularity(point)
+        if regularity is not Regularity.REGULAR:
+            return Unrest(regularity)
+        slopes, _ = self._pinned.slopes(point.state, reference, parameters)
+        slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self.sizes
+        unrest = np.where(slow, 0.0, point.unrest)
+        worst = int(np.argmax(unrest))
+        if unrest[worst] <= AT_REST:
+            return None
+        moving = self._pinned.system.state_signals[worst].name
+        return Unrest(regularity, moving, float(point.rate[worst]))

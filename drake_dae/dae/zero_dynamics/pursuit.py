@@ -1,0 +1,269 @@
+"""Motions with the outputs on a reference.                                          (35)-(36)"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import scipy.integrate
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.zero_dynamics.pinned_motion import Cause, Ending, PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point, Regularity
+from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
+
+TOLERANCE = 1e-6
+"""Of an integration step, relative to the state; the method's estimate is two orders too high."""
+
+
+SHORTEST = 1e-6
+"""The part of a time step at which a search for the way on ends."""
+
+
+JUMP = 0.1
+"""A correction of this size, relative to the state, may lead to another solution."""
+
+
+STEPS = 20_000
+"""The most steps of one motion, beside its times."""
+
+
+GROWN = 1e8
+"""By this factor a state grows only without bound."""
+
+
+LOST = 1e-2
+"""A margin below this part of its largest value on the way tends to zero."""
+
+
+Reference = Callable[[float], FloatArray]
+"""t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape (sum (mu_i + 1),)."""
+
+
+def follow(
+    pinned: PinnedOutputs,
+    reference: Reference,
+    times: FloatArray,
+    guess: FloatArray,
+    parameters: FloatArray,
+) -> PinnedMotion:
+    """The motion on Z(R(t)) from a state next to a guess; see `ZeroDynamics.motion`."""
+    points: list[Point] = []
+    ending = None
+    try:
+        with np.errstate(all="ignore"):  # States out of the domain are tried, and refused.
+            pursuit = _Pursuit(pinned, reference, parameters, times.tolist(), guess)
+            for point in pursuit.points():
+                points.append(point)
+    except _MotionEnd as end:
+        ending = end.ending
+    system, count = pinned.system, len(points)
+
+    def column(values: list[FloatArray], width: int) -> FloatArray:
+        return np.array(values).reshape(count, width)
+
+    margins = column([np.array(point.margins) for point in points], 2)
+    return PinnedMotion(
+        times=times[:count],
+        states=column([point.state for point in points], system.num_states),
+        controls=column([point.control for point in points], system.num_controls),
+        constraint_inputs=column(
+            [point.constraint_input for point in points], system.num_constraints
+        ),
+        constraint_margins=margins[:, 0],
+        control_margins=margins[:, 1],
+        ending=ending,
+    )
+
+
+class _MotionEnd(Exception):
+    """A motion does not go on."""
+
+    def __init__(self, ending: Ending) -> None:
+        super().__init__(str(ending))
+        self.ending = ending
+
+
+class _Pursuit:
+    """Follows a reference from point to point; raises _MotionEnd where that ends."""
+
+    def __init__(
+        self,
+        pinned: PinnedOutputs,
+        reference: Reference,
+        parameters: FloatArray,
+        times: list[float],
+        guess: FloatArray,
+    ) -> None:
+        self._pinned = pinned
+        self._reference = reference
+        self._parameters = parameters
+        self._times = times
+        self._remaining = STEPS + len(times)
+        self._name = pinned.system.name
+        self._time = times[0]
+        goal, when = self._goal(self._time), f"t = {self._time:.6g} s"
+        try:
+            start = pinned.state(goal, guess, parameters)
+        except InconsistentStateError as error:
+            ending = Ending(Cause.NO_START, self._time, f"{error} ({when})")
+            raise _MotionEnd(ending) from error
+        self._last = pinned.point(start, goal, parameters)
+        if pinned.regularity(self._last) is not Regularity.REGULAR:
+            text = (
+                f"{self._name}: at the start, {when}, x = {show(start)}, A(x) or B(x) is singular, "
+                "or the domain of the system ends"
+            )
+            raise _MotionEnd(Ending(Cause.SINGULAR_START, self._time, text, start))
+        self._largest = self._last.margins
+
+    def points(self) -> Iterator[Point]:
+        """One for each time."""
+        yield self._last
+        has_dynamics = self._pinned.structure.zero_dynamics_dimension > 0
+        yield from self._integrate() if has_dynamics else self._continue()
+
+    def _continue(self) -> Iterator[Point]:
+        """Without zero dynamics: predictor and Newton's method."""
+        step, change = np.inf, np.zeros(self._last.state.size)
+        for end in self._times[1:]:
+            interval = end - self._time
+            while self._time < end:
+                step = min(step, end - self._time)
+                time = end if step == end - self._time else self._time + step
+                before = self._last
+                # Adams and Bashforth: x' and its change since the step before.
+                predicted = before.state + step * (before.rate + 0.5 * step * change)
+                if self._reach(time, predicted):
+                    change = (self._last.rate - before.rate) / step
+                    step *= 2.0
+                else:
+                    step *= 0.5
+                    self._check_step(step, interval)
+            yield self._last
+
+    def _integrate(self) -> Iterator[Point]:
+        """With zero dynamics: an implicit integrator, since they may be stiff."""
+        bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state))))
+        integrator = None
+        for end in self._times[1:]:
+            interval = end - self._time
+            integrator = integrator or self._integrator(end)
+            integrator.t_bound, integrator.status = end, "running"
+            while self._time < end:
+                integrator.step()
+                if integrator.status == "failed":
+                    raise self._end(0.1 * interval)
+                worst = int(np.argmax(np.abs(integrator.y)))
+                if abs(integrator.y[worst]) > bound:
+                    raise self._stop(
+                        Cause.UNBOUNDED,
+                        f"{self._name}: {Cause.UNBOUNDED.value}: "
+                        f"{self._pinned.system.state_signals[worst].name} = "
+                        f"{integrator.y[worst]:.3g} at t = {integrator.t:.6g} s",
+                    )
+                if self._reach(integrator.t, integrator.y):
+                    integrator.y, integrator.f = self._last.state.copy(), self._last.rate.copy()
+                else:
+                    step = 0.5 * (integrator.t - self._time)
+                    self._check_step(step, interval)
+                    integrator = self._integrator(end, step)
+            yield self._last
+
+    def _integrator(self, end: float, step: float | None = None) -> scipy.integrate.Radau:
+        """Of x' = f* + h* u from the last point."""
+
+        def rate(time: float, state: FloatArray) -> FloatArray:
+            return self._pinned.rate(state, self._goal(time), self._parameters)
+
+        def slopes(time: float, state: FloatArray) -> FloatArray:
+            matrix = self._pinned.slopes(state, self._goal(time), self._parameters)[0]
+            if not np.all(np.isfinite(matrix)):
+                raise self._end(time - self._time)
+            return matrix
+
+        return scipy.integrate.Radau(
+            rate,
+            self._time,
+            self._last.state,
+            end,
+            rtol=TOLERANCE,
+            atol=0.01 * TOLERANCE,
+            jac=slopes,
+            first_step=step,
+        )
+
+    def _goal(self, time: float) -> FloatArray:
+        """R(t)."""
+        layout = self._pinned.layout
+        try:
+            goal = np.asarray(self._reference(time), dtype=float).reshape(-1)
+        except NonFiniteError as error:
+            ending = Ending(Cause.REFERENCE_NOT_FINITE, time, str(error))
+            raise _MotionEnd(ending) from error
+        if goal.size != layout.reference_size:
+            raise ModelError(
+                f"{self._name}: the reference must have size {layout.reference_size} (each output "
+                f"and its derivatives up to its degree {layout.degrees}), got {goal.size}"
+            )
+        if not np.all(np.isfinite(goal)):
+            text = f"{self._name}: the reference is not finite at t = {time:.6g} s"
+            raise _MotionEnd(Ending(Cause.REFERENCE_NOT_FINITE, time, text))
+        return goal
+
+    def _reach(self, time: float, state: FloatArray) -> bool:
+        """Goes on to the point next to a state, unless it is on another branch than the last."""
+        last = self._last
+        self._remaining -= 1
+        if self._remaining < 0:
+            raise self._stop(
+                Cause.TOO_FAST,
+                f"{self._name}: after {STEPS} steps the motion is at t = {self._time:.6g} s; it is "
+                "too fast to be followed so far",
+            )
+        goal = self._goal(time)
+        found, converged = self._pinned.project(state, goal, self._parameters)
+        near = JUMP * np.maximum(1.0, np.abs(last.state)) + np.abs(state - last.state)
+        if not converged or np.any(np.abs(found - state) > near):
+            return False
+        point = self._pinned.point(found, goal, self._parameters)
+        regular = self._pinned.regularity(point) is Regularity.REGULAR
+        if not regular or point.signs != last.signs:
+            return False
+        (a, b), (c, d) = self._largest, point.margins
+        self._time, self._last, self._largest = time, point, (max(a, c), max(b, d))
+        return True
+
+    def _check_step(self, step: float, interval: float) -> None:
+        if step < SHORTEST * interval:
+            raise self._end(0.1 * interval)
+
+    def _end(self, ahead: float) -> _MotionEnd:
+        """Why there is no way on from the last point, with a look at the goal ahead of it."""
+        last, when = self._last, f"t = {self._time:.6g} s"
+        shares = [
+            now / largest if largest < np.inf else 1.0
+            for now, largest in zip(last.margins, self._largest, strict=True)
+        ]
+        which = int(np.argmin(shares))
+        if shares[which] > LOST:
+            return self._stop(
+                Cause.NO_WAY_ON,
+                f"{self._name}: no state that continues the motion is found beyond {when}, x = "
+                f"{show(last.state)}: the reference jumps, or the domain of the system ends",
+            )
+        ahead = min(ahead, self._times[-1] - self._time)
+        goal = self._goal(self._time + ahead)
+        beyond = any(
+            self._pinned.project(guess, goal, self._parameters)[1]
+            for guess in (last.state, last.state + ahead * last.rate)
+        )
+        matrix, smallest = "AB"[which], f"smallest singular value {last.margins[which]:.2g}"
+        singular = f"{matrix}(x) becomes singular, {smallest}"
+        if beyond:
+            text = f"{self._name}: at {when} {singular}: {Cause.SINGULAR.value}"
+            return self._stop(Cause.SINGULAR, text, matrix)
+        text = f"{self._name}: {Cause.OUT_OF_REACH.value} at {when}: {singular}"
+        return self._stop(Cause.OUT_OF_REACH, text, matrix)
+
+    def _stop(self, cause: Cause, text: str, matrix: str = "") -> _MotionEnd:
+        """An end at the last point."""
+        return _MotionEnd(Ending(cause, self._time, text, self._last.state, matrix))

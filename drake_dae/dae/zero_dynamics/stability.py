@@ -1,0 +1,128 @@
+"""Stability of the zero dynamics at an equilibrium, by linearization.                 (36)"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+
+LINEARIZED = 1e-11
+"""The error of a linearization, relative to its norm: that of the equilibrium, and round-off."""
+
+SHIFT = 1e-7
+"""How far off an equilibrium may be, relative to the size of the states."""
+
+ComplexArray = np.typing.NDArray[np.complex128]
+
+
+class Verdict(StrEnum):
+    """What the linearization says of the zero dynamics."""
+
+    STABLE = "exponentially stable"
+    UNSTABLE = "unstable"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """Whether the internal states stay near an equilibrium while the outputs are held.
+
+    The verdict is local: it is about states near this equilibrium and outputs near its outputs.
+    What suffices for Assumption 2.2 everywhere, (i) and (ii) below (36), is not examined.
+
+    Attributes:
+        verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
+            one; undecided if one is on the imaginary axis up to round-off, or if no equilibrium is
+            found. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
+        eigenvalues: Of the zero dynamics in 1/s, largest real part first, shape (dimension,);
+            empty if no equilibrium is found.
+        state: The equilibrium, shape (n,); None if none is needed, or found.
+        reason: A sentence.
+    """
+
+    verdict: Verdict
+    eigenvalues: ComplexArray
+    state: FloatArray | None
+    reason: str
+
+
+def linearized_eigenvalues(
+    pinned: PinnedOutputs,
+    scale: FloatArray,
+    state: FloatArray,
+    reference: FloatArray,
+    parameters: FloatArray,
+) -> tuple[ComplexArray, FloatArray]:
+    """The eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), and their errors.
+
+    They are off by the round-off of what cancels in the derivative, and by what a shift of the
+    equilibrium changes, which is not known better where Newton's method converges slowly.
+
+    Args:
+        pinned: Z(R).
+        scale: How large the states are, shape (n,).
+        state: An equilibrium, shape (n,).
+        reference: R there.
+        parameters: Values of all parameters.
+
+    Returns:
+        In 1/s, largest real part first, each of shape (dimension,).
+    """
+    slopes, _ = pinned.slopes(state, reference, parameters)
+    tangent = scipy.linalg.null_space(pinned.gradients(state, parameters))
+    sizes = pinned.sizes_of_slopes(state, reference, parameters) / scale[:, None] * scale
+    noise = LINEARIZED * max(balanced_norm(slopes), float(np.linalg.norm(sizes)))
+    values, errors = _eigenvalues(tangent.T @ slopes @ tangent, noise)
+    along = tangent @ np.random.default_rng(0).standard_normal(tangent.shape[1])
+    along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
+    beside, _ = pinned.slopes(state + SHIFT * along, reference, parameters)
+    if np.all(np.isfinite(beside)):
+        others = np.linalg.eigvals(tangent.T @ beside @ tangent)
+        errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
+    return values, errors
+
+
+def balanced_norm(matrix: FloatArray) -> float:
+    """The norm of a matrix without the units of its state."""
+    return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
+
+
+def _eigenvalues(matrix: FloatArray, error: float) -> tuple[ComplexArray, FloatArray]:
+    """Eigenvalues, largest real part first, and how far off each may be.
+
+    To first order an error E of the matrix moves an eigenvalue by at most |E| / |y^H x|, with its
+    left and right eigenvectors y and x of length one. Balancing takes the units out first.
+    """
+    if not matrix.size:
+        return np.zeros(0, dtype=complex), np.zeros(0)
+    balanced = scipy.linalg.matrix_balance(matrix, permute=False)[0]
+    values, left, right = scipy.linalg.eig(balanced, left=True, right=True)
+    errors = error / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), 1e-300)
+    order = np.lexsort((values.imag, -values.real))
+    return values[order], errors[order]
+
+
+def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: str) -> Stability:
+    """What the eigenvalues at an equilibrium say.
+
+    Args:
+        values, errors: As from `linearized_eigenvalues`; at least one.
+        state: The equilibrium, shape (n,).
+        place: The equilibrium in words.
+    """
+    largest = f"the largest real part of an eigenvalue is {values[0].real:.4g} 1/s {place}"
+    if np.any(values.real > errors):
+        return Stability(Verdict.UNSTABLE, values, state, f"non-minimum phase: {largest}")
+    if np.all(values.real < -errors):
+        return Stability(Verdict.STABLE, values, state, f"minimum phase: {largest}")
+    count = np.count_nonzero(np.abs(values.real) <= errors)
+    return Stability(
+        Verdict.UNDECIDED,
+        values,
+        state,
+        f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
+        f"imaginary axis, up to round-off, {place}",
+    )

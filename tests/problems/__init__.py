@@ -1,0 +1,98 @@
+"""Systems with known answers, and helpers that the tests of drake_dae.dae share.
+
+Every problem is worked out by hand: degrees, A, alpha, beta, a and B are written in NumPy, from the
+derivation in its docstring, and share no code with the library.
+"""
+
+from collections.abc import Callable
+
+from problems.closed_loop import closed_loop_outputs, integrated, reference_at, wanted_outputs
+from problems.hidden import Hidden, hidden_normal_form
+from problems.made_up import (
+    bead,
+    double_integrator,
+    early_control,
+    held_point,
+    linear,
+    mixed_degrees,
+    redundant,
+    scalar,
+    system_of,
+    third_order,
+)
+from problems.mechanisms import (
+    aircraft,
+    cart,
+    flexible_pendulum,
+    gantry,
+    hanging_pendulum,
+    pendulum,
+    pendulum_known,
+    pendulum_tension,
+    two_link_arm,
+)
+from problems.networks import (
+    circuit,
+    dc_motor,
+    quadruple_tank,
+    quadruple_tank_crossed,
+    swing_network,
+)
+from problems.nonholonomic import chaplygin_sleigh, knife_edge, knife_edge_force, rolling_disk
+from problems.problem import Array, Known, Problem, known, unconstrained
+from problems.variants import changed, in_other_units
+
+__all__ = [
+    "PROBLEMS",
+    "Array",
+    "Hidden",
+    "Known",
+    "Problem",
+    "bead",
+    "changed",
+    "closed_loop_outputs",
+    "double_integrator",
+    "early_control",
+    "hanging_pendulum",
+    "hidden_normal_form",
+    "in_other_units",
+    "integrated",
+    "knife_edge",
+    "known",
+    "linear",
+    "pendulum",
+    "pendulum_known",
+    "pendulum_tension",
+    "redundant",
+    "reference_at",
+    "system_of",
+    "unconstrained",
+    "wanted_outputs",
+]
+
+PROBLEMS: dict[str, Callable[[], Problem]] = {
+    function.__name__: function
+    for function in (
+        pendulum,
+        pendulum_tension,
+        two_link_arm,
+        circuit,
+        linear,
+        third_order,
+        mixed_degrees,
+        cart,
+        flexible_pendulum,
+        knife_edge,
+        knife_edge_force,
+        chaplygin_sleigh,
+        rolling_disk,
+        swing_network,
+        quadruple_tank,
+        quadruple_tank_crossed,
+        aircraft,
+        dc_motor,
+        gantry,
+        scalar,
+        held_point,
+    )
+}

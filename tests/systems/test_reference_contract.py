@@ -1,0 +1,102 @@
+"""The rules of `Reference`, run on every member: a new one is a line in MEMBERS."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_dae import (
+    ConstantReference,
+    ExpressionReference,
+    PointToPointReference,
+    ReferenceGenerator,
+    SinusoidReference,
+    TrajectoryReference,
+)
+from drake_dae.errors import ReferenceSignalError
+
+PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
+    [0.0, 1.0, 2.0], [[0.0, 1.0, 0.5], [1.0, -1.0, 2.0]], np.zeros((2, 1)), np.zeros((2, 1))
+)
+
+MEMBERS = {
+    "constant": ConstantReference([0.3, -2.0]),
+    "sinusoids": SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
+    "point to point": PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
+    "expression": ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
+    "trajectory": TrajectoryReference(PATH),
+}
+
+TIMES = (0.41, 0.93, 1.62)
+
+ROUGH = {
+    "point to point": PointToPointReference(0.0, 1.0, 0.0, 1.0, order=1),
+    "expression": ExpressionReference(lambda t: ca.fabs(t - 1.0)),
+    "trajectory": TrajectoryReference(PiecewisePolynomial.FirstOrderHold([0, 1, 2], [[0, 1, 0]])),
+}
+
+
+def table(reference, degree, time):
+    """Row per output: value, first derivative, ..."""
+    value = reference.derivatives([degree] * reference.size)(time)
+    return np.array(value).reshape(reference.size, degree + 1)
+
+
+@pytest.fixture(params=MEMBERS)
+def reference(request):
+    return MEMBERS[request.param]
+
+
+def test_rules_1_and_2_size_and_layout(reference):
+    assert reference.size >= 1
+    degrees = [2, 0, 1][: reference.size]
+    value = reference.derivatives(degrees)(0.5)
+    assert value.shape == (sum(degrees) + len(degrees),)
+    ends = np.cumsum([degree + 1 for degree in degrees])
+    rows = np.split(np.array(value), ends[:-1])
+    for row, full in zip(rows, table(reference, 2, 0.5), strict=True):
+        np.testing.assert_allclose(row, full[: row.size], rtol=1e-14, atol=1e-14)
+
+
+def test_rule_3_each_derivative_is_that_of_the_one_before(reference):
+    """Central differences over h = 1e-4 s are off by h^2 / 6 of the third derivative after.
+
+    With derivatives below 1e3, of the move of 1.4 s, that is 2e-6; round-off adds 1e-16 / h.
+    """
+    h = 1e-4
+    for time in TIMES:
+        found = table(reference, 2, time)
+        slope = (table(reference, 2, time + h) - table(reference, 2, time - h)) / (2 * h)
+        np.testing.assert_allclose(found[:, 1:], slope[:, :-1], rtol=0, atol=2e-6)
+
+
+def test_rule_3_what_the_law_integrates_is_continuous(reference):
+    """Across 2 us, values and first derivatives change by less than their slopes allow."""
+    for time in [*np.linspace(0.01, 1.99, 67).tolist(), 0.3, 1.0, 1.7]:
+        change = table(reference, 2, time + 1e-6) - table(reference, 2, time - 1e-6)
+        assert np.abs(change[:, :-1]).max() < 1e-3
+
+
+def test_rule_4_a_value_depends_on_the_time_alone(reference):
+    function = reference.derivatives([1] * reference.size)
+    first = [np.array(function(time)) for time in TIMES]
+    again = [np.array(function(time)) for time in reversed(TIMES)]
+    np.testing.assert_array_equal(first, again[::-1])
+
+
+@pytest.mark.parametrize("name", ROUGH)
+def test_rule_5_what_is_too_rough_is_refused_before_it_is_used(name):
+    ROUGH[name].derivatives([0])
+    with pytest.raises(ReferenceSignalError, match="needs"):
+        ROUGH[name].derivatives([2])
+
+
+def test_rule_6_traced_together_the_values_are_the_same(reference):
+    """Beside another, all as one function or one after the other."""
+    degrees = [2] * reference.size
+    generator = ReferenceGenerator([ConstantReference(7.0), reference], [1, *degrees])
+    for time in TIMES:
+        stacked = generator.reference(time)
+        np.testing.assert_array_equal(stacked[:2], [7.0, 0.0])
+        own = reference.derivatives(degrees)(time)
+        np.testing.assert_allclose(stacked[2:], own, rtol=1e-14, atol=1e-14)
