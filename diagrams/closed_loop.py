@@ -5,37 +5,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Rgba, SceneGraph
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, WiringError
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
-from drake_dae.simulation.view import (
-    FRAME_RATE,
-    ContactForceVisualizer,
-    ContactPoints,
-    draw_path,
-    draw_surface,
-    frame_times,
-    scene_extent,
-)
+from drake_dae.simulation.view import View, add_view
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
-
-_ON_REQUEST = 1e9
-"""A publish period so long that only a forced publish draws."""
-
-_DESIRED, _ACTUAL = Rgba(0.1, 0.6, 0.2, 1.0), Rgba(0.1, 0.2, 0.8, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +33,9 @@ class ClosedLoop:
             robot.
         plant, controller, reference: Its systems.
         loggers: Port name -> (sink, names and units), one sample per step.
-        meshcat: Where the robot is drawn, or None.
-        sensor: Of the constraint force, or None.
+        view: The blocks that draw the robot, or None.
+        sensor: The sensor of the constraint force, or None.
+        noise: The source of the sensor's noise, or None.
     """
 
     diagram: Diagram
@@ -57,8 +43,9 @@ class ClosedLoop:
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
-    meshcat: Meshcat | None
+    view: View | None
     sensor: ForceSensor | None
+    noise: RandomSource | None
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.loggers)})"
@@ -67,19 +54,18 @@ class ClosedLoop:
         """Chooses the noise of the sensor; without a call it is the same in every run.
 
         Args:
-            context: Of the diagram.
-            seed: Of the random numbers.
+            context: The diagram's context.
+            seed: The seed of the random numbers.
         """
-        for system in self.diagram.GetSystems():
-            if isinstance(system, RandomSource):
-                own = system.GetMyMutableContextFromRoot(context)
-                system.SetRandomContext(own, RandomGenerator(seed))
+        if self.noise is not None:
+            own = self.noise.GetMyMutableContextFromRoot(context)
+            self.noise.SetRandomContext(own, RandomGenerator(seed))
 
     def record(self, context: Context) -> Record:
         """What was logged up to now, with `desired_output` r and `tracking_error` z - r (29).
 
         Args:
-            context: Of the diagram.
+            context: The diagram's context.
         """
         record = Record.from_logs(self.loggers, context)
         desired = record["reference"][:, self.controller.law.layout.lowest]
@@ -152,8 +138,9 @@ def make_closed_loop(
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
 
+    noise = None
     if law.measured_force:
-        _add_force_feedback(builder, plant, controller, sensor)
+        noise = _add_force_feedback(builder, plant, controller, sensor)
     elif sensor is not None:
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
@@ -176,17 +163,16 @@ def make_closed_loop(
         loggers[name] = (LogVectorOutput(port, builder, {TriggerType.kPerStep}), signals)
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
-    # The view: the robot at its link positions, the surfaces, the contact forces.
+    # The view: the robot at its link positions, what it touches, the constraint forces.
+    view = None
     if isinstance(plant, RobotPlant):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
         if meshcat is not None:
-            if scene_graph is not None:
-                _add_geometry(builder, plant, scene_graph, meshcat, live)
-            _add_contacts(builder, plant, meshcat, live)
+            view = add_view(builder, plant, scene_graph, meshcat, live)
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")
-    return ClosedLoop(diagram, plant, controller, reference, loggers, meshcat, sensor)
+    return ClosedLoop(diagram, plant, controller, reference, loggers, view, sensor, noise)
 
 
 def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
@@ -216,9 +202,13 @@ def _add_force_feedback(
     plant: DaePlant,
     controller: TrackingController,
     sensor: ForceSensor | None,
-) -> None:
-    """From the constraint force, through the sensor if there is one, to the controller."""
-    force = plant.GetOutputPort("constraint_force")
+) -> RandomSource | None:
+    """From the constraint force, through the sensor if there is one, to the controller.
+
+    Returns:
+        The source of the sensor's noise, if it has one.
+    """
+    force, noise = plant.GetOutputPort("constraint_force"), None
     if sensor is None:
         control = plant.GetInputPort("control").get_index()
         if plant.HasDirectFeedthrough(control, force.get_index()):
@@ -247,131 +237,4 @@ def _add_force_feedback(
             noise = builder.AddSystem(source)
             builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     builder.Connect(force, controller.GetInputPort("measured_force"))
-
-
-def make_animation(loop: ClosedLoop, record: Record, context: Context) -> str:
-    """Replays a record of a robot in Meshcat, with the paths of the contact points.
-
-    Args:
-        loop: Made with a meshcat, for a `RobotPlant`.
-        record: Of a run of this loop.
-        context: Of its diagram, for the parameters; not changed.
-
-    Returns:
-        One HTML page that holds the scene and the animation.
-
-    Raises:
-        ModelError: There is no meshcat or no robot.
-    """
-    meshcat, plant = loop.meshcat, loop.plant
-    if meshcat is None or not isinstance(plant, RobotPlant):
-        raise ModelError("an animation needs a closed loop of a RobotPlant, made with a meshcat")
-    parameters = plant.parameters(plant.GetMyContextFromRoot(context))
-    points = ContactPoints(plant.model, parameters)
-
-    # Between the steps the signals are drawn as straight lines.
-    times = frame_times(record.time[-1] - record.time[0])
-    states, forces, desired = (
-        np.column_stack(
-            [np.interp(times, record.time - record.time[0], column) for column in record[name].T]
-        ).reshape(len(times), -1)
-        for name in ("state", "constraint_force", "desired_output")
-    )
-    _draw_surfaces(meshcat, plant, points, states[0], parameters)
-    _draw_paths(meshcat, plant, points, states, desired, parameters)
-
-    # The robot and the arrows, frame by frame.
-    replay = context.Clone()
-    replayed = plant.GetMyMutableContextFromRoot(replay)
-    systems = loop.diagram.GetSystems()
-    robots = [system for system in systems if isinstance(system, MeshcatVisualizer)]
-    (arrows,) = [system for system in systems if isinstance(system, ContactForceVisualizer)]
-    arrows.largest_force = float(np.max(np.abs(forces), initial=1e-6))
-    meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    for time, state, force in zip(times, states, forces, strict=True):
-        replay.SetTime(time)
-        plant.set_state(replayed, state)
-        for robot in robots:
-            robot.ForcedPublish(robot.GetMyContextFromRoot(replay))
-        arrows.draw(state, force, time, points)
-    meshcat.StopRecording()
-    meshcat.PublishRecording()
-    return meshcat.StaticHtml()
-
-
-def _draw_surfaces(
-    meshcat: Meshcat,
-    plant: RobotPlant,
-    points: ContactPoints,
-    state: FloatArray,
-    parameters: FloatArray,
-) -> None:
-    _, size = scene_extent(plant.model, state[: plant.model.links.q.numel()])
-    for contact, center in zip(points.contacts, points(state)[0], strict=True):
-        position = parameters[plant.dae.parameter_slice(f"{contact.name}.position")]
-        draw_surface(meshcat, contact, position, center, size)
-
-
-def _draw_paths(
-    meshcat: Meshcat,
-    plant: RobotPlant,
-    points: ContactPoints,
-    states: FloatArray,
-    desired: FloatArray,
-    parameters: FloatArray,
-) -> None:
-    """Where each contact point went, and where the reference wanted it."""
-    model = plant.model
-    guess = states[0, : model.links.q.numel()]
-    configurations = []
-    try:
-        for row in desired[:, : len(model.position_signals)]:
-            guess = model.configuration(row, guess, parameters)
-            configurations.append(guess)
-    except InconsistentStateError:
-        pass  # The reference leaves what the robot can reach: its path ends there.
-    for number, contact in enumerate(points.contacts):
-        draw_path(meshcat, f"{contact.name}/actual", points.path(states, number), _ACTUAL, 4.0)
-        if configurations:
-            path = points.path(np.array(configurations), number)
-            draw_path(meshcat, f"{contact.name}/desired", path, _DESIRED, 2.0)
-
-
-def _add_geometry(
-    builder: DiagramBuilder,
-    plant: RobotPlant,
-    scene_graph: SceneGraph,
-    meshcat: Meshcat,
-    live: bool,
-) -> None:
-    """Drake's own picture of the robot, posed by our link state; its plant is not simulated."""
-    links = plant.model.links
-    if not isinstance(links, MultibodyExpressions) or links.plant.get_source_id() is None:
-        return
-    builder.AddSystem(scene_graph)
-    pose = builder.AddSystem(
-        MultibodyPositionToGeometryPose(links.plant, input_multibody_state=True)
-    )
-    builder.Connect(plant.GetOutputPort("link_state"), pose.get_input_port())
-    builder.Connect(
-        pose.get_output_port(), scene_graph.get_source_pose_port(links.plant.get_source_id())
-    )
-    period = 1.0 / FRAME_RATE if live else _ON_REQUEST
-    MeshcatVisualizer.AddToBuilder(
-        builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
-    )
-
-
-def _add_contacts(builder: DiagramBuilder, plant: RobotPlant, meshcat: Meshcat, live: bool) -> None:
-    model = plant.model
-    state = plant.structure.manifold.project(model.dae.nominal_state)
-    _draw_surfaces(meshcat, plant, ContactPoints(model), state, model.dae.parameter_values)
-    # From behind, the side and a little above.
-    middle, size = scene_extent(model, state[: model.links.q.numel()])
-    meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
-    period = 1.0 / FRAME_RATE if live else None
-    forces = builder.AddSystem(ContactForceVisualizer(meshcat, model, period, 0.2 * size))
-    builder.Connect(plant.GetOutputPort("link_state"), forces.GetInputPort("link_state"))
-    builder.Connect(
-        plant.GetOutputPort("constraint_force"), forces.GetInputPort("constraint_force")
-    )
+    return noise

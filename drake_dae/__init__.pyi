@@ -25,7 +25,6 @@ from .dae.tracking import TrackingLaw as TrackingLaw
 from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.build import build_scenario as build_scenario
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
-from .diagrams.closed_loop import make_animation as make_animation
 from .diagrams.closed_loop import make_closed_loop as make_closed_loop
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
@@ -50,6 +49,7 @@ from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions
 from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
+from .simulation.animation import make_animation as make_animation
 from .simulation.record import Record as Record
 from .simulation.simulate import simulate as simulate
 from .simulation.view import start_meshcat as start_meshcat

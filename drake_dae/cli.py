@@ -17,7 +17,7 @@ from pydrake.systems.framework import Context
 
 import drake_dae
 from drake_dae.diagrams.build import build_scenario
-from drake_dae.diagrams.closed_loop import ClosedLoop, make_animation
+from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.diagrams.scenario import (
     DEFAULT_SCENARIO,
@@ -28,6 +28,7 @@ from drake_dae.diagrams.scenario import (
     shipped_scenarios,
 )
 from drake_dae.errors import DrakeDaeError, NonMinimumPhaseWarning, ScenarioError
+from drake_dae.simulation.animation import make_animation
 from drake_dae.simulation.plots import PLOTS, save_plots
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary

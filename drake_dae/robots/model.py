@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import ActuationChain, chain
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import PositionOutput
+from drake_dae.robots.statics import Balance, Placing
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
 
 class RobotModel:
@@ -30,11 +31,12 @@ class RobotModel:
         M(q) v' + H(q, v) = J(q)^T lambda + B tau,    q' = N(q) v,
         0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
 
-    with J = (dphi/dq) N. With rigid joints tau = u; stages of actuation put their own dynamics
-    between u and tau: E s' = drift(q, v, s) + drive u, tau = tau(q, v, s), as in (64)-(65) and
-    (74)-(75). The state is x = (q, v, s), the constraint input is lambda, and the controlled
-    outputs are z = (z_1, z_2), so there are as many position outputs as there are actuators less
-    constraints.
+    with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T; one
+    that restricts velocities alone has its rate in place of phi. With rigid joints tau = u; stages
+    of actuation put their own dynamics between u and tau: E s' = drift(q, v, s) + drive u,
+    tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the constraint
+    input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many position
+    outputs as there are actuators less constraints.
 
     Args:
         links: M, H and kinematics.
@@ -42,18 +44,20 @@ class RobotModel:
         positions: h_1, one below the other.
         nominal_positions: A configuration of the robot at work, shape (nq,), near which the
             structure is examined; `links.default_positions` if None.
-        name: For messages.
+        name: The robot's name in messages.
         actuation: Stages from the joints toward the motor; none is rigid joints.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, constraints, positions: As given.
+        links, constraints, positions, name: As given.
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
+        control_limits: The largest |u| per actuator, infinite where there is none or where u is
+            no joint force.
 
     Raises:
-        ModelError: Too many or too few outputs, an M that is not positive definite, or stages
-            that do not fit.
+        ModelError: There are too many or too few outputs, M is not positive definite, or stages
+            do not fit.
     """
 
     def __init__(
@@ -65,48 +69,27 @@ class RobotModel:
         name: str = "robot",
         actuation: Sequence[Stage] = (),
     ) -> None:
-        for stage in actuation if isinstance(actuation, Sequence) else [None]:
-            if not hasattr(stage, "attach"):
-                raise ModelError(
-                    f"{name}: actuation is a list of stages such as [FlexibleJoints(8000.0)], got "
-                    f"{actuation!r}"
-                )
         self.links = links
         self.constraints = tuple(constraints)
         self.positions = tuple(positions)
         self.name = name
-        phi = self._residual(links)
+        bound = ConstraintSet(self.constraints)
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
-        self._check_number(phi.numel(), h_1.numel())
-        nominal = np.asarray(
-            links.default_positions if nominal_positions is None else nominal_positions, float
-        )
-        if nominal.shape != (links.q.numel(),):
-            raise ModelError(
-                f"{name}: nominal_positions has shape {nominal.shape}, not ({links.q.numel()},)"
-            )
-        self._chain = self._attach(actuation)
-        self.stages = self._chain.stages
-        self.joint_force = self._chain.joint_force if self.stages else None
-        #: Largest |u| per actuator, infinite where there is none or where u is no joint force.
+        self._check_outputs(bound.size, h_1.numel())
+        driven = chain(actuation, links)
+        self.stages = driven.stages
+        self.joint_force = driven.joint_force if driven.stages else None
+        is_joint_force = driven.control_signals == tuple(links.actuator_signals)
         self.control_limits = (
-            links.effort_limits
-            if self._chain.control_signals == tuple(links.actuator_signals)
-            else np.full(len(links.actuator_signals), np.inf)
+            links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
         )
-        self.dae = self._equations(phi, h_1, nominal)
-        self._configuration = TracedFunction(
-            f"{name} configuration",
-            {"q": links.q, "parameters": self.dae.parameter_symbol},
-            {"phi": phi, "h_1": h_1, "jacobian": ca.jacobian(ca.vertcat(phi, h_1), links.q)},
-        )
-        self._trace_equilibrium()
+        nominal = self._nominal(nominal_positions)
+        self.dae = self._equations(bound, h_1, driven, nominal)
+        self._check_mass_matrix(nominal)
+        self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
+        self._balance = Balance(self.dae, links.q, links.v)
         if self.stages:
-            # On the constraints first: shafts that rest off them would strain the springs.
-            with suppress(InconsistentStateError):
-                nominal = self.configuration(None, nominal)
-            rest = self._rest(nominal, np.zeros(phi.numel()), self.dae.parameter_values)[0]
-            self.dae = replace(self.dae, nominal_state=rest)
+            self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
     @classmethod
     def from_multibody(
@@ -121,7 +104,7 @@ class RobotModel:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
         Raises:
-            ModelError: What the plant has and cannot be represented, by name.
+            ModelError: The plant has what cannot be represented; the message names it.
         """
         links = MultibodyExpressions(plant)
         return cls(links, constraints, positions, nominal_positions, name, actuation)
@@ -145,29 +128,19 @@ class RobotModel:
             Shape (nq,); where the outputs leave freedom, the one next to the guess.
 
         Raises:
-            InconsistentStateError: No such configuration near the guess.
-            ModelError: A shape that does not fit.
+            InconsistentStateError: There is no such configuration near the guess.
+            ModelError: A shape does not fit.
         """
-        q = np.array(guess, dtype=float)
+        q = numbers("the guess", guess)
+        wanted = numbers("outputs", [] if outputs is None else outputs)
         count = 0 if outputs is None else len(self.position_signals)
-        wanted = np.zeros(0) if outputs is None else np.asarray(outputs, dtype=float)
         if wanted.shape != (count,) or q.shape != (self.links.q.numel(),):
             raise ModelError(
                 f"{self.name}: outputs and guess have shapes {wanted.shape} and {q.shape}, "
                 f"expected ({count},) and ({self.links.q.numel()},)"
             )
-        values = self.dae.parameter_values if parameters is None else parameters
-
-        def residual(q: FloatArray) -> FloatArray:
-            phi, h_1, _ = self._configuration(q, values)
-            return np.concatenate([phi, h_1[:count] - wanted])
-
-        def linearize(q: FloatArray) -> Linearization | None:
-            jacobian = self._configuration(q, values)[2].reshape(-1, q.size)
-            return shortest_steps(jacobian[: self.dae.num_constraints + count], residual)
-
-        found, _ = newton(q, linearize)
-        left = residual(found)
+        values = self.dae.parameter_values if parameters is None else np.asarray(parameters)
+        found, left = self._placing.solve(wanted, q, values)
         size = float(np.max(np.abs(left), initial=0.0))
         if size < 1e-10:
             return found
@@ -198,8 +171,8 @@ class RobotModel:
             ModelError: No drive holds the robot there.
         """
         values = self.dae.parameter_values if parameters is None else np.asarray(parameters)
-        q, load = np.asarray(positions, dtype=float), np.asarray(forces, dtype=float)
-        state, left = self._rest(q, load, values)
+        q, load = numbers("positions", positions), numbers("forces", forces)
+        state, left = self._balance.rest(q, load, values)
         if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
                 f"{self.name}: no drive holds the robot at rest at q = "
@@ -208,11 +181,7 @@ class RobotModel:
             )
         return state
 
-    def _residual(self, links: Links) -> ca.SX:
-        """phi(q), shape (m, 1)."""
-        return ca.vertcat(ca.SX(0, 1), *[c.residual(links) for c in self.constraints])
-
-    def _check_number(self, m: int, count: int) -> None:
+    def _check_outputs(self, m: int, count: int) -> None:
         """m constraint forces and the position outputs are as many as the actuators."""
         nu = self.links.actuation_matrix.shape[1]
         if m > nu:
@@ -228,127 +197,81 @@ class RobotModel:
                 f"{count} ({', '.join(names) or 'none'})"
             )
 
-    def _attach(self, actuation: Sequence[Stage]) -> ActuationChain:
-        select = self.links.actuation_matrix
-        if actuation and not np.allclose(select.T @ select, np.eye(select.shape[1])):
+    def _nominal(self, given: ArrayLike | None) -> FloatArray:
+        nominal = self.links.default_positions if given is None else given
+        nominal = numbers(f"{self.name}: nominal_positions", nominal)
+        if nominal.shape != (self.links.q.numel(),):
             raise ModelError(
-                f"{self.name}: actuation stages need one actuator per actuated joint, so "
-                "orthonormal columns of the actuation matrix"
+                f"{self.name}: nominal_positions has shape {nominal.shape}, not "
+                f"({self.links.q.numel()},)"
             )
-        transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
-        rates = ca.mtimes(transposed, self.links.velocity_map)
-        if actuation and not ca.is_equal(ca.sparsify(rates), transposed, 9):
-            raise ModelError(
-                f"{self.name}: actuation stages need the actuated velocities to be derivatives of "
-                "positions, q_i' = v_i: choose such coordinates where N(q) is not the identity"
-            )
-        position = ca.mtimes(transposed, self.links.q)
-        return chain(actuation, self.links, position, ca.mtimes(transposed, self.links.v))
+        return nominal
 
-    def _equations(self, phi: ca.SX, h_1: ca.SX, nominal: FloatArray) -> DaeSystem:
-        """E x' = f + g lambda + h u of the links and then of the stages."""
-        links, stages = self.links, self._chain
-        nq, nv, m = links.q.numel(), links.v.numel(), phi.numel()
-        nu, k = links.actuation_matrix.shape[1], stages.state.numel()
-        # The rotors turn with the first stage, or else with the joints.
-        rotors = ca.SX(nv, nv)
-        if self.stages and self.stages[0].carries_rotors:
-            B = links.actuation_matrix
-            rotors = ca.SX(ca.sparsify(ca.DM(B * links.reflected_inertia @ B.T)))
-        mass = links.mass_matrix - rotors
-        self._check_mass_matrix(mass, nominal)
-        actuation_matrix = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+    def _equations(
+        self, bound: ConstraintSet, h_1: ca.SX, driven: ActuationChain, nominal: FloatArray
+    ) -> DaeSystem:
+        """(43)-(45), with M on the left; below the rows of the links stand those of the stages."""
+        links = self.links
+        nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
+        m, nu = bound.size, len(links.actuator_signals)
+        B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(actuation_matrix, stages.joint_force)
+        torque = ca.mtimes(B, driven.joint_force)
+        rotors = self._moved_rotors(driven)
 
-        def motion(rate: ca.SX, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
+        def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
             acceleration = rate[nq : nq + nv]
-            inertial, phi_rate = links.motion(acceleration, self._residual, multiplier)
+            inertial, constraint_rate = bound.implicit(links, acceleration, constraint_force)
             balance = inertial - ca.mtimes(rotors, acceleration) - torque
-            driven = ca.mtimes(stages.mass, rate[nq + nv :]) - stages.drift
-            return ca.vertcat(rate[:nq] - velocity, balance, driven), phi_rate
+            stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
+            return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
-        force_signals = tuple(s for c in self.constraints for s in c.force_signals)
+        position_signals = tuple(s for p in self.positions for s in p.signals(links))
         return DaeSystem(
-            state=ca.vertcat(links.q, links.v, stages.state),
-            mass_matrix=ca.diagcat(ca.SX.eye(nq), mass, stages.mass),
-            f=ca.vertcat(velocity, torque - links.bias, stages.drift),
-            g=ca.vertcat(ca.SX(nq, m), links.jacobian(self._residual).T, ca.SX(k, m)),
-            h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(actuation_matrix, stages.direct), stages.drive),
-            k=phi,
-            l=ca.vertcat(h_1, ca.SX(m, 1)),
+            state=ca.vertcat(links.q, links.v, driven.state),
+            mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
+            f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
+            g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
+            h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(B, driven.direct), driven.drive),
+            k=bound.constraint_output(links.kinematics()),  # (44)
+            l=ca.vertcat(h_1, ca.SX(m, 1)),  # (45)
             m=ca.vertcat(ca.SX(nu - m, m), ca.SX.eye(m)),
-            parameters=(
-                *links.parameters,
-                *(p for stage in self.stages for p in stage.parameters),
-                *(p for constraint in self.constraints for p in constraint.parameters),
-            ),
+            parameters=(*links.parameters, *driven.parameters, *bound.parameters),
             state_signals=(
                 *links.position_signals,
                 *links.velocity_signals,
-                *(s for stage in self.stages for s in stage.state_signals),
+                *driven.state_signals,
             ),
-            constraint_input_signals=force_signals,
-            constraint_output_signals=tuple(
-                s for c in self.constraints for s in c.residual_signals
-            ),
-            control_signals=stages.control_signals,
-            output_signals=(
-                *(s for p in self.positions for s in p.signals(links)),
-                *force_signals,
-            ),
+            constraint_input_signals=bound.force_signals,
+            constraint_output_signals=bound.residual_signals,
+            control_signals=driven.control_signals,
+            output_signals=(*position_signals, *bound.force_signals),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
-            motion=motion,
+            motion=implicit,
         )
 
-    def _trace_equilibrium(self) -> None:
-        """Balance of forces and of the stages at v = 0, to be solved for (s, u)."""
-        dae, links = self.dae, self.links
-        first = links.q.numel() + links.v.numel()
-        control = ca.SX.sym("u", dae.num_controls)
-        force = ca.SX.sym("lambda", dae.num_constraints)
-        balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
-        balance = balance[links.q.numel() :]
-        balance = ca.substitute(balance, links.v, ca.SX.zeros(links.v.numel()))
-        unknown = ca.vertcat(dae.state[first:], control)
-        self._equilibrium = TracedFunction(
-            f"{self.name} equilibrium",
-            {"q": links.q, "lambda": force, "s": unknown, "parameters": dae.parameter_symbol},
-            {"balance": balance, "gradient": ca.jacobian(balance, unknown)},
-        )
+    def _moved_rotors(self, driven: ActuationChain) -> ca.SX:
+        """What of M turns with a stage, and not with the links, shape (nv, nv)."""
+        B = self.links.actuation_matrix
+        if not driven.carries_rotors:
+            return ca.SX(B.shape[0], B.shape[0])
+        return ca.SX(ca.sparsify(ca.DM(B * self.links.reflected_inertia @ B.T)))
 
-    def _rest(
-        self, q: FloatArray, forces: FloatArray, parameters: FloatArray
-    ) -> tuple[FloatArray, float]:
-        """The state at rest and what is left of the balance of forces."""
-        nv = self.links.v.numel()
-        stages = self.dae.num_states - q.size - nv
-        trial, left = np.zeros(stages + self.dae.num_controls), np.inf
-        solution = trial
-        for _ in range(20):
-            balance, gradient = self._equilibrium(q, forces, trial, parameters)
-            size = float(np.max(np.abs(balance), initial=0.0))
-            if not size < left:
-                break
-            solution, left = trial, size
-            gradient = gradient.reshape(balance.size, -1)
-            # Currents and forces differ by orders of magnitude.
-            scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)
-            trial = solution - np.linalg.lstsq(gradient / scale, balance)[0] / scale
-        return np.concatenate([q, np.zeros(nv), solution[:stages]]), left
+    def _nominal_rest(self, nominal: FloatArray) -> FloatArray:
+        """At rest on the constraints: shafts that rest off them would strain the springs."""
+        with suppress(InconsistentStateError):
+            nominal = self.configuration(None, nominal)
+        forces = np.zeros(self.dae.num_constraints)
+        return self._balance.rest(nominal, forces, self.dae.parameter_values)[0]
 
-    def _check_mass_matrix(self, mass_matrix: ca.SX, nominal: FloatArray) -> None:
-        parameters = self.links.parameters
-        mass = TracedFunction(
-            "mass matrix",
-            {
-                "q": self.links.q,
-                "p": ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters]),
-            },
-            {"mass_matrix": mass_matrix},
-        )(nominal, np.concatenate([np.zeros(0), *[p.value for p in parameters]]))[0]
-        mass = np.atleast_2d(mass)
+    def _check_mass_matrix(self, nominal: FloatArray) -> None:
+        """Refuses an M (less the rotors that turn with a stage) that is no mass matrix."""
+        nq, nv = self.links.q.numel(), self.links.v.numel()
+        inputs = {"q": self.links.q, "parameters": self.dae.parameter_symbol}
+        expression = self.dae.mass_matrix[nq : nq + nv, nq : nq + nv]
+        function = TracedFunction("mass matrix", inputs, {"mass_matrix": expression})
+        mass = np.atleast_2d(function(nominal, self.dae.parameter_values)[0])
         asymmetry = np.abs(mass - mass.T).max()
         if asymmetry > 1e-9 * np.abs(mass).max():
             raise ModelError(f"{self.name}: M(q) is not symmetric, by {asymmetry:.2g}")

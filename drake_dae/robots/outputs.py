@@ -1,39 +1,47 @@
 """Position outputs h_1(q) that, with the constraints, fix where the robot is.       (39)"""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
-from typing import Protocol
 
 import casadi as ca
 
-from drake_dae.arrays import check_axes
+from drake_dae.arrays import check_axes, unknown_name
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.points import PointOnSurface
-from drake_dae.robots.contact.surfaces import Vector
+from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.contact.surface import Vector
 from drake_dae.robots.links.links import Links
 
 
-class PositionOutput(Protocol):
-    """Some components of h_1(q)."""
+class PositionOutput(ABC):
+    """Some components of h_1(q).
 
+    1. `expression` is a smooth function of q (and of parameters of the robot), one row for each of
+       `signals`. It is no function of the rows of the constraints: those outputs are zero anyway.
+    2. A name stands once in all outputs of a robot.
+    3. What the robot does not have (a frame, a joint) raises ModelError, which names what it has.
+    """
+
+    @abstractmethod
     def expression(self, links: Links) -> ca.SX:
         """The components, shape (k, 1)."""
 
+    @abstractmethod
     def signals(self, links: Links) -> tuple[Signal, ...]:
-        """Their names and units."""
+        """Names and units of the components."""
 
 
 @dataclass(frozen=True)
-class PointCoordinates:
+class PointCoordinates(PositionOutput):
     """World coordinates of a point that is fixed in a frame, m.
 
     Attributes:
         frame: Name of the frame.
         axes: Which of "xyz", for example "yz".
         point: The point in the frame, m, shape (3,).
-        name: Of the outputs, "<name>.y"; the frame's if empty. Two points of one frame need it.
+        name: What stands before the axis in the names, "<name>.y"; the frame's name if empty. Two
+            points of one frame need it.
     """
 
     frame: str
@@ -52,7 +60,7 @@ class PointCoordinates:
 
 
 @dataclass(frozen=True)
-class AxisCoordinates:
+class AxisCoordinates(PositionOutput):
     """World components of an axis of a frame: two of them steer where the axis points.
 
     Attributes:
@@ -80,31 +88,31 @@ class AxisCoordinates:
 
 
 @dataclass(frozen=True)
-class SurfaceCoordinates:
-    """Coordinates of the contact point along its surface; which, the surface tells.
+class SurfaceCoordinates(PositionOutput):
+    """Coordinates of where the robot is along a constraint; which, the constraint tells.
 
     Attributes:
-        contact: The constraint that keeps the point on the surface.
+        contact: A constraint with coordinates, as a `PointOnSurface`.
     """
 
-    contact: PointOnSurface
+    contact: Constraint
 
     def __post_init__(self) -> None:
-        if not isinstance(self.contact, PointOnSurface):
-            raise ModelError(f"constraint '{self.contact.name}' has no coordinates along it")
+        if not self.contact.coordinate_signals:
+            raise ModelError(
+                f"constraint '{self.contact.name}' has no coordinates along it; use "
+                "PointCoordinates or an expression"
+            )
 
     def expression(self, links: Links) -> ca.SX:
-        return self.contact.surface.coordinates(self.contact.offset(links))
+        return self.contact.coordinates(links)
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
-        return tuple(
-            Signal(f"{self.contact.name}.{name}", unit)
-            for name, unit in self.contact.surface.coordinate_signals
-        )
+        return self.contact.coordinate_signals
 
 
 @dataclass(frozen=True)
-class JointPositions:
+class JointPositions(PositionOutput):
     """Generalized positions by name.
 
     Attributes:
@@ -117,9 +125,7 @@ class JointPositions:
         names = [signal.name for signal in links.position_signals]
         for joint in self.joints:
             if joint not in names:
-                near = get_close_matches(joint, names, n=1)
-                hint = f"did you mean '{near[0]}'? " if near else ""
-                raise ModelError(f"no joint position '{joint}'; {hint}there are {', '.join(names)}")
+                raise ModelError(unknown_name("joint position", joint, names))
         return links.q[[names.index(joint) for joint in self.joints]]
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
@@ -128,11 +134,11 @@ class JointPositions:
 
 
 @dataclass(frozen=True)
-class ExpressionOutput:
+class ExpressionOutput(PositionOutput):
     """Any smooth function of the robot's configuration.
 
     Attributes:
-        function: Of the links (`links.q`, `links.position("tool")`, ...), returns a CasADi
+        function: Takes the links (`links.q`, `links.position("tool")`, ...), returns a CasADi
             column.
         outputs: Name and unit of each component.
     """

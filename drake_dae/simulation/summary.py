@@ -8,13 +8,12 @@ import numpy as np
 from drake_dae.analysis.tables import Table
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.robots.contact.points import PointOnSurface
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 
 _SLACK = 1e-9
-"""Of joint limits, in their unit: a start on the limit is not beyond it."""
+"""What is not yet beyond a joint limit, in its unit: a start on the limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +21,9 @@ class Limits:
     """What a robot can take; None where it has no limits.
 
     Attributes:
-        control: Largest |u|, shape (p,).
-        state: Lowest and highest (q, v), shape (nq + nv,) each.
-        pushing: Names of the constraint forces that can only push; of all if None.
+        control: The largest |u|, shape (p,).
+        state: The lowest and the highest (q, v), shape (nq + nv,) each.
+        pushing: Names of the constraint forces that can only push; None if that is all of them.
     """
 
     control: FloatArray | None = None
@@ -37,17 +36,19 @@ class Limits:
 
     @classmethod
     def of(cls, model: RobotModel) -> Self:
-        """Those of a robot: of what drives it, and of its joints."""
+        """The limits of a robot: of what drives it, of its joints, and of what it touches."""
         pairs = zip(model.links.position_limits, model.links.velocity_limits, strict=True)
         lower, upper = (np.concatenate(pair) for pair in pairs)
         state = (lower, upper) if np.any(np.isfinite([lower, upper])) else None
-        pushing = {
+        pushing = frozenset(
             signal.name
             for constraint in model.constraints
-            if isinstance(constraint, PointOnSurface)
-            for signal in constraint.force_signals
-        }
-        return cls(model.control_limits, state, frozenset(pushing))
+            for signal, pushes in zip(
+                constraint.force_signals, constraint.can_only_push, strict=True
+            )
+            if pushes
+        )
+        return cls(model.control_limits, state, pushing)
 
 
 def summary(
@@ -62,7 +63,7 @@ def summary(
     Args:
         record: With state, tracking_error, constraint_residual, constraint_force and control.
         predicted: Tracking error by theory, shape (k, p).
-        limits: Of the robot.
+        limits: What the robot can take.
         run: What it took; None for a run that failed.
         failure: Why it failed.
     """

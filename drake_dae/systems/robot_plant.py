@@ -16,10 +16,10 @@ class RobotPlant(DaePlant):
 
     Output ports:
         link_state: (q, v) of the links, shape (nq + nv,), as Drake's MultibodyPlant orders it.
-        motor_state: (q_2, q_2') of the shafts, on the joints' side; with `FlexibleJoints`.
-        motor_current: I_a in A, shape (nu,); with `DcMotors`.
-        actuator_force: f_a in N, shape (nu,); with `ElectrohydraulicServos`.
         joint_torque: What the stages deliver to the joints, N m (N), shape (nu,); with any stage.
+
+    A stage of actuation shows its state at ports of its own, which its class names: `motor_state`
+    of `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
 
     `constraint_force` is lambda of (37), in N for contacts. With rigid joints it feeds through from
     `control`; with any stage it is a function of the state alone.

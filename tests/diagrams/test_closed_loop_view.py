@@ -7,18 +7,23 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, fixed_step, law, parse
+from members import Coupler, Saddle
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from recordings import animation, objects, transforms, vertices
+from two_arms import two_arms
 
 from drake_dae import (
     ConstantReference,
     DaePlant,
     DaeSystem,
     ImplicitSurface,
+    JointPositions,
+    PointCoordinates,
     PointOnSurface,
     Record,
+    RobotModel,
     RobotPlant,
     TrackingLaw,
     build_scenario,
@@ -32,15 +37,10 @@ from drake_dae import (
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact import surfaces
+from drake_dae.simulation.animation import frame_times
+from drake_dae.simulation.constraint_forces import ConstraintForceVisualizer, ConstraintLoads
 from drake_dae.simulation.record import Recorded
-from drake_dae.simulation.view import (
-    FRAME_RATE,
-    ContactForceVisualizer,
-    ContactPoints,
-    draw_surface,
-    frame_times,
-    scene_extent,
-)
+from drake_dae.simulation.view import FRAME_RATE, scene_extent
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 
@@ -127,7 +127,8 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     shaft = things[f"{path}/arrow/shaft"]["geometries"][0]
     head = things[f"{path}/arrow/head"]["geometries"][0]
     nominal = loop.plant.structure.manifold.project(loop.plant.dae.nominal_state)
-    _, size = scene_extent(loop.plant.model, nominal[: nominal.size // 2])
+    model = loop.plant.model
+    _, size = scene_extent(model, ConstraintLoads(model), nominal)
     assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
     assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
@@ -262,13 +263,15 @@ def test_live_view_draws_while_it_runs():
     simulator.AdvanceTo(0.5)
     page = meshcat.StaticHtml()
     state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    points, normals = ContactPoints(loop.plant.model)(state)
     arrow = transforms(page)["/contact/wall/force"]
-    np.testing.assert_allclose(arrow[:3, 3], points[0], atol=1e-9)
-    np.testing.assert_allclose(arrow[:3, 2], normals[0], atol=1e-9)
+    # The wall x = 1.2 pushes along -x.
+    np.testing.assert_allclose(arrow[0, 3], 1.2, atol=1e-9)
+    np.testing.assert_allclose(arrow[:3, 2], [-1.0, 0.0, 0.0], atol=1e-9)
     plant = parse("two_link_arm")
     own = plant.CreateDefaultContext()
     plant.SetPositions(own, state[:2])
+    tool = plant.GetFrameByName("tool").CalcPoseInWorld(own).translation()
+    np.testing.assert_allclose(arrow[:3, 3], tool, atol=1e-9)
     pose = plant.EvalBodyPoseInWorld(own, plant.GetBodyByName("link2")).GetAsMatrix4()
     link = transforms(page)["/drake/visualizer/two_link_arm/link2"]
     np.testing.assert_allclose(link, pose, atol=1e-9)
@@ -304,12 +307,13 @@ def test_only_this_machine_reaches_meshcat():
 def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     model = arm("two_link").model
     meshcat = start_meshcat()
-    visualizer = ContactForceVisualizer(meshcat, model, None, length=0.3)
+    visualizer = ConstraintForceVisualizer(meshcat, model, None, length=0.3)
+    loads = ConstraintLoads(model)
     state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
     seen = {}
     for force in (0.0, 10.0, -20.0):
         meshcat.StartRecording()
-        visualizer.draw(state, np.array([force]), 0.0)
+        visualizer.draw(loads(state, [force]), 0.0)
         meshcat.StopRecording()
         meshcat.PublishRecording()
         tracks = animation(meshcat.StaticHtml())
@@ -322,57 +326,106 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     assert visualizer.largest_force == 20.0
 
 
+def shown_at_rest(model, forces):
+    """The page of a robot that holds still with given constraint forces."""
+    meshcat = start_meshcat()
+    plant = RobotPlant(model)
+    law = TrackingLaw(model.dae, poles(-4.0), structure=plant.structure)
+    state = plant.structure.manifold.project(model.dae.nominal_state)
+    names = [signal.name for signal in model.position_signals]
+    wanted = ConstantReference(np.concatenate([np.zeros(len(names)), forces]))
+    loop = make_closed_loop(plant, law, [wanted], meshcat=meshcat, live=False)
+    loads = ConstraintLoads(model)(state, forces)
+    meshcat.StartRecording()
+    loop.view.forces.draw(loads, 0.0)
+    meshcat.StopRecording()
+    meshcat.PublishRecording()
+    return state, meshcat.StaticHtml()
+
+
 @pytest.mark.parametrize(
-    ("surface", "kind"),
-    [
-        (surfaces.Plane((0, 0, 0), (1, 2, 2)), "BoxGeometry"),
-        (surfaces.Sphere((0, 0, 0), 0.5), "SphereGeometry"),
-        (surfaces.Cylinder((0, 0, 0), (1, 2, 2), 0.5), "CylinderGeometry"),
-        (surfaces.Ellipsoid((0, 0, 0), (0.5, 0.6, 0.7)), "SphereGeometry"),
-    ],
+    "surface",
+    [Saddle((1.2, 0.0, 0.0), 0.5), ImplicitSurface(lambda p: p[2] - p[0] ** 2, (1.2, 0.0, 0.0))],
 )
-def test_surfaces_stand_where_they_are(surface, kind):
-    meshcat = start_meshcat()
+def test_a_surface_without_a_shape_is_drawn(surface):
+    """Around the contact, every vertex on the surface."""
     contact = PointOnSurface("tool", surface, name="it")
-    position, center = np.array([0.1, 0.2, 0.3]), np.array([0.7, -0.4, 0.9])
-    draw_surface(meshcat, contact, position, center, size=2.0)
-    page = meshcat.StaticHtml()
-    shape = objects(page)["/contact/it/surface"]["geometries"][0]
-    pose = transforms(page)["/contact/it/surface"]
-    assert shape["type"] == kind
-    turn, place = pose[:3, :3], pose[:3, 3]
-    axis = np.array([1.0, 2.0, 2.0]) / 3.0
-    if kind == "BoxGeometry":
-        # Its upper side is in the plane, below the center; no shape can be seen to stand higher.
-        np.testing.assert_allclose(turn[:, 2], axis, atol=1e-12)
-        foot = center - np.dot(center - position, axis) * axis
-        np.testing.assert_allclose(place + 0.01 * axis, foot, atol=1e-12)
-    elif kind == "CylinderGeometry":
-        np.testing.assert_allclose(turn[:, 2], axis, atol=1e-12)
-        foot = position + np.dot(center - position, axis) * axis
-        np.testing.assert_allclose(place, foot, atol=1e-12)
-        assert (shape["radiusTop"], shape["height"]) == (0.5, 2.0)
-    else:
-        np.testing.assert_allclose(place, position, atol=1e-12)
-
-
-def test_a_torus_is_drawn_on_its_surface():
-    meshcat = start_meshcat()
-    torus = surfaces.Torus((0, 0, 0), (1, 2, 2), 0.5, 0.2)
-    position = np.array([0.1, 0.2, 0.3])
-    draw_surface(meshcat, PointOnSurface("tool", torus, name="it"), position, position, 1.0)
-    points = vertices(objects(meshcat.StaticHtml())["/contact/it/surface"])
+    outputs = [PointCoordinates("tool", "x")]
+    plant = parse("two_link_arm")
+    model = RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])
+    _, page = shown_at_rest(model, np.array([10.0]))
+    points = vertices(objects(page)["/contact/it/surface"])
+    points += transforms(page)["/contact/it/surface"][:3, 3]
+    assert len(points) > 500
     offset = ca.SX.sym("offset", 3)
-    distance = ca.Function("distance", [offset], [torus.distance(offset)]).map(len(points))
-    assert len(points) > 1000
-    np.testing.assert_allclose(distance((points - position).T), 0.0, atol=1e-6)
+    distance = ca.Function("distance", [offset], [surface.distance(offset)]).map(len(points))
+    # The page holds single precision.
+    np.testing.assert_allclose(distance((points - surface.position).T), 0.0, atol=1e-6)
+    place = animation(page)["/contact/it/force", "position"].values[0]
+    assert np.min(np.linalg.norm(points - place, axis=1)) < 0.1
 
 
-def test_an_implicit_surface_is_left_out():
+def test_the_force_of_a_pin_is_drawn():
+    """At the pin, along what the one link does to the other; by Drake's forward kinematics."""
+    loop, _ = build_scenario(load_scenario(find_scenario("five_bar")))
+    model = loop.plant.model
+    (pin,) = model.constraints
+    state, page = shown_at_rest(model, np.array([30.0, -40.0]))
+    context = model.links.plant.CreateDefaultContext()
+    model.links.plant.SetPositions(context, state[: model.links.q.numel()])
+    frame = model.links.plant.GetFrameByName(pin.frame_b)
+    tracks, path = animation(page), f"/contact/{pin.name}/force"
+    point = frame.CalcPoseInWorld(context) @ np.array(pin.point_b)
+    np.testing.assert_allclose(tracks[path, "position"].values[0], point, atol=1e-6)
+    direction = rotation(tracks[path, "quaternion"].values[0])[:, 2]
+    expected = np.zeros(3)
+    expected[["xyz".index(axis) for axis in pin.axes]] = [0.6, -0.8]
+    np.testing.assert_allclose(direction, expected, atol=1e-6)
+    assert f"/contact/{pin.name}/moment" not in [path for path, _ in tracks]
+
+
+def test_force_and_moment_of_a_weld_are_drawn():
+    """In the axes of frame A, at the origin of frame B; the moment along its axis, two heads."""
+    model = two_arms()
+    load = np.array([40.0, 0.0, 30.0, 0.0, 6.0, 8.0])
+    state, page = shown_at_rest(model, load)
+    plant = model.links.plant
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, state[:14])
+    turned = plant.GetFrameByName("object").CalcPoseInWorld(context).rotation().matrix()
+    right = plant.GetModelInstanceByName("right")
+    point = plant.GetFrameByName("tool", right).CalcPoseInWorld(context).translation()
+    tracks = animation(page)
+    for kind, acting in (("force", load[:3]), ("moment", load[3:])):
+        path = f"/contact/grasp/{kind}"
+        np.testing.assert_allclose(tracks[path, "position"].values[0], point, atol=1e-6)
+        direction = rotation(tracks[path, "quaternion"].values[0])[:, 2]
+        expected = turned @ acting / np.linalg.norm(acting)
+        np.testing.assert_allclose(direction, expected, atol=1e-6)
+        # Each is the largest of its kind.
+        scale = tracks[f"{path}/arrow", "scale"].values[0]
+        np.testing.assert_allclose(scale, 1.0, rtol=1e-6)
+    assert "/contact/grasp/moment/arrow/second_head" in objects(page)
+    assert "/contact/grasp/surface" not in objects(page)
+
+
+@pytest.mark.parametrize("constraints", [[], [Coupler(0, 1, 0.5, 0.4)]])
+def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
+    """A free one, and one whose constraint force is a moment between joints."""
+    plant = parse("two_link_arm")
+    outputs = [JointPositions(["joint1", "joint2"][len(constraints) :])]
+    model = RobotModel.from_multibody(plant, constraints, outputs, [1.2, -1.6])
+    controls = TrackingLaw(model.dae, poles(-4.0))
     meshcat = start_meshcat()
-    bowl = ImplicitSurface(lambda p: p[2] - p[0] ** 2 - p[1] ** 2)
-    draw_surface(meshcat, PointOnSurface("tool", bowl, name="it"), np.zeros(3), np.zeros(3), 1.0)
-    assert "/contact/it/surface" not in objects(meshcat.StaticHtml())
+    loop = make_closed_loop(
+        RobotPlant(model), controls, [ConstantReference([0.3, 0.4])], meshcat=meshcat, live=False
+    )
+    context = loop.diagram.CreateDefaultContext()
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_consistent_state(own, loop.plant.state(own))
+    simulate(loop.diagram, context, 0.1, fixed_step())
+    page = make_animation(loop, loop.record(context), context)
+    assert not [path for path in objects(page) if path.startswith(("/contact", "/paths"))]
 
 
 # Without a picture.

@@ -682,7 +682,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("robot.file=package://x/y.urdf", ["robot.file: ", "unknown package 'x'"]),
         ("robot.file=two_link_wall.yaml", ["robot.file: ", "two_link_wall.yaml", ".urdf"]),
         # Constraints.
-        ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "did you mean tool?", "link2"]),
+        ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "did you mean 'tool'?", "link2"]),
         ("constraints.0.point=[1, 2]", ["constraints.0.point: expected 3 numbers, got [1, 2]"]),
         ("constraints.0.name=", ["constraints.0.name: expected text"]),
         ("constraints.0.name=''", ["constraints.0.name: ", "name of its own"]),
@@ -699,7 +699,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("constraints.0=!Weld {}", ["0: expected one of !PointOnSurface, !WeldedFrames, !Coinc"]),
         ("constraints.0=!WeldedFrames {frame_a: world}", ["!WeldedFrames needs", "'frame_b'"]),
         ("constraints.0=!WeldedFrames {frame: tool}", ["!WeldedFrames has no key 'frame'", "_a"]),
-        (f"{WELD} frame_b: tol}}", ["constraints.0: ", "'tol'", "did you mean tool?"]),
+        (f"{WELD} frame_b: tol}}", ["constraints.0: ", "'tol'", "did you mean 'tool'?"]),
         (f"{WELD} frame_b: tool, name: ''}}", ["constraints.0.name: ", "name of its own"]),
         (
             f"{WELD} frame_b: tool, pose: {{rpy_deg: [0, 90]}}}}",
@@ -730,7 +730,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("outputs.0.axes=xz", ["outputs: ", "1 position output", "2 (tool.x, tool.z)"]),
         ("outputs.0.axes=x", ["outputs: Assumption (5)", "'tool.x'"]),
         ("outputs.0.axes=zz", ["outputs.0: axes", "'zz'"]),
-        ("outputs.0.frame=tol", ["outputs.0: ", "'tol'", "did you mean tool?"]),
+        ("outputs.0.frame=tol", ["outputs.0: ", "'tol'", "did you mean 'tool'?"]),
         ("outputs.0=!JointPositions {joints: [joint9]}", ["outputs.0: ", "'joint9'", "joint1"]),
         ("outputs.0=!SurfaceCoordinates {constraint: wal}", ["outputs.0: ", "'wal'", "'wall'?"]),
         # Gains.

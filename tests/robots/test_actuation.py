@@ -215,7 +215,7 @@ def test_damping_of_some_joints_is_refused():
     [
         (FlexibleJoints(**SHAFT), "is a list of stages"),
         (["springs"], "is a list of stages"),
-        ([FlexibleJoints("stiff", inertia=1.0)], "must be numbers, got 'stiff'"),
+        ([FlexibleJoints("stiff", inertia=1.0)], "must be real numbers, got 'stiff'"),
         ([FlexibleJoints(**SHAFT), FlexibleJoints(**SHAFT)], "come once in a chain"),
         ([FlexibleJoints(**{**SHAFT, "damping": [5.0, 0.0]})], "Damp all flexible joints or none"),
         (

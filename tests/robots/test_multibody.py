@@ -315,12 +315,18 @@ def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
     speed = N @ v
     rate = ca.jtimes(phi(expressions), q, speed)
     twice = ca.jtimes(rate, ca.vertcat(q, v), ca.vertcat(speed, a))
-    residual, second_rate = expressions.motion(a, phi, force)
+    kinematics = expressions.kinematics(a)
+    own_rate = kinematics.derivative(phi(kinematics))
+    reaction = kinematics.reaction(ca.dot(force, own_rate))
+    residual = expressions.inverse_dynamics(kinematics, reaction)
+    second_rate = kinematics.value(kinematics.derivative(own_rate))
+    columns = reaction.map(lambda part: ca.jacobian(part, force))
+    jacobian = expressions.generalized_force(kinematics, columns).T
     masses = ca.vertcat(*[parameter.symbol for parameter in expressions.parameters])
     function = TracedFunction(
-        "motion",
+        "balance",
         {"q": q, "v": v, "a": a, "f": force, "masses": masses},
-        {"J": expressions.jacobian(phi), "own": residual, "rate": second_rate, "twice": twice},
+        {"J": jacobian, "own": residual, "rate": second_rate, "twice": twice},
     )
     context = random_context(plant, random)
     numbers = state(plant, context)
@@ -635,7 +641,9 @@ def test_what_is_not_supported_is_refused_with_a_remedy(make, message):
 
 def test_unknown_frame_lists_near_and_known_names():
     expressions = MultibodyExpressions(crane())
-    with pytest.raises(ModelError, match=r"no frame 'hok'; did you mean hook\?.*frames: .*boom"):
+    with pytest.raises(
+        ModelError, match=r"no frame 'hok'; did you mean 'hook'\?.*there are .*boom"
+    ):
         expressions.rotation("hok")
     with pytest.raises(ModelError, match="frame 'hook' belongs to another plant"):
         expressions.rotation(crane().GetFrameByName("hook"))

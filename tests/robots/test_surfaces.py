@@ -1,10 +1,14 @@
-"""Axioms that every surface keeps, and distances against brute force."""
+"""The rules of `Surface` on every member, and distances against brute force."""
 
 import casadi as ca
 import numpy as np
 import pytest
+from members import Saddle, subclasses
+from pydrake import geometry
 
+from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
+from drake_dae.robots.contact.surface import Surface, tangents
 from drake_dae.robots.contact.surfaces import (
     Cylinder,
     Ellipsoid,
@@ -12,7 +16,6 @@ from drake_dae.robots.contact.surfaces import (
     Plane,
     Sphere,
     Torus,
-    tangents,
 )
 from drake_dae.trace.functions import TracedFunction
 
@@ -27,7 +30,12 @@ SURFACES = {
     "implicit": ImplicitSurface(
         lambda p: 7.0 * (p[2] - 0.3 * ca.sin(2.0 * p[0]) - 0.2 * p[1] ** 2), (0.5, 0.0, 0.1)
     ),
+    "saddle": Saddle((0.3, 0.1, -0.2), 0.6),
 }
+
+
+def test_no_member_is_left_out():
+    assert subclasses(Surface) <= {type(surface) for surface in SURFACES.values()}
 
 
 def functions(surface):
@@ -73,7 +81,7 @@ def test_distance_grows_with_one_along_the_normal(name):
             assert function(p + d * normal)[0][0] == pytest.approx(d, abs=20 * d * d)
 
 
-@pytest.mark.parametrize("name", [n for n in SURFACES if n != "implicit"])
+@pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].coordinate_signals])
 def test_coordinates_cover_the_surface(name):
     """Normal and gradients of the two coordinates are independent away from the poles."""
     function, points = points_on(SURFACES[name])
@@ -82,6 +90,82 @@ def test_coordinates_cover_the_surface(name):
         for _, gradient, _, jacobian in map(function, points)
     ]
     assert min(volumes) > 0.1
+
+
+@pytest.mark.parametrize("name", [n for n in SURFACES if not SURFACES[n].coordinate_signals])
+def test_coordinates_that_there_are_not_are_refused(name):
+    with pytest.raises(ModelError, match="has no coordinates along it"):
+        SURFACES[name].coordinates(ca.SX.sym("p", 3))
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_any_surface_is_drawn_from_its_distance_alone(name):
+    """As `Surface` does where a class has no shape of its own: around a point, on the surface."""
+    surface, size = SURFACES[name], 0.4
+    function, points = points_on(surface, 5)
+    for center in points + 0.1 * np.random.default_rng(2).uniform(-1.0, 1.0, (5, 3)):
+        picture = Surface.picture(surface, center, size)
+        assert picture.pose.IsExactlyIdentity()
+        mesh = picture.form
+        vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+        distances = [function(vertex)[0][0] for vertex in vertices]
+        np.testing.assert_allclose(distances, 0.0, atol=1e-12)
+        apart = np.linalg.norm(vertices - center, axis=1)
+        # A patch of about this size, the center above its middle.
+        assert mesh.num_triangles() > 500
+        assert apart.min() < 0.2
+        assert 0.5 * size < apart.max() < 2.0 * size
+
+
+def test_a_patch_ends_where_the_surface_does():
+    """A small ball in a large patch: half of it is drawn, all of that on the ball."""
+    ball = Sphere((0.0, 0.0, 0.0), 0.1)
+    mesh = Surface.picture(ball, [0.0, 0.0, 0.3], 1.0).form
+    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.1, atol=1e-12)
+
+
+AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
+
+
+@pytest.mark.parametrize(
+    ("surface", "kind"),
+    [
+        (Plane((0, 0, 0), (1, 2, 2)), geometry.Box),
+        (Sphere((0, 0, 0), 0.5), geometry.Sphere),
+        (Cylinder((0, 0, 0), (1, 2, 2), 0.5), geometry.Cylinder),
+        (Ellipsoid((0, 0, 0), (0.5, 0.6, 0.7)), geometry.Ellipsoid),
+    ],
+)
+def test_shapes_stand_where_the_surfaces_are(surface, kind):
+    """Where a parameter puts the surface, and not where it was made."""
+    position, center = np.array([0.1, 0.2, 0.3]), np.array([0.7, -0.4, 0.9])
+    contact = PointOnSurface("tool", surface, name="it")
+    picture = contact.picture(position, center, 2.0)
+    turn, place = picture.pose.rotation().matrix(), picture.pose.translation()
+    assert isinstance(picture.form, kind)
+    if kind is geometry.Box:
+        # Its upper side is in the plane, below the center; no shape can be seen to stand higher.
+        np.testing.assert_allclose(turn[:, 2], AXIS, atol=1e-12)
+        foot = center - np.dot(center - position, AXIS) * AXIS
+        np.testing.assert_allclose(place + 0.01 * AXIS, foot, atol=1e-12)
+    elif kind is geometry.Cylinder:
+        np.testing.assert_allclose(turn[:, 2], AXIS, atol=1e-12)
+        foot = position + np.dot(center - position, AXIS) * AXIS
+        np.testing.assert_allclose(place, foot, atol=1e-12)
+        assert (picture.form.radius(), picture.form.length()) == (0.5, 2.0)
+    else:
+        np.testing.assert_allclose(place, position, atol=1e-12)
+
+
+def test_a_torus_is_drawn_on_its_surface():
+    torus, position = Torus((0, 0, 0), (1, 2, 2), 0.5, 0.2), np.array([0.1, 0.2, 0.3])
+    picture = PointOnSurface("tool", torus, name="it").picture(position, position, 1.0)
+    mesh, distance = picture.form, functions(torus)
+    points = [picture.pose @ mesh.vertex(i) for i in range(mesh.num_vertices())]
+    assert len(points) > 1000
+    distances = [distance(point - position)[0][0] for point in points]
+    np.testing.assert_allclose(distances, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "cylinder", "torus"])

@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm
+from two_arms import two_arms
 
 from drake_dae import ExpressionOutput, Record, RobotModel
 from drake_dae.dae.signals import Signal
@@ -119,6 +120,14 @@ def test_limits_of_a_robot():
     np.testing.assert_array_equal(limits.control, [300.0, 120.0])
     np.testing.assert_array_equal(limits.state[0], [-3.1416, -2.7925, -3.0, -3.0])
     np.testing.assert_array_equal(limits.state[1], [3.1416, 2.7925, 3.0, 3.0])
+
+
+def test_what_can_only_push_is_told_by_the_constraints():
+    wall, grasp = (Limits.of(model) for model in (arm("two_link").model, two_arms()))
+    (force,) = arm("two_link").model.dae.constraint_input_signals
+    assert not wall.can_pull(force)
+    assert grasp.pushing == frozenset()
+    assert grasp.can_pull(Signal("grasp.fx", "N"))
 
 
 def test_limits_of_a_textbook_robot():

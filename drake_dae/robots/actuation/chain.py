@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
 from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
@@ -17,12 +17,14 @@ class ActuationChain:
     """Stages attached to a robot, wired from the joints to the control.
 
     Attributes:
-        stages: In this order, toward the motor; none for rigid joints.
-        joint_force: tau(q, v, s), what the joints get from the stages, shape (p, 1).
+        stages: The stages from the joints toward the motor; none for rigid joints.
+        joint_force: tau(q, v, s), what the joints get from the stages, shape (p, 1); 0 for rigid
+            joints.
         direct: What the joints get from u at once, shape (p, p): 1 for rigid joints, otherwise 0.
         state: All stages' states, shape (k, 1).
         mass, drift, drive: E s' = drift + drive u, shapes (k, k), (k, 1), (k, p).
         control_signals: Names and units of u.
+        parameters: Numbers of all stages.
     """
 
     stages: tuple[AttachedStage, ...]
@@ -33,45 +35,48 @@ class ActuationChain:
     drift: ca.SX
     drive: ca.SX
     control_signals: tuple[Signal, ...]
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def carries_rotors(self) -> bool:
+        """Whether the rotors turn with a stage, and not with the links."""
+        return any(stage.carries_rotors for stage in self.stages)
+
+    @property
+    def state_signals(self) -> tuple[Signal, ...]:
+        """Names and units of all stages' states."""
+        return tuple(signal for stage in self.stages for signal in stage.state_signals)
 
 
-def chain(
-    stages: Sequence[Stage], links: Links, position: ca.SX, velocity: ca.SX
-) -> ActuationChain:
+def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
     """Wires stages: each drives the one before it, the control drives the last.
 
     Args:
-        stages: From the joints toward the motor.
+        stages: The stages from the joints toward the motor.
         links: The robot.
-        position: Actuated positions, shape (p, 1).
-        velocity: Actuated velocities, shape (p, 1).
 
     Raises:
-        ModelError: A stage behind one that nothing can drive.
+        ModelError: A stage stands behind one that nothing can drive, or two carry the rotors; or
+            the actuators do not drive derivatives of positions, each its own.
     """
-    p = position.numel()
+    for stage in stages if isinstance(stages, Sequence) else [None]:
+        if not isinstance(stage, Stage):
+            raise ModelError(
+                f"actuation is a list of stages such as [FlexibleJoints(8000.0)], got {stages!r}"
+            )
     if not stages:
-        none = ca.SX(0, 1)
-        return ActuationChain(
-            stages=(),
-            joint_force=ca.SX(p, 1),
-            direct=ca.SX.eye(p),
-            state=none,
-            mass=ca.SX(0, 0),
-            drift=none,
-            drive=ca.SX(0, p),
-            control_signals=tuple(links.actuator_signals),
-        )
+        return _rigid_joints(links)
+    position, velocity = _actuated(links)
+    p = position.numel()
     attached = [stage.attach(links) for stage in stages]
+    names = [type(stage).__name__ for stage in stages]
+    _check_rotors(names, attached)
     loads = [(position, velocity)]
-    for stage, before in zip(stages[1:], attached, strict=False):
+    for name, other, before in zip(names[1:], names, attached, strict=False):
         if before.shaft is None:
             raise ModelError(
-                f"{type(stage).__name__} cannot stand behind an electric or hydraulic stage, "
-                "which has no shaft to drive; these come last"
+                f"{name} cannot stand behind {other}, which has no shaft to drive; put {other} last"
             )
-        if isinstance(stage, FlexibleJoints):
-            raise ModelError("FlexibleJoints come once in a chain; put both springs into one")
         loads.append(before.shaft)
     delivered = [own.force(*load) for own, load in zip(attached, loads, strict=True)]
     drifts = [own.drift(*load) for own, load in zip(attached, loads, strict=True)]
@@ -87,4 +92,49 @@ def chain(
         drift=ca.vertcat(*drifts),
         drive=ca.vertcat(ca.SX(idle, p), attached[-1].drive_matrix),
         control_signals=attached[-1].drive_signals,
+        parameters=tuple(p for own in attached for p in own.parameters),
     )
+
+
+def _rigid_joints(links: Links) -> ActuationChain:
+    """No stage: the control is the joint force."""
+    p, none = len(links.actuator_signals), ca.SX(0, 1)
+    return ActuationChain(
+        stages=(),
+        joint_force=ca.SX(p, 1),
+        direct=ca.SX.eye(p),
+        state=none,
+        mass=ca.SX(0, 0),
+        drift=none,
+        drive=ca.SX(0, p),
+        control_signals=tuple(links.actuator_signals),
+        parameters=(),
+    )
+
+
+def _actuated(links: Links) -> tuple[ca.SX, ca.SX]:
+    """Positions and velocities of the actuated joints, shape (p, 1) each."""
+    select = links.actuation_matrix
+    if not np.allclose(select.T @ select, np.eye(select.shape[1])):
+        raise ModelError(
+            "actuation stages need one actuator per actuated joint, so orthonormal columns of the "
+            "actuation matrix"
+        )
+    transposed = ca.SX(ca.sparsify(ca.DM(select.T)))
+    rates = ca.mtimes(transposed, links.velocity_map)
+    if not ca.is_equal(ca.sparsify(rates), transposed, 9):
+        raise ModelError(
+            "actuation stages need the actuated velocities to be derivatives of positions, "
+            "q_i' = v_i: choose such coordinates where N(q) is not the identity"
+        )
+    return ca.mtimes(transposed, links.q), ca.mtimes(transposed, links.v)
+
+
+def _check_rotors(names: Sequence[str], attached: Sequence[AttachedStage]) -> None:
+    """The rotors turn with one stage: two springs in a row would count them twice."""
+    carriers = [n for n, own in zip(names, attached, strict=True) if own.carries_rotors]
+    if len(carriers) > 1:
+        raise ModelError(
+            f"the rotors would turn with each of {', '.join(carriers)}, but stages that carry them "
+            "come once in a chain; put all springs into one"
+        )

@@ -7,18 +7,20 @@ from numpy.typing import ArrayLike
 
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation.stage import AttachedStage, diagonal_parameter
+from drake_dae.robots.actuation.numbers import diagonal_parameter
+from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
 @dataclass(frozen=True, eq=False)
-class DcMotors:
+class DcMotors(Stage):
     """Armature-controlled direct-current motors (74)-(75), driven by voltages u:
 
         M(q) q'' + H = J^T lambda + N K_m I_a,    L I_a' + R I_a + K_m N q' = u.
 
     Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
     positions and 1 for forces. The law needs positions and velocities, and the currents.
+    Their port is `motor_current`, I_a in A, shape (p,).
 
     Attributes:
         torque_constant: K_m in N m/A, a number or shape (p,), not 0.
@@ -58,8 +60,6 @@ class DcMotors:
             drive_matrix=ca.SX.eye(p),
             drive_signals=tuple(Signal(f"{name}.voltage", "V") for name in names),
             force=lambda position, velocity: n * k_m * current,
-            shaft=None,
-            carries_rotors=False,
             ports={"motor_current": slice(0, p)},
             parameters=(constant, inductance, resistance, gears),
         )

@@ -6,19 +6,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arrays import numbers
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation.stage import (
-    AttachedStage,
-    full_matrix,
-    matrix_parameter,
-    numbers_of,
-)
+from drake_dae.robots.actuation.numbers import full_matrix, matrix_parameter
+from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
 @dataclass(frozen=True, eq=False)
-class FlexibleJoints:
+class FlexibleJoints(Stage):
     """Elastic transmissions (64)-(65), with joint damping D beside the paper's stiffness K_2:
 
         M(q_1) q_1'' + H = J^T lambda + K_2 (q_2 - q_1) + D (q_2' - q_1'),
@@ -28,7 +25,7 @@ class FlexibleJoints:
     for positions and 2 for forces; 3 and 1 with damping. Damping leaves p zero dynamics, which the
     law does not move: K_2 d + D d' = tau for the deflections d, with the rates of D^-1 K_2. They
     are stable, but bound the step of an explicit integrator. The law needs positions and
-    velocities of links and shafts.
+    velocities of links and shafts. Their port is `motor_state`, (q_2, q_2'), shape (2p,).
 
     Attributes:
         stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite.
@@ -43,7 +40,7 @@ class FlexibleJoints:
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
         p = len(names)
-        if np.any(np.isinf(numbers_of("flexible_joints.stiffness", self.stiffness))):
+        if np.any(np.isinf(numbers("flexible_joints.stiffness", self.stiffness))):
             raise ModelError(
                 "FlexibleJoints: a stiffness is infinite. Rigid joints beside flexible ones are "
                 "not supported: the control would reach the outputs at different orders, and B(x) "

@@ -8,23 +8,24 @@ from numpy.typing import ArrayLike
 
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation.stage import (
-    AttachedStage,
+from drake_dae.robots.actuation.numbers import (
     diagonal_parameter,
     full_matrix,
     matrix_parameter,
 )
+from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
 @dataclass(frozen=True, eq=False)
-class ElectrohydraulicServos:
+class ElectrohydraulicServos(Stage):
     """Electrohydraulic servos (the last model of section 3.3), driven by normalized currents u:
 
         M(q) q'' + H = J^T lambda + G(q) f_a,    K_h^-1 f_a' + G_p f_a + G(q)^T q' = u.
 
     Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
     positions and 1 for forces. The law needs positions and velocities, and the actuator forces.
+    Their port is `actuator_force`, f_a in N, shape (p,).
 
     Attributes:
         stiffness: K_h of the fluid in N/m, a number or shape (p,), positive.
@@ -70,8 +71,6 @@ class ElectrohydraulicServos:
             drive_matrix=ca.SX.eye(p),
             drive_signals=tuple(Signal(f"{name}.valve_current") for name in names),
             force=lambda position, velocity: ca.mtimes(geometry(position), pressing),
-            shaft=None,
-            carries_rotors=False,
             ports={"actuator_force": slice(0, p)},
             parameters=(fluid, leakage),
         )

@@ -6,25 +6,27 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import check_axes
+from drake_dae.arrays import FloatArray, check_axes
 from drake_dae.dae.signals import Parameter, Signal, signals
-from drake_dae.robots.contact.surfaces import Surface, Vector
-from drake_dae.robots.links.links import Links
+from drake_dae.robots.contact.constraint import Application, Constraint
+from drake_dae.robots.contact.picture import Picture
+from drake_dae.robots.contact.surface import Surface, Vector
+from drake_dae.robots.links.kinematics import Frames, Kinematics
 
 
 @dataclass(frozen=True)
-class PointOnSurface:
+class PointOnSurface(Constraint):
     """A point of a frame stays on a surface: phi(q) = signed distance of p_W(q).
 
-    The multiplier is the normal force of the surface on the robot in N; positive pushes the robot
-    to the free side, and a unilateral contact can only push. The parameter "<name>.position" is
-    where the surface stands.
+    The constraint force is the normal force of the surface on the robot in N; positive pushes the
+    robot to the free side, and a unilateral contact can only push. The parameter "<name>.position"
+    is where the surface stands.
 
     Attributes:
         frame: Name of the frame.
         surface: A surface that stands in the world.
         point: The point in the frame, m, shape (3,).
-        name: Of the constraint, its multiplier and its parameter.
+        name: The name of the constraint, before those of its force and its parameter.
     """
 
     frame: str
@@ -32,6 +34,7 @@ class PointOnSurface:
     point: Vector = (0.0, 0.0, 0.0)
     name: str = "surface"
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+    can_only_push: ClassVar[tuple[bool, ...]] = (True,)
 
     def __post_init__(self) -> None:
         position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
@@ -45,27 +48,36 @@ class PointOnSurface:
     def residual_signals(self) -> tuple[Signal, ...]:
         return (Signal(f"{self.name}.distance", "m"),)
 
-    def offset(self, links: Links) -> ca.SX:
+    @property
+    def coordinate_signals(self) -> tuple[Signal, ...]:
+        own = self.surface.coordinate_signals
+        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
+
+    def offset(self, frames: Frames) -> ca.SX:
         """The point relative to where the surface stands, m, shape (3, 1)."""
-        return links.position(self.frame, self.point) - self.parameters[0].symbol
+        return frames.position(self.frame, self.point) - self.parameters[0].symbol
 
-    def residual(self, links: Links) -> ca.SX:
-        return self.surface.distance(self.offset(links))
+    def residual(self, frames: Frames) -> ca.SX:
+        return self.surface.distance(self.offset(frames))
 
-    def normal(self, links: Links) -> ca.SX:
-        """Unit normal at the point, toward the free side, shape (3, 1)."""
-        p = ca.SX.sym("p", 3)
-        gradient = ca.gradient(self.surface.distance(p), p)
-        return ca.substitute(gradient, p, self.offset(links))
+    def coordinates(self, frames: Frames) -> ca.SX:
+        return self.surface.coordinates(self.offset(frames))
+
+    def application(self, kinematics: Kinematics) -> Application:
+        normal = self.surface.unit_normal(self.offset(kinematics))
+        return Application(kinematics.position(self.frame, self.point), normal, ca.SX(3, 1))
+
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture:
+        return self.surface.picture(point - values, size).moved(values)
 
 
 @dataclass(frozen=True)
-class CoincidentPoints:
+class CoincidentPoints(Constraint):
     """A point of frame B stays on a point of frame A: phi(q) = p_WB(q) - p_WA(q).
 
     A ball joint that closes a loop; a pin, in a mechanism that moves in a plane and so needs the
-    axes of that plane alone. The multiplier is the force in N, in world axes, that A exerts on B at
-    the point; B exerts the opposite on A.
+    axes of that plane alone. The constraint force is the force in N, in world axes, that A exerts
+    on B at the point; B exerts the opposite on A.
 
     Attributes:
         frame_a: Name of frame A, for example "world".
@@ -73,7 +85,7 @@ class CoincidentPoints:
         frame_b: Name of frame B, on another body.
         point_b: The point in frame B, m, shape (3,).
         axes: In which of the world's axes "xyz" they coincide, for example "xz".
-        name: Of the constraint and its multipliers.
+        name: The name of the constraint, before those of its forces.
     """
 
     frame_a: str
@@ -82,7 +94,6 @@ class CoincidentPoints:
     point_b: Vector
     axes: str = "xyz"
     name: str = "pin"
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
 
     def __post_init__(self) -> None:
         check_axes("axes", self.axes)
@@ -95,7 +106,15 @@ class CoincidentPoints:
     def residual_signals(self) -> tuple[Signal, ...]:
         return signals([f"{self.name}.{axis}" for axis in self.axes], "m")
 
-    def residual(self, links: Links) -> ca.SX:
-        point_b = links.position(self.frame_b, self.point_b)
-        apart = point_b - links.position(self.frame_a, self.point_a)
-        return apart[["xyz".index(axis) for axis in self.axes]]
+    def residual(self, frames: Frames) -> ca.SX:
+        point_b = frames.position(self.frame_b, self.point_b)
+        apart = point_b - frames.position(self.frame_a, self.point_a)
+        return apart[self._rows]
+
+    def application(self, kinematics: Kinematics) -> Application:
+        point = kinematics.position(self.frame_b, self.point_b)
+        return Application(point, ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes)))
+
+    @property
+    def _rows(self) -> list[int]:
+        return ["xyz".index(axis) for axis in self.axes]

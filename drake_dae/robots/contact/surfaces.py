@@ -1,61 +1,24 @@
-"""Surfaces as signed distances: positive on the free side, of unit gradient on the surface.
-
-With |grad phi| = 1 at the contact point, the multiplier of phi is the normal force in newtons.
-"""
+"""Surfaces that are known: planes, spheres, cylinders, ellipsoids, tori, and any F(p) = 0."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake import geometry
+from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import numbers
+from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
-
-Vector = tuple[float, float, float]
-
-
-class Surface(Protocol):
-    """A smooth surface. Where it stands is an argument, so that it can be a parameter.
-
-    Attributes:
-        position: Where its reference point stands in the world by default, m, shape (3,).
-        coordinate_signals: (name, unit) of the two coordinates along it; empty if it has none.
-    """
-
-    @property
-    def position(self) -> Vector: ...
-
-    @property
-    def coordinate_signals(self) -> tuple[tuple[str, str], ...]: ...
-
-    def distance(self, offset: ca.SX) -> ca.SX:
-        """Signed distance in m of a point, given relative to the reference point, shape (3, 1)."""
-
-    def coordinates(self, offset: ca.SX) -> ca.SX:
-        """Coordinates along the surface of such a point, shape (2, 1)."""
-
-
-def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors across a unit vector, upright where possible.
-
-    For a vertical wall the first is horizontal and the second points up; for a horizontal plane
-    they are x and y.
-    """
-    n = np.asarray(normal, dtype=float)
-    if abs(n[2]) < 0.9:
-        second = np.array([0.0, 0.0, 1.0]) - n[2] * n
-        second /= np.linalg.norm(second)
-        return np.cross(n, second), second
-    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
-    first /= np.linalg.norm(first)
-    return first, np.cross(n, first)
+from drake_dae.robots.contact.picture import Picture, mesh_of_grid
+from drake_dae.robots.contact.surface import Surface, Vector, axes_along, tangents
 
 
 @dataclass(frozen=True)
-class Plane:
+class Plane(Surface):
     """phi = n . (p - point).
 
     Attributes:
@@ -65,7 +28,7 @@ class Plane:
 
     point: Vector
     normal: Vector
-    coordinate_signals: ClassVar = (("along", "m"), ("across", "m"))
+    coordinate_signals: ClassVar = (Signal("along", "m"), Signal("across", "m"))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _vector("point", self.point))
@@ -81,15 +44,22 @@ class Plane:
     def coordinates(self, offset: ca.SX) -> ca.SX:
         return ca.vertcat(*[ca.dot(ca.DM(t), offset) for t in tangents(self.normal)])
 
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        normal, thickness = np.array(self.normal), 0.01 * size
+        foot = center - np.dot(center, normal) * normal
+        # The upper side of a thin box.
+        pose = RigidTransform(RotationMatrix(axes_along(normal)), foot - thickness / 2 * normal)
+        return Picture(geometry.Box(size, size, thickness), pose)
+
 
 @dataclass(frozen=True)
-class Sphere:
+class Sphere(Surface):
     """phi = |p - center| - radius; its negative inside.
 
     Attributes:
         center: m, shape (3,).
         radius: m.
-        axis: Of longitude and latitude, which are singular on it, shape (3,).
+        axis: The axis of longitude and latitude, which are singular on it, shape (3,).
         inside: Whether the free side is the inside.
     """
 
@@ -97,7 +67,7 @@ class Sphere:
     radius: float
     axis: Vector = (0.0, 0.0, 1.0)
     inside: bool = False
-    coordinate_signals: ClassVar = (("longitude", "rad"), ("latitude", "rad"))
+    coordinate_signals: ClassVar = (Signal("longitude", "rad"), Signal("latitude", "rad"))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("center", self.center))
@@ -115,9 +85,12 @@ class Sphere:
         x, y, z = _components(self.axis, offset)
         return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2)))
 
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        return Picture(geometry.Sphere(self.radius), RigidTransform())
+
 
 @dataclass(frozen=True)
-class Cylinder:
+class Cylinder(Surface):
     """phi = distance from the axis - radius; its negative inside. It has no ends.
 
     Attributes:
@@ -131,7 +104,7 @@ class Cylinder:
     axis: Vector
     radius: float
     inside: bool = False
-    coordinate_signals: ClassVar = (("angle", "rad"), ("along", "m"))
+    coordinate_signals: ClassVar = (Signal("angle", "rad"), Signal("along", "m"))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _vector("point", self.point))
@@ -150,9 +123,14 @@ class Cylinder:
         x, y, z = _components(self.axis, offset)
         return ca.vertcat(ca.atan2(y, x), z)
 
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        axis = np.array(self.axis)
+        pose = RigidTransform(RotationMatrix(axes_along(axis)), np.dot(center, axis) * axis)
+        return Picture(geometry.Cylinder(self.radius, size), pose)
+
 
 @dataclass(frozen=True)
-class Ellipsoid:
+class Ellipsoid(Surface):
     """phi = F / |grad F| with F = (x/a)^2 + (y/b)^2 + (z/c)^2 - 1: the distance to first order.
 
     Attributes:
@@ -165,7 +143,7 @@ class Ellipsoid:
     center: Vector
     semi_axes: Vector
     inside: bool = False
-    coordinate_signals: ClassVar = (("longitude", "rad"), ("latitude", "rad"))
+    coordinate_signals: ClassVar = (Signal("longitude", "rad"), Signal("latitude", "rad"))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("center", self.center))
@@ -186,16 +164,19 @@ class Ellipsoid:
         x, y, z = ca.vertsplit(offset / ca.DM(self.semi_axes))
         return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2)))
 
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        return Picture(geometry.Ellipsoid(*self.semi_axes), RigidTransform())
+
 
 @dataclass(frozen=True)
-class Torus:
+class Torus(Surface):
     """phi = distance from the ring - minor radius; its negative inside the tube.
 
     Attributes:
         center: m, shape (3,).
-        axis: Of the ring, any length, shape (3,).
-        major_radius: Of the ring, m.
-        minor_radius: Of the tube, m, less than the major one.
+        axis: The axis of the ring, any length, shape (3,).
+        major_radius: The radius of the ring, m.
+        minor_radius: The radius of the tube, m, less than the major one.
         inside: Whether the free side is inside the tube. Coordinates: angle along the ring and
             angle around the tube (0 outermost), rad.
     """
@@ -205,7 +186,7 @@ class Torus:
     major_radius: float
     minor_radius: float
     inside: bool = False
-    coordinate_signals: ClassVar = (("ring_angle", "rad"), ("tube_angle", "rad"))
+    coordinate_signals: ClassVar = (Signal("ring_angle", "rad"), Signal("tube_angle", "rad"))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("center", self.center))
@@ -229,9 +210,17 @@ class Torus:
         x, y, z = _components(self.axis, offset)
         return ca.vertcat(ca.atan2(y, x), ca.atan2(z, ca.sqrt(x**2 + y**2) - self.major_radius))
 
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        ring, tube = np.meshgrid(np.linspace(0, 2 * np.pi, 61), np.linspace(0, 2 * np.pi, 31))
+        radial = self.major_radius + self.minor_radius * np.cos(tube)
+        height = self.minor_radius * np.sin(tube)
+        points = np.stack([radial * np.cos(ring), radial * np.sin(ring), height], axis=-1)
+        pose = RigidTransform(RotationMatrix(axes_along(self.axis)), np.zeros(3))
+        return Picture(mesh_of_grid(points), pose)
+
 
 @dataclass(frozen=True)
-class ImplicitSurface:
+class ImplicitSurface(Surface):
     """phi = F / |grad F| for any smooth F(p) that is zero on the surface: the distance near it.
 
     The gradient has length one on the surface itself.
@@ -244,7 +233,6 @@ class ImplicitSurface:
 
     function: Callable[[ca.SX], ca.SX]
     point: Vector = (0.0, 0.0, 0.0)
-    coordinate_signals: ClassVar = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _vector("point", self.point))
@@ -255,11 +243,6 @@ class ImplicitSurface:
 
     def distance(self, offset: ca.SX) -> ca.SX:
         return _normalized(self.function, offset)
-
-    def coordinates(self, offset: ca.SX) -> ca.SX:
-        raise ModelError(
-            "an ImplicitSurface has no coordinates along it; use PointCoordinates or an expression"
-        )
 
 
 def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
@@ -286,7 +269,7 @@ def _side(distance: ca.SX, inside: bool) -> ca.SX:
 
 
 def _vector(name: str, value: ArrayLike) -> Vector:
-    array = np.asarray(value, dtype=float)
+    array = numbers(name, value)
     if array.shape != (3,) or not np.all(np.isfinite(array)):
         raise ModelError(f"{name} must be three finite numbers, got {value!r}")
     return (float(array[0]), float(array[1]), float(array[2]))

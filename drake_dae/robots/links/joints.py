@@ -20,7 +20,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.tree import Link, Motion
+from drake_dae.robots.links.tree import ElementaryJoint, Link
 
 SUPPORTED_JOINTS = (
     RevoluteJoint,
@@ -35,21 +35,21 @@ SUPPORTED_JOINTS = (
 
 
 @dataclass(frozen=True, eq=False)
-class JointMotions:
-    """The motions from the inboard to the outboard frame of a joint.
+class ElementaryJoints:
+    """A joint as elementary ones, from its inboard to its outboard frame.
 
     Attributes:
-        motions: From inboard to outboard; empty for a weld.
-        rotation: Shape (3, 3), the constant R such that X_FM(q) = R (motions) R^T: it turns an
+        sequence: From inboard to outboard; empty for a weld.
+        rotation: Shape (3, 3), the constant R such that X_FM(q) = R (sequence) R^T: it turns an
             oblique joint axis into a coordinate axis, which saves operations.
     """
 
-    motions: tuple[Motion, ...]
+    sequence: tuple[ElementaryJoint, ...]
     rotation: FloatArray
 
 
 def check_joint(joint: Joint) -> None:
-    """Refuses a joint that has no motions.
+    """Refuses a joint that is no sequence of turns and shifts.
 
     Raises:
         ModelError: It is a quaternion joint, or of a type that is not supported.
@@ -69,41 +69,45 @@ def check_joint(joint: Joint) -> None:
     )
 
 
-def joint_motions(plant: MultibodyPlant, joint: Joint, reverse: bool = False) -> JointMotions:
-    """Reads the motions of a supported joint.
+def elementary_joints(
+    plant: MultibodyPlant, joint: Joint, reverse: bool = False
+) -> ElementaryJoints:
+    """Reads a supported joint as elementary ones.
 
     Args:
         plant: The finalized plant of the joint.
         joint: One that `check_joint` accepts.
         reverse: From the frame on the child to the frame on the parent; Drake allows it for
-            revolute, prismatic and weld joints, where the inverse motion has the opposite axis.
+            revolute, prismatic and weld joints, where the inverse has the opposite axis.
     """
     sign = -1.0 if reverse else 1.0
     i, j = joint.position_start(), joint.velocity_start()
     unit = np.eye(3)
     if isinstance(joint, RevoluteJoint):
         axis, rotation = _align(sign * joint.revolute_axis())
-        return JointMotions((Motion(axis, (i,), (j,), unit[:, [axis]]),), rotation)
+        return ElementaryJoints((ElementaryJoint(axis, (i,), (j,), unit[:, [axis]]),), rotation)
     if isinstance(joint, PrismaticJoint):
         direction = sign * joint.translation_axis().reshape(3, 1)
-        return JointMotions((Motion(None, (i,), (j,), direction),), unit)
+        return ElementaryJoints((ElementaryJoint(None, (i,), (j,), direction),), unit)
     if isinstance(joint, ScrewJoint):
         axis, rotation = _align(_screw_axis(plant, joint))
         metres_per_radian = joint.screw_pitch() / (2.0 * np.pi)
-        shift = Motion(None, (i,), (j,), metres_per_radian * unit[:, [axis]])
-        return JointMotions((shift, Motion(axis, (i,), (j,), unit[:, [axis]])), rotation)
+        shift = ElementaryJoint(None, (i,), (j,), metres_per_radian * unit[:, [axis]])
+        return ElementaryJoints(
+            (shift, ElementaryJoint(axis, (i,), (j,), unit[:, [axis]])), rotation
+        )
     if isinstance(joint, UniversalJoint):
-        turns = [Motion(k, (i + k,), (j + k,), unit[:, [k]]) for k in (0, 1)]
-        return JointMotions(tuple(turns), unit)
+        turns = [ElementaryJoint(k, (i + k,), (j + k,), unit[:, [k]]) for k in (0, 1)]
+        return ElementaryJoints(tuple(turns), unit)
     if isinstance(joint, PlanarJoint):
-        shift = Motion(None, (i, i + 1), (j, j + 1), unit[:, :2])
-        return JointMotions((shift, Motion(2, (i + 2,), (j + 2,), unit[:, [2]])), unit)
+        shift = ElementaryJoint(None, (i, i + 1), (j, j + 1), unit[:, :2])
+        return ElementaryJoints((shift, ElementaryJoint(2, (i + 2,), (j + 2,), unit[:, [2]])), unit)
     if isinstance(joint, BallRpyJoint):
-        return JointMotions(_roll_pitch_yaw(i, j), unit)
+        return ElementaryJoints(_roll_pitch_yaw(i, j), unit)
     if isinstance(joint, RpyFloatingJoint):
-        shift = Motion(None, (i + 3, i + 4, i + 5), (j + 3, j + 4, j + 5), unit)
-        return JointMotions((shift, *_roll_pitch_yaw(i, j)), unit)
-    return JointMotions((), unit)
+        shift = ElementaryJoint(None, (i + 3, i + 4, i + 5), (j + 3, j + 4, j + 5), unit)
+        return ElementaryJoints((shift, *_roll_pitch_yaw(i, j)), unit)
+    return ElementaryJoints((), unit)
 
 
 def joint_velocity_map(joint: Joint, q: ca.SX) -> ca.SX:
@@ -158,11 +162,11 @@ def read_links(
             if isinstance(joint, WeldJoint):
                 X_LM = X_LF @ (joint.X_FM().inverse() if reverse else joint.X_FM())
             else:
-                sequence = joint_motions(plant, joint, reverse)
-                X_FA = RigidTransform(RotationMatrix(sequence.rotation), np.zeros(3))
+                found = elementary_joints(plant, joint, reverse)
+                X_FA = RigidTransform(RotationMatrix(found.rotation), np.zeros(3))
                 start = X_LF @ X_FA
-                for motion in sequence.motions:
-                    links.append(Link.moved(link, *constant_pose(start), motion, q))
+                for elementary in found.sequence:
+                    links.append(Link.moved(link, *constant_pose(start), elementary, q))
                     link, start = len(links) - 1, RigidTransform()
                 X_LM = X_FA.inverse()
             bodies[ends[1]] = (link, X_LM @ frames[1].GetFixedPoseInBodyFrame().inverse())
@@ -189,13 +193,13 @@ def _snap(rotation: FloatArray) -> FloatArray:
     return np.where(np.abs(rotation - nearest) < 1e-13, nearest, rotation)
 
 
-def _roll_pitch_yaw(i: int, j: int) -> tuple[Motion, ...]:
+def _roll_pitch_yaw(i: int, j: int) -> tuple[ElementaryJoint, ...]:
     """R_FM = Rz(yaw) Ry(pitch) Rx(roll); the first turn carries the angular velocity in F."""
     none = np.zeros((3, 0))
     return (
-        Motion(2, (i + 2,), (j, j + 1, j + 2), np.eye(3)),
-        Motion(1, (i + 1,), (), none),
-        Motion(0, (i,), (), none),
+        ElementaryJoint(2, (i + 2,), (j, j + 1, j + 2), np.eye(3)),
+        ElementaryJoint(1, (i + 1,), (), none),
+        ElementaryJoint(0, (i,), (), none),
     )
 
 

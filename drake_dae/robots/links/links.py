@@ -1,75 +1,125 @@
-"""What the links of a robot provide: M(q), H(q, v) and where their frames are."""
+"""What the links of a robot provide: M(q), H(q, v), and their frames."""
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import casadi as ca
-from numpy.typing import ArrayLike
+from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
-class Links(Protocol):
-    """Rigid links without constraint: M(q) v' + H(q, v) = B u, q' = N(q) v.
+class Links(Frames, Protocol):
+    """Rigid links and nothing that they touch: M(q) v' + H(q, v) = B u + R, q' = N(q) v.
 
-    `MultibodyExpressions` takes them from a MultibodyPlant, `LinkExpressions` from equations.
-    Expressions depend on `q`, `v` and the symbols of `parameters`.
+    R is the generalized force of a reaction. `MultibodyExpressions` takes links from a
+    MultibodyPlant, `LinkExpressions` from equations.
+
+    1. Expressions depend on `q`, `v` and the symbols of `parameters` alone, poses of frames on `q`
+       and parameters. `q` and `v` are columns of symbols.
+    2. M is symmetric, and positive definite wherever the robot can be; v^T M v / 2 is its kinetic
+       energy, with the rotors of `reflected_inertia` in it.
+    3. `rotation` is a rotation, and `position(frame, point)` = `position(frame)` + R_WF point. The
+       frame "world" stands still at the origin. A frame that is not known raises ModelError, which
+       names those that are.
+    4. `kinematics(acceleration)` keeps the rules of `Kinematics`, with the same frames.
+    5. `generalized_force` of a reaction is tau with tau . v = its power.
+    6. `inverse_dynamics` of a reaction is M v' + H - tau.
+    7. Signals, limits and numbers of actuators have the sizes of what they are about; a name stands
+       once in `position_signals` and `velocity_signals` together.
     """
 
     @property
-    def q(self) -> ca.SX: ...
-    @property
-    def v(self) -> ca.SX: ...
-    @property
-    def velocity_map(self) -> ca.SX: ...
-    @property
-    def mass_matrix(self) -> ca.SX: ...
-    @property
-    def bias(self) -> ca.SX: ...
-    @property
-    def actuation_matrix(self) -> FloatArray: ...
-    @property
-    def parameters(self) -> tuple[Parameter, ...]: ...
-    @property
-    def position_signals(self) -> tuple[Signal, ...]: ...
-    @property
-    def velocity_signals(self) -> tuple[Signal, ...]: ...
-    @property
-    def actuator_signals(self) -> tuple[Signal, ...]: ...
-    @property
-    def effort_limits(self) -> FloatArray: ...
-    @property
-    def reflected_inertia(self) -> FloatArray: ...
-    @property
-    def gear_ratios(self) -> FloatArray: ...
-    @property
-    def default_positions(self) -> FloatArray: ...
-    @property
-    def position_limits(self) -> tuple[FloatArray, FloatArray]: ...
-    @property
-    def velocity_limits(self) -> tuple[FloatArray, FloatArray]: ...
+    def q(self) -> ca.SX:
+        """Generalized positions, symbols, shape (nq, 1)."""
 
-    def rotation(self, frame: Any) -> ca.SX:
-        """R_WF(q), shape (3, 3)."""
+    @property
+    def v(self) -> ca.SX:
+        """Generalized velocities, symbols, shape (nv, 1)."""
 
-    def position(self, frame: Any, point: ArrayLike = (0.0, 0.0, 0.0)) -> ca.SX:
-        """Position in the world of a point that is fixed in a frame, m, shape (3, 1)."""
+    @property
+    def velocity_map(self) -> ca.SX:
+        """N(q) of q' = N(q) v, shape (nq, nv)."""
 
-    def jacobian(self, phi: "Residual") -> ca.SX:
-        """J = (dphi/dq) N of constraints phi(q), shape (m, nv)."""
+    @property
+    def mass_matrix(self) -> ca.SX:
+        """M(q), shape (nv, nv)."""
 
-    def motion(
-        self, acceleration: ca.SX, phi: "Residual", multiplier: ca.SX
-    ) -> tuple[ca.SX, ca.SX]:
-        """M(q) v' + H(q, v) - J(q)^T lambda of (37), shape (nv, 1), and phi'', shape (m, 1).
+    @property
+    def bias(self) -> ca.SX:
+        """H(q, v), shape (nv, 1)."""
+
+    @property
+    def actuation_matrix(self) -> FloatArray:
+        """B, shape (nv, nu)."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Numbers that a study may change."""
+
+    @property
+    def position_signals(self) -> tuple[Signal, ...]:
+        """Names and units of q."""
+
+    @property
+    def velocity_signals(self) -> tuple[Signal, ...]:
+        """Names and units of v."""
+
+    @property
+    def actuator_signals(self) -> tuple[Signal, ...]:
+        """Names and units of u."""
+
+    @property
+    def effort_limits(self) -> FloatArray:
+        """Largest |u|, shape (nu,), infinite where there is no limit."""
+
+    @property
+    def reflected_inertia(self) -> FloatArray:
+        """What of M is the rotor of each actuator, kg m^2 (kg), shape (nu,)."""
+
+    @property
+    def gear_ratios(self) -> FloatArray:
+        """Motor turns per joint turn, shape (nu,)."""
+
+    @property
+    def default_positions(self) -> FloatArray:
+        """A usual configuration, shape (nq,)."""
+
+    @property
+    def position_limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limit of q, shape (nq,) each."""
+
+    @property
+    def velocity_limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limit of v, shape (nv,) each."""
+
+    @property
+    def plant(self) -> MultibodyPlant | None:
+        """The plant that they come from, for Drake's picture of them; None if there is none."""
+
+    def landmarks(self) -> ca.SX:
+        """Points of the robot that show where it is, in m, shape (3, k): for a view of it."""
+
+    def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
+        """The frames in motion.
 
         Args:
-            acceleration: v', shape (nv, 1).
-            phi: The constraints.
-            multiplier: lambda, shape (m, 1).
+            acceleration: v', shape (nv, 1); a symbol of its own if None.
         """
 
+    def generalized_force(self, kinematics: Any, reaction: Reaction) -> ca.SX:
+        """tau of each column of a reaction, shape (nv, k).
 
-Residual = Callable[[Links], ca.SX]
-"""phi(q) of links, or of stand-ins for them with the same frames, shape (m, 1)."""
+        Args:
+            kinematics: What the reaction is written in, made by these links.
+            reaction: Forces that act on the links.
+        """
+
+    def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
+        """M(q) v' + H(q, v) - tau of (37), shape (nv, 1), with v' of the kinematics.
+
+        Args:
+            kinematics: What the reaction is written in, made by these links.
+            reaction: Forces that act on the links, one column.
+        """

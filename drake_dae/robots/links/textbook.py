@@ -2,21 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import Residual
+from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
 
 
 @dataclass(frozen=True, eq=False)
 class LinkExpressions:
-    """A robot given by its own M(q) and H(q, v), as in a textbook.
+    """Links given by their own M(q) and H(q, v), as in a textbook; see `Links`.
 
     Attributes:
         q: Generalized positions, SX symbols, shape (nq, 1).
@@ -55,11 +55,12 @@ class LinkExpressions:
     default_positions: FloatArray = field(default=None)  # type: ignore[arg-type]
     position_limits: tuple[FloatArray, FloatArray] = field(default=None)  # type: ignore[assignment]
     velocity_limits: tuple[FloatArray, FloatArray] = field(default=None)  # type: ignore[assignment]
+    plant: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         nq, nv = self.q.numel(), self.v.numel()
         actuation = np.eye(nv) if self.actuation_matrix is None else self.actuation_matrix
-        actuation = np.array(actuation, dtype=float)
+        actuation = numbers("actuation_matrix", actuation)
         if actuation.ndim != 2 or actuation.shape[0] != nv:
             raise ModelError(f"actuation_matrix has shape {actuation.shape}, expected ({nv}, nu)")
         nu = actuation.shape[1]
@@ -69,10 +70,10 @@ class LinkExpressions:
             "position_signals": self.position_signals or signals([f"q{i}" for i in range(nq)]),
             "velocity_signals": self.velocity_signals or signals([f"v{i}" for i in range(nv)]),
             "actuator_signals": self.actuator_signals or signals([f"u{i}" for i in range(nu)]),
-            "effort_limits": _numbers(self.effort_limits, nu, np.inf),
-            "reflected_inertia": _numbers(self.reflected_inertia, nu, 0.0),
-            "gear_ratios": _numbers(self.gear_ratios, nu, 1.0),
-            "default_positions": _numbers(self.default_positions, nq, 0.0),
+            "effort_limits": _filled("effort_limits", self.effort_limits, nu, np.inf),
+            "reflected_inertia": _filled("reflected_inertia", self.reflected_inertia, nu, 0.0),
+            "gear_ratios": _filled("gear_ratios", self.gear_ratios, nu, 1.0),
+            "default_positions": _filled("default_positions", self.default_positions, nq, 0.0),
             "position_limits": _limits("position_limits", self.position_limits, nq),
             "velocity_limits": _limits("velocity_limits", self.velocity_limits, nv),
         }
@@ -104,44 +105,84 @@ class LinkExpressions:
             raise ModelError(f"frame '{frame}' was given as a position only; give (rotation, p)")
         return pose[0]
 
-    def position(self, frame: str, point: ArrayLike = (0.0, 0.0, 0.0)) -> ca.SX:
-        """Position in the world of a point that is fixed in a frame, m, shape (3, 1).
+    def position(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
+        """p_W(q) in m of a point that is fixed in a frame, shape (3, 1).
 
         Raises:
             ModelError: An unknown frame, or a point off the origin of one without rotation.
         """
-        offset = np.asarray(point, dtype=float)
+        offset = numbers("point", point)
         if frame == "world":
             return ca.SX(offset)
         pose = self._pose(frame)
         origin = pose[1] if isinstance(pose, tuple) else pose
         return origin + ca.mtimes(self.rotation(frame), offset) if offset.any() else origin
 
-    def jacobian(self, phi: Residual) -> ca.SX:
-        """J = (dphi/dq) N of constraints phi(q), shape (m, nv)."""
-        return ca.mtimes(ca.jacobian(phi(self), self.q), self.velocity_map)
+    def landmarks(self) -> ca.SX:
+        """The origins of all frames, in m, shape (3, k)."""
+        return ca.horzcat(ca.SX(3, 1), *[self.position(frame) for frame in self.frames])
 
-    def motion(self, acceleration: ca.SX, phi: Residual, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """M(q) v' + H(q, v) - J(q)^T lambda of (37), shape (nv, 1), and phi'', shape (m, 1)."""
-        residual, velocity = phi(self), ca.mtimes(self.velocity_map, self.v)
-        reaction = ca.jtimes(residual, self.q, multiplier, True)
-        inertial = ca.mtimes(self.mass_matrix, acceleration) + self.bias
-        rate, moving = ca.jtimes(residual, self.q, velocity), ca.vertcat(self.q, self.v)
-        twice = ca.jtimes(rate, moving, ca.vertcat(velocity, acceleration))
-        return inertial - ca.mtimes(self.velocity_map.T, reaction), twice
+    def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
+        """The frames in motion with v' = `acceleration`, a symbol if None."""
+        if acceleration is None:
+            acceleration = ca.SX.sym("acceleration", self.v.numel())
+        return TextbookKinematics(self, acceleration)
+
+    def generalized_force(self, kinematics: "TextbookKinematics", reaction: Reaction) -> ca.SX:
+        """tau of each column of a reaction, shape (nv, k)."""
+        return reaction.generalized
+
+    def inverse_dynamics(self, kinematics: "TextbookKinematics", reaction: Reaction) -> ca.SX:
+        """M(q) v' + H(q, v) - tau of (37), shape (nv, 1)."""
+        inertial = ca.mtimes(self.mass_matrix, kinematics.acceleration) + self.bias
+        return inertial - reaction.generalized
 
     def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
         if frame not in self.frames:
-            near = get_close_matches(frame, self.frames, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise ModelError(
-                f"no frame '{frame}'; {hint}frames: {', '.join(['world', *self.frames])}"
-            )
+            raise ModelError(unknown_name("frame", frame, ["world", *self.frames]))
         return self.frames[frame]
 
 
-def _numbers(given: ArrayLike | None, size: int, default: float) -> FloatArray:
-    return np.full(size, default) if given is None else np.array(given, dtype=float)
+class TextbookKinematics(Kinematics):
+    """Frames whose poses are plain expressions of q, and differentiated as such."""
+
+    def __init__(self, links: LinkExpressions, acceleration: ca.SX) -> None:
+        self.q, self.v, self.acceleration = links.q, links.v, acceleration
+        self._links = links
+        self._moving = ca.vertcat(links.q, links.v)
+        self._rate = ca.vertcat(ca.mtimes(links.velocity_map, links.v), acceleration)
+
+    def rotation(self, frame: str) -> ca.SX:
+        return self._links.rotation(frame)
+
+    def position(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
+        return self._links.position(frame, point)
+
+    def angular_velocity(self, frame: str) -> ca.SX:
+        rotation = self._links.rotation(frame)
+        rate = ca.reshape(self.derivative(ca.vec(rotation)), 3, 3)
+        # R' = w x R, so that w stands in R' R^T.
+        return ca.vertcat(
+            ca.mtimes(rate[2, :], rotation[1, :].T),
+            ca.mtimes(rate[0, :], rotation[2, :].T),
+            ca.mtimes(rate[1, :], rotation[0, :].T),
+        )
+
+    def velocity(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
+        return self.derivative(self.position(frame, point))
+
+    def derivative(self, expression: ca.SX) -> ca.SX:
+        return ca.jtimes(expression, self._moving, self._rate)
+
+    def reaction(self, power: ca.SX) -> Reaction:
+        return Reaction(ca.gradient(power, self.v))
+
+    def value(self, expression: ca.SX) -> ca.SX:
+        return expression
+
+
+def _filled(name: str, given: ArrayLike | None, size: int, default: float) -> FloatArray:
+    return np.full(size, default) if given is None else numbers(name, given)
 
 
 def _limits(
@@ -149,7 +190,7 @@ def _limits(
 ) -> tuple[FloatArray, FloatArray]:
     lower, upper = (np.full(size, end) for end in (-np.inf, np.inf))
     if given is not None:
-        lower, upper = (np.array(end, dtype=float) for end in given)
+        lower, upper = (numbers(name, end) for end in given)
     if lower.shape != (size,) or upper.shape != (size,) or not np.all(lower < upper):
         raise ModelError(
             f"{name} must be a lower and an upper limit of shape ({size},), the lower one below, "

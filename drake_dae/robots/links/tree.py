@@ -1,13 +1,12 @@
-"""Recursive algorithms on a tree of links, each in its own frame (Featherstone 2008, ch. 5, 6).
+"""A tree of links, each with its own frame, its inertia and one elementary joint to its parent.
 
 Frame names: P is the frame of a link's parent, L its own, W the world's. Quantities of a link are
-expressed in L unless said otherwise. A link moves by one elementary motion, so that its rotation
+expressed in L unless said otherwise. A link moves by one elementary joint, so that its rotation
 is sparse; a joint with several is a chain of links, of which the last carries the inertia.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -15,15 +14,16 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 
 
-def _zero(rows: int, columns: int = 1) -> ca.SX:
+def zeros(rows: int, columns: int = 1) -> ca.SX:
+    """A dense column or matrix of zeros, whose entries can be set one by one."""
     return ca.SX.zeros(rows, columns)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """An elementary motion X_FM(q): a turn about a coordinate axis of F, or a shift.
+class ElementaryJoint:
+    """X_FM(q) of one elementary joint: a turn about a coordinate axis of F, or a shift.
 
-    A joint is a sequence of these; each starts from the frame where the one before ends.
+    A joint of a plant is a sequence of these; each starts from the frame where the one before ends.
 
     Attributes:
         axis: The coordinate axis of the turn (0, 1, 2), or None for a shift.
@@ -55,9 +55,9 @@ class Inertia:
             tr(second) 1 - second.
     """
 
-    mass: ca.SX = field(default_factory=lambda: _zero(1))
-    first: ca.SX = field(default_factory=lambda: _zero(3))
-    second: ca.SX = field(default_factory=lambda: _zero(3, 3))
+    mass: ca.SX = field(default_factory=lambda: zeros(1))
+    first: ca.SX = field(default_factory=lambda: zeros(3))
+    second: ca.SX = field(default_factory=lambda: zeros(3, 3))
 
     @classmethod
     def of_mass(cls, mass: ca.SX, centre: FloatArray, second: FloatArray) -> "Inertia":
@@ -70,12 +70,12 @@ class Inertia:
 
 @dataclass(eq=False)
 class Link:
-    """A frame that one elementary motion moves, with the inertia of the bodies fixed to it.
+    """A frame that one elementary joint moves, with the inertia of the bodies fixed to it.
 
     Attributes:
         parent: Index of its parent; -1 for the world, which is link 0.
-        fixed: Constant R_PF, shape (3, 3), where the motion starts.
-        axis: Of the turn, 0, 1 or 2; None for a shift.
+        fixed: Constant R_PF, shape (3, 3), where the joint starts.
+        axis: The coordinate axis of the turn, 0, 1 or 2; None for a shift.
         turn: R_FL(q), shape (3, 3).
         offset: p_PL in m, expressed in P, shape (3, 1).
         turning: Index in v -> angular velocity in L for a unit of it, shape (3, 1).
@@ -88,7 +88,7 @@ class Link:
     fixed: FloatArray = field(default_factory=lambda: np.eye(3))
     axis: int | None = None
     turn: ca.SX = field(default_factory=lambda: ca.SX.eye(3))
-    offset: ca.SX = field(default_factory=lambda: _zero(3))
+    offset: ca.SX = field(default_factory=lambda: zeros(3))
     turning: dict[int, ca.SX] = field(default_factory=dict)
     shifting: dict[int, ca.SX] = field(default_factory=dict)
     inertia: Inertia = field(default_factory=Inertia)
@@ -99,19 +99,19 @@ class Link:
 
     @classmethod
     def moved(
-        cls, parent: int, fixed: FloatArray, offset: FloatArray, motion: Motion, q: ca.SX
+        cls, parent: int, fixed: FloatArray, offset: FloatArray, joint: ElementaryJoint, q: ca.SX
     ) -> "Link":
-        """A link without inertia that `motion` moves, starting at a constant pose in P."""
-        if motion.axis is None:
-            directions = ca.SX(fixed @ motion.directions)
-            lengths = ca.vertcat(*[q[i] for i in motion.positions])
-            shifting = {j: directions[:, c] for c, j in enumerate(motion.velocities)}
+        """A link without inertia that `joint` moves, starting at a constant pose in P."""
+        if joint.axis is None:
+            directions = ca.SX(fixed @ joint.directions)
+            lengths = ca.vertcat(*[q[i] for i in joint.positions])
+            shifting = {j: directions[:, c] for c, j in enumerate(joint.velocities)}
             moved = ca.SX(offset) + directions @ lengths
             return cls(parent, fixed, offset=moved, shifting=shifting)
-        turn = _turn_about(motion.axis, q[motion.positions[0]])
-        directions = turn.T @ ca.SX(motion.directions)
-        turning = {j: ca.densify(directions[:, c]) for c, j in enumerate(motion.velocities)}
-        return cls(parent, fixed, motion.axis, turn, ca.SX(offset), turning)
+        turn = _turn_about(joint.axis, q[joint.positions[0]])
+        directions = turn.T @ ca.SX(joint.directions)
+        turning = {j: ca.densify(directions[:, c]) for c, j in enumerate(joint.velocities)}
+        return cls(parent, fixed, joint.axis, turn, ca.SX(offset), turning)
 
     def force_to_parent(self, moment: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
         """A moment about L's origin and a force, moved to P's origin and expressed in P."""
@@ -119,7 +119,7 @@ class Link:
         return self.rotation @ moment + ca.cross(self.offset, force), force
 
     def generalized_force(self, moment: ca.SX, force: ca.SX) -> list[tuple[int, ca.SX]]:
-        """What a moment about L's origin and a force do on this motion: index in v, scalar."""
+        """What a moment about L's origin and a force do on this joint: index in v, scalar."""
         turning = [(j, ca.dot(d, moment)) for j, d in self.turning.items()]
         return turning + [(j, ca.dot(self.rotation.T @ d, force)) for j, d in self.shifting.items()]
 
@@ -127,11 +127,11 @@ class Link:
         """An inertia in L, moved to P's origin and expressed in P."""
         first = self.rotation @ inertia.first
         fixed = ca.SX(self.fixed)
-        second = _symmetric(fixed @ self._turn_second(inertia.second) @ fixed.T)
+        second = symmetric(fixed @ self._turn_second(inertia.second) @ fixed.T)
         half = first + inertia.mass / 2 * self.offset
         outer = self.offset @ half.T
         return Inertia(
-            inertia.mass, first + inertia.mass * self.offset, second + _symmetric(outer + outer.T)
+            inertia.mass, first + inertia.mass * self.offset, second + symmetric(outer + outer.T)
         )
 
     def _turn_second(self, second: ca.SX) -> ca.SX:
@@ -152,168 +152,14 @@ class Link:
 
 def link_poses(links: Sequence[Link]) -> list[tuple[ca.SX, ca.SX]]:
     """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
-    poses = [(ca.SX(np.eye(3)), _zero(3))]
+    poses = [(ca.SX(np.eye(3)), zeros(3))]
     for link in links[1:]:
         rotation, origin = poses[link.parent]
         poses.append((rotation @ link.rotation, origin + rotation @ link.offset))
     return poses
 
 
-def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
-    """M, shape (nv, nv), by the composite rigid body algorithm.
-
-    Args:
-        links: The tree, parents before children; the world is link 0.
-        reflected_inertia: Of the rotors, shape (nv,), added to the diagonal.
-    """
-    M = ca.SX(ca.diag(reflected_inertia))
-    composite = [link.inertia for link in links]
-    for index in range(len(links) - 1, 0, -1):
-        link, inertia = links[index], composite[index]
-        composite[link.parent] += link.inertia_to_parent(inertia)
-        columns = []
-        for j, direction in link.turning.items():
-            moment = ca.trace(inertia.second) * direction - inertia.second @ direction
-            columns.append((j, moment, ca.cross(direction, inertia.first)))
-        for j, direction in link.shifting.items():
-            direction = link.rotation.T @ direction
-            columns.append((j, ca.cross(inertia.first, direction), inertia.mass * direction))
-        for j, moment, force in columns:
-            at = link
-            while at.parent >= 0:
-                for i, entry in at.generalized_force(moment, force):
-                    M[i, j] += entry
-                    if at is not link:
-                        M[j, i] += entry
-                moment, force = at.force_to_parent(moment, force)
-                at = links[at.parent]
-    return ca.sparsify(_symmetric(M))
-
-
-def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) -> ca.SX:
-    """Velocity in m/s and angular velocity of a frame for a unit of each entry of v, in the world.
-
-    Args:
-        links: The tree, parents before children; the world is link 0.
-        index: Of the link that the frame is fixed to.
-        origin: Of the frame, p_W in m, shape (3, 1).
-        size: nv.
-
-    Returns:
-        Shape (6, nv): the velocity of the origin above the angular velocity.
-    """
-    poses, result = link_poses(links), ca.SX(6, size)
-    while index > 0:
-        link, (rotation, position) = links[index], poses[index]
-        for j, direction in link.turning.items():
-            axis = rotation @ direction
-            result[:, j] += ca.vertcat(ca.cross(axis, origin - position), axis)
-        for j, direction in link.shifting.items():
-            result[:3, j] += poses[link.parent][0] @ direction
-        index = link.parent
-    return result
-
-
-@dataclass(frozen=True, eq=False)
-class LinkMotion:
-    """How a link moves, in its own axes; each of shape (3, 1), except as noted.
-
-    Attributes:
-        spin: Angular velocity in rad/s.
-        spin_rate: Its derivative in rad/s^2.
-        velocity: Of the origin, in m/s.
-        acceleration: Of the origin, less gravity, in m/s^2: the world is accelerated upward, which
-            pulls every body down.
-        gradient: A point r of the link has the acceleration `acceleration` + gradient r, in 1/s^2,
-            shape (3, 3).
-    """
-
-    spin: ca.SX
-    spin_rate: ca.SX
-    velocity: ca.SX
-    acceleration: ca.SX
-    gradient: ca.SX
-
-
-def link_motions(
-    links: Sequence[Link], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
-) -> list[LinkMotion]:
-    """How every link moves.
-
-    Args:
-        links: The tree, parents before children; the world is link 0.
-        v: Velocities, shape (nv, 1).
-        acceleration: v', shape (nv, 1).
-        gravity: In the world, shape (3,), in m/s^2.
-    """
-    motions = [LinkMotion(_zero(3), _zero(3), _zero(3), ca.SX(-gravity), _zero(3, 3))]
-    for link in links[1:]:
-        parent, to_link = motions[link.parent], link.rotation.T
-        turning, turning_rate, shifting, shifting_rate = (
-            sum((rates[j] * d for j, d in directions.items()), _zero(3))
-            for directions in (link.turning, link.shifting)
-            for rates in (v, acceleration)
-        )
-        carried = to_link @ parent.spin
-        spin = carried + turning
-        spin_rate = to_link @ parent.spin_rate + ca.cross(carried, turning) + turning_rate
-        velocity = parent.velocity + ca.cross(parent.spin, link.offset) + shifting
-        moved = parent.gradient @ link.offset + 2 * ca.cross(parent.spin, shifting) + shifting_rate
-        outer = _symmetric(spin @ spin.T)
-        motions.append(
-            LinkMotion(
-                spin,
-                spin_rate,
-                to_link @ velocity,
-                to_link @ (parent.acceleration + moved),
-                ca.skew(spin_rate) + outer - ca.trace(outer) * ca.SX.eye(3),
-            )
-        )
-    return motions
-
-
-def inverse_dynamics(
-    links: Sequence[Link],
-    motions: Sequence[LinkMotion],
-    gravity: FloatArray,
-    size: int,
-    wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = MappingProxyType({}),
-) -> ca.SX:
-    """Generalized forces, shape (nv, 1), by the recursive Newton-Euler algorithm.
-
-    Args:
-        links: The tree, parents before children; the world is link 0.
-        motions: Of the links.
-        gravity: In the world, shape (3,), in m/s^2.
-        size: nv.
-        wrenches: Index of a link -> moment about its origin in N m and force in N that act on it,
-            in the link's axes, each of shape (3, 1).
-    """
-    tau = _zero(size)
-    moments, forces = [_zero(3) for _ in links], [_zero(3) for _ in links]
-    poses = link_poses(links)
-    for index in range(len(links) - 1, 0, -1):
-        link, inertia, weightless = links[index], links[index].inertia, links[index].weightless
-        acceleration, gradient = motions[index].acceleration, motions[index].gradient
-        T = gradient @ inertia.second
-        force = forces[index] + inertia.mass * acceleration + gradient @ inertia.first
-        moment = moments[index] + ca.cross(inertia.first, acceleration)
-        moment += ca.vertcat(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
-        if not weightless.mass.is_zero():
-            lift = poses[index][0].T @ ca.SX(gravity)
-            force += weightless.mass * lift
-            moment += ca.cross(weightless.first, lift)
-        if index in wrenches:
-            moment, force = moment - wrenches[index][0], force - wrenches[index][1]
-        for j, entry in link.generalized_force(moment, force):
-            tau[j] += entry
-        moment, force = link.force_to_parent(moment, force)
-        moments[link.parent] += moment
-        forces[link.parent] += force
-    return tau
-
-
-def _symmetric(matrix: ca.SX) -> ca.SX:
+def symmetric(matrix: ca.SX) -> ca.SX:
     """The lower triangle mirrored: equal entries become one expression."""
     return ca.tril2symm(ca.tril(matrix))
 

@@ -1,0 +1,133 @@
+"""What a surface says of itself, and how any surface is drawn."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.contact.picture import Picture, mesh_of_grid
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import Linearization, newton, shortest_steps
+
+Vector = tuple[float, float, float]
+
+CELLS = 24
+"""How many cells of a mesh stand side by side."""
+
+
+class Surface(ABC):
+    """A smooth surface that stands in the world.
+
+    Points are given as offsets from its reference point, so that where it stands can be a
+    parameter.
+
+    1. `position` is where the reference point stands by default.
+    2. `distance` is the signed distance of a point, to first order around the surface: zero on it,
+       positive on the free side, with a gradient of length one on the surface. So the constraint
+       force of `PointOnSurface` is the normal force in newtons. It is smooth around the surface.
+    3. `coordinates` tell where on the surface a point is, one row for each of
+       `coordinate_signals`; with the distance they tell the point, but for poles. A surface may
+       have none.
+    4. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
+       with a shape of its own gives that.
+    """
+
+    coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
+
+    @property
+    @abstractmethod
+    def position(self) -> Vector:
+        """Where the reference point stands in the world by default, m, shape (3,)."""
+
+    @abstractmethod
+    def distance(self, offset: ca.SX) -> ca.SX:
+        """The signed distance of a point in m.
+
+        Args:
+            offset: The point relative to the reference point, m, shape (3, 1).
+        """
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        """Coordinates along the surface of such a point, shape (2, 1).
+
+        Raises:
+            ModelError: It has none.
+        """
+        raise ModelError(
+            f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "
+            "expression"
+        )
+
+    def unit_normal(self, offset: ca.SX) -> ca.SX:
+        """The gradient of the distance at such a point, shape (3, 1): one long on the surface."""
+        p = ca.SX.sym("p", 3)
+        return ca.substitute(ca.gradient(self.distance(p), p), p, offset)
+
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        """What is to be seen of the surface, standing with its reference point at the origin.
+
+        Args:
+            center: A point of interest, relative to the reference point, m, shape (3,).
+            size: How large a piece of it to draw if it has no end, m.
+        """
+        return Picture(mesh_of_grid(self._patch(np.asarray(center, float), size)), RigidTransform())
+
+    def _patch(self, center: FloatArray, size: float) -> FloatArray:
+        """A grid of points on the surface, shape (k, k, 3); NaN where there is none.
+
+        It is a grid of the tangent plane below `center`, each point brought onto the surface by
+        Newton's method.
+        """
+        p = ca.SX.sym("p", 3)
+        distance = self.distance(p)
+        function = TracedFunction(
+            "distance",
+            {"offset": p},
+            {"distance": distance, "gradient": ca.gradient(distance, p)},
+        )
+
+        def linearize(point: FloatArray) -> Linearization | None:
+            gradient = function(point)[1]
+            return shortest_steps(gradient[None], lambda x: function(x)[0])
+
+        def foot(point: FloatArray) -> FloatArray:
+            found, solved = newton(point, linearize)
+            near = solved and np.linalg.norm(found - point) <= size
+            return found if near else np.full(3, np.nan)
+
+        middle = foot(center)
+        if not np.all(np.isfinite(middle)):
+            middle = center
+        normal = function(middle)[1]
+        first, second = tangents(normal / np.linalg.norm(normal))
+        steps = size * np.linspace(-0.5, 0.5, CELLS + 1)
+        return np.array([[foot(middle + a * first + b * second) for b in steps] for a in steps])
+
+
+def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across a unit vector, upright where possible.
+
+    For a vertical wall the first is horizontal and the second points up; for a horizontal plane
+    they are x and y.
+    """
+    n = np.asarray(normal, dtype=float)
+    if abs(n[2]) < 0.9:
+        second = np.array([0.0, 0.0, 1.0]) - n[2] * n
+        second /= np.linalg.norm(second)
+        return np.cross(n, second), second
+    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    first /= np.linalg.norm(first)
+    return first, np.cross(n, first)
+
+
+def axes_along(direction: ArrayLike) -> FloatArray:
+    """A rotation, shape (3, 3), whose z axis is a unit vector."""
+    z = np.asarray(direction, dtype=float)
+    x, _ = tangents(z)
+    return np.column_stack([x, np.cross(z, x), z])

@@ -1,0 +1,117 @@
+"""The frames of a MultibodyPlant, by name, on the links that carry them."""
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, FrameIndex
+
+from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.errors import ModelError
+from drake_dae.robots.links.joints import constant_pose
+from drake_dae.robots.links.tree import Link, link_poses
+
+
+class PlantFrames:
+    """The frames of a plant, each fixed to a link of its tree.
+
+    Args:
+        plant: A finalized plant.
+        links: Its tree, parents before children; the world is link 0.
+        bodies: Index of a body -> its link, and its constant pose in that link.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        links: Sequence[Link],
+        bodies: dict[int, tuple[int, RigidTransform]],
+    ) -> None:
+        self._plant = plant
+        self._links = links
+        self._bodies = bodies
+        self._poses: dict[int, tuple[ca.SX, ca.SX]] = {}
+
+    def find(self, frame: str | Frame) -> Frame:
+        """A frame of the plant by its name; "instance::name" if several have that name.
+
+        Raises:
+            ModelError: No frame, or more than one, has that name; or a frame of another plant.
+        """
+        found = self._by_name(frame) if isinstance(frame, str) else frame
+        if found.GetParentPlant() is not self._plant:
+            raise ModelError(f"frame '{found.name()}' belongs to another plant")
+        return found
+
+    def pose(self, frame: Frame) -> tuple[ca.SX, ca.SX]:
+        """R_WF, shape (3, 3), and p_WF in m, shape (3, 1), as expressions of q."""
+        index = int(frame.index())
+        if index not in self._poses:
+            link, rotation, offset = self.on_link(frame)
+            R_WL, p_WL = self.link_poses[link]
+            self._poses[index] = (R_WL @ ca.SX(rotation), p_WL + R_WL @ ca.SX(offset))
+        return self._poses[index]
+
+    def on_link(self, frame: Frame) -> tuple[int, FloatArray, FloatArray]:
+        """The index of the link that carries a frame; R_LF, shape (3, 3), and p_LF, shape (3,)."""
+        link, X_LB = self._bodies[int(frame.body().index())]
+        return link, *constant_pose(X_LB @ frame.GetFixedPoseInBodyFrame())
+
+    @cached_property
+    def link_poses(self) -> list[tuple[ca.SX, ca.SX]]:
+        """R_WL and p_WL of every link."""
+        return link_poses(self._links)
+
+    def _by_name(self, name: str) -> Frame:
+        plant = self._plant
+        if name == "world":
+            return plant.world_frame()
+        frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
+        matches = [frame for frame in frames if name in (frame.name(), scoped_name(plant, frame))]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            scoped = ", ".join(scoped_name(plant, frame) for frame in matches)
+            raise ModelError(f"the plant has several frames '{name}'; say which: {scoped}")
+        # Drake's parser adds frames of its own at joints whose axis it has to turn.
+        names = [n for n in unique_names(plant, frames) if not n.endswith(("_parent_F", "_M"))]
+        raise ModelError(unknown_name("frame", name, names))
+
+
+def position_of(pose: tuple[ca.SX, ca.SX], point: ArrayLike) -> ca.SX:
+    """p_W in m of a point that is fixed in a frame with this pose, shape (3, 1).
+
+    Raises:
+        ModelError: The point is not three finite numbers.
+    """
+    rotation, origin = pose
+    return origin + rotation @ ca.SX(check_point(point))
+
+
+def check_point(point: ArrayLike) -> FloatArray:
+    """The coordinates of a point, shape (3,).
+
+    Raises:
+        ModelError: It is not three finite numbers.
+    """
+    offset = numbers("a point", point)
+    if offset.shape != (3,) or not np.all(np.isfinite(offset)):
+        raise ModelError(f"a point has 3 finite coordinates, got {point!r}")
+    return offset
+
+
+def scoped_name(plant: MultibodyPlant, item: Any) -> str:
+    """The name of a joint, body, frame or actuator behind that of its model instance."""
+    return f"{plant.GetModelInstanceName(item.model_instance())}::{item.name()}"
+
+
+def unique_names(plant: MultibodyPlant, items: Sequence[Any]) -> list[str]:
+    """Names of joints, bodies, frames or actuators, scoped where they collide."""
+    count = Counter(item.name() for item in items)
+    return [item.name() if count[item.name()] == 1 else scoped_name(plant, item) for item in items]

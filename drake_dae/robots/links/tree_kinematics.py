@@ -1,0 +1,138 @@
+"""The frames of a tree of links in motion, with symbols for their poses and velocities.
+
+Constraints are differentiated by these few symbols, and not through the joints: what the frames
+do, the recursions of `recursions` know in far fewer operations.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+from numpy.typing import ArrayLike
+from pydrake.multibody.tree import Frame
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.links.frames import PlantFrames, check_point, position_of
+from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
+from drake_dae.robots.links.recursions import LinkKinematics
+
+Wrench = tuple[ca.SX, ca.SX]
+
+
+@dataclass(frozen=True, eq=False)
+class _FrameSymbols:
+    """What stands for a frame F that can move, all in the world W.
+
+    R_WF' stands beside w, although R_WF' = w x R_WF: so a constraint on orientations is
+    differentiated without products that the recursions have formed already.
+    """
+
+    rotation: ca.SX = field(default_factory=lambda: ca.SX.sym("R", 3, 3))
+    rotation_rate: ca.SX = field(default_factory=lambda: ca.SX.sym("R'", 3, 3))
+    origin: ca.SX = field(default_factory=lambda: ca.SX.sym("p", 3))
+    velocity: ca.SX = field(default_factory=lambda: ca.SX.sym("p'", 3))
+    spin: ca.SX = field(default_factory=lambda: ca.SX.sym("w", 3))
+
+
+class TreeKinematics(Kinematics):
+    """The frames of a plant in motion.
+
+    Args:
+        frames: The plant's frames.
+        q, v, acceleration: As in `Kinematics`.
+        velocity_map: N, shape (nq, nv).
+        moving: How each link moves, with gravity in its acceleration.
+        gravity: In the world, shape (3,), in m/s^2.
+
+    Attributes:
+        moving: As given.
+    """
+
+    def __init__(
+        self,
+        frames: PlantFrames,
+        q: ca.SX,
+        v: ca.SX,
+        acceleration: ca.SX,
+        velocity_map: ca.SX,
+        moving: Sequence[LinkKinematics],
+        gravity: FloatArray,
+    ) -> None:
+        self.q, self.v, self.acceleration = q, v, acceleration
+        self.moving = moving
+        self._frames = frames
+        self._position_rate = ca.mtimes(velocity_map, v)
+        self._gravity = ca.SX(gravity)
+        self._symbols: dict[int, tuple[Frame, _FrameSymbols]] = {}
+
+    def rotation(self, frame: str | Frame) -> ca.SX:
+        return self._pose(frame)[0]
+
+    def position(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
+        return position_of(self._pose(frame), point)
+
+    def angular_velocity(self, frame: str | Frame) -> ca.SX:
+        own = self._moving(self._frames.find(frame))
+        return ca.SX.zeros(3) if own is None else own.spin
+
+    def velocity(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
+        own, offset = self._moving(self._frames.find(frame)), check_point(point)
+        return ca.SX.zeros(3) if own is None else own.velocity + own.rotation_rate @ ca.SX(offset)
+
+    def derivative(self, expression: ca.SX) -> ca.SX:
+        moving = [(self.q, self._position_rate), (self.v, self.acceleration)]
+        for frame, own in self._symbols.values():
+            index, turn, lever = self._frames.on_link(frame)
+            R_WL, link = self._frames.link_poses[index][0], self.moving[index]
+            falling = link.acceleration + link.gradient @ ca.SX(lever)
+            moving += [
+                (own.rotation, own.rotation_rate),
+                (own.rotation_rate, R_WL @ (link.gradient @ ca.SX(turn))),
+                (own.origin, own.velocity),
+                (own.velocity, R_WL @ falling + self._gravity),
+                (own.spin, R_WL @ link.spin_rate),
+            ]
+        places, rates = (ca.vertcat(*map(ca.vec, column)) for column in zip(*moving, strict=True))
+        return ca.jtimes(expression, places, rates)
+
+    def reaction(self, power: ca.SX) -> Reaction:
+        wrenches = {}
+        for frame, own in self._symbols.values():
+            velocities = ca.veccat(own.velocity, own.rotation_rate, own.spin)
+            if not ca.depends_on(power, velocities):
+                continue
+            slope = ca.gradient(power, own.rotation_rate)
+            moment = ca.gradient(power, own.spin)
+            for k in range(3):
+                moment += ca.cross(own.rotation[:, k], slope[:, k])
+            wrenches[frame] = (ca.gradient(power, own.velocity), moment)
+        return Reaction(ca.sparsify(ca.gradient(power, self.v)), wrenches)
+
+    def value(self, expression: ca.SX) -> ca.SX:
+        pairs = [pair for entry in self._symbols.values() for pair in self._values(*entry)]
+        symbols, values = ([ca.vec(pair[i]) for pair in pairs] for i in (0, 1))
+        return ca.substitute(expression, ca.vertcat(*symbols), ca.vertcat(*values))
+
+    def _values(self, frame: Frame, own: _FrameSymbols) -> list[tuple[ca.SX, ca.SX]]:
+        """Each symbol of a frame, and what it stands for."""
+        index, turn, lever = self._frames.on_link(frame)
+        R_WL, link = self._frames.link_poses[index][0], self.moving[index]
+        R_WF, p_WF = self._frames.pose(frame)
+        return [
+            (own.rotation, R_WF),
+            (own.rotation_rate, R_WL @ (ca.skew(link.spin) @ ca.SX(turn))),
+            (own.origin, p_WF),
+            (own.velocity, R_WL @ (link.velocity + ca.cross(link.spin, ca.SX(lever)))),
+            (own.spin, R_WL @ link.spin),
+        ]
+
+    def _pose(self, frame: str | Frame) -> tuple[ca.SX, ca.SX]:
+        found = self._frames.find(frame)
+        own = self._moving(found)
+        return self._frames.pose(found) if own is None else (own.rotation, own.origin)
+
+    def _moving(self, frame: Frame) -> _FrameSymbols | None:
+        """The symbols of a frame; None if it is fixed to the world."""
+        if self._frames.on_link(frame)[0] == 0:
+            return None
+        return self._symbols.setdefault(int(frame.index()), (frame, _FrameSymbols()))[1]

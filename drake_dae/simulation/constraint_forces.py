@@ -1,0 +1,198 @@
+"""What constraints do to a robot, in numbers and as arrows in Meshcat."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.contact.surface import axes_along
+from drake_dae.robots.model import RobotModel
+from drake_dae.trace.functions import TracedFunction
+
+_FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
+_MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
+
+LEAST_SCALE = 1e-3
+"""How much of its length an arrow keeps where nothing acts: no transformation survives zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loads:
+    """What constraints do to a robot at one moment, in the world, one row per constraint.
+
+    Attributes:
+        points: Where they act, m, shape (k, 3).
+        forces: The forces that act there, N, shape (k, 3).
+        moments: The moments, N m, shape (k, 3).
+    """
+
+    points: FloatArray
+    forces: FloatArray
+    moments: FloatArray
+
+
+class ConstraintLoads:
+    """Where and how the constraints of a robot act on it, as a fast function.
+
+    Args:
+        model: The robot.
+        parameters: Values of all parameters; the defaults if None.
+
+    Attributes:
+        constraints: Those that act at a point.
+        with_moment: Whether each of these has a moment besides its force.
+    """
+
+    def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
+        links, bound = model.links, ConstraintSet(model.constraints)
+        kinematics, force = links.kinematics(), ca.SX.sym("force", bound.size)
+        acting = [
+            (constraint, part, application)
+            for constraint, part in bound.parts()
+            if (application := constraint.application(kinematics)) is not None
+        ]
+        self.constraints: Sequence[Constraint] = [constraint for constraint, _, _ in acting]
+        self.with_moment = [a.moment_axes.nnz() > 0 for _, _, a in acting]
+        columns = {
+            "points": [a.point for _, _, a in acting],
+            "forces": [ca.mtimes(a.force_axes, force[part]) for _, part, a in acting],
+            "moments": [ca.mtimes(a.moment_axes, force[part]) for _, part, a in acting],
+        }
+        self._function = TracedFunction(
+            "constraint loads",
+            {"q": links.q, "v": links.v, "force": force, "parameters": model.dae.parameter_symbol},
+            {
+                name: kinematics.value(ca.horzcat(ca.SX(3, 0), *column))
+                for name, column in columns.items()
+            },
+        )
+        values = model.dae.parameter_values if parameters is None else parameters
+        self._parameters = np.asarray(values, dtype=float)
+        self._sizes = links.q.numel(), links.v.numel()
+
+    def __call__(self, state: FloatArray, constraint_force: ArrayLike) -> Loads:
+        """What acts at one moment.
+
+        Args:
+            state: x, or the link state (q, v) that it begins with.
+            constraint_force: lambda, shape (m,).
+        """
+        nq, nv = self._sizes
+        q, v = state[:nq], state[nq : nq + nv]
+        found = self._function(q, v, constraint_force, self._parameters)
+        return Loads(*(columns.reshape(3, -1, order="F").T for columns in found))
+
+
+class ConstraintForceVisualizer(LeafSystem):
+    """Draws what each constraint does to the robot: an arrow that ends where its force acts.
+
+    It points as the constraint pushes. A moment has an arrow of its own, with two heads, along its
+    axis. An arrow is as long as its force is large beside the largest one drawn so far.
+
+    Input ports:
+        link_state: (q, v).
+        constraint_force: lambda, shape (m,).
+
+    Args:
+        meshcat: Where to draw.
+        model: The robot.
+        period: Time between pictures in s; None draws only when told to.
+        length: The length of the longest arrow, m.
+
+    Attributes:
+        largest_force, largest_moment: What gets the longest arrow, N and N m.
+    """
+
+    def __init__(
+        self, meshcat: Meshcat, model: RobotModel, period: float | None, length: float = 0.25
+    ) -> None:
+        super().__init__()
+        self.set_name("constraint_force_visualizer")
+        self.largest_force = self.largest_moment = 1e-6
+        self._meshcat = meshcat
+        self._loads = ConstraintLoads(model)
+        size = model.links.q.numel() + model.links.v.numel()
+        self._link_state = self.DeclareVectorInputPort("link_state", size)
+        self._force = self.DeclareVectorInputPort("constraint_force", model.dae.num_constraints)
+        pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
+        for constraint, with_moment in pairs:
+            _add_arrow(meshcat, path_of(constraint, "force"), length, 1, _FORCE_COLOR)
+            if with_moment:
+                _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, _MOMENT_COLOR)
+        if period is not None:
+            self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+        self.DeclareForcedPublishEvent(self._publish)
+
+    def draw(self, loads: Loads, time: float) -> None:
+        """Draws the arrows.
+
+        Args:
+            loads: What acts.
+            time: The time in a recording, s.
+        """
+        self.measure([loads])
+        pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
+        for row, (constraint, with_moment) in enumerate(pairs):
+            point, force, moment = loads.points[row], loads.forces[row], loads.moments[row]
+            self._draw_arrow(path_of(constraint, "force"), point, force / self.largest_force, time)
+            if with_moment:
+                turned = moment / self.largest_moment
+                self._draw_arrow(path_of(constraint, "moment"), point, turned, time)
+
+    def measure(self, course: Sequence[Loads]) -> None:
+        """Makes the arrows so short that none of these loads has one that is too long."""
+        for loads in course:
+            force, moment = (
+                float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
+                for rows in (loads.forces, loads.moments)
+            )
+            self.largest_force = max(self.largest_force, force)
+            self.largest_moment = max(self.largest_moment, moment)
+
+    def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
+        size = float(np.linalg.norm(arrow))
+        direction = arrow / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+        pose = RigidTransform(RotationMatrix(axes_along(direction)), point)
+        self._meshcat.SetTransform(path, pose, time)
+        scale = max(size, LEAST_SCALE)
+        self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
+
+    def _publish(self, context: Context) -> EventStatus:
+        state, force = self._link_state.Eval(context), self._force.Eval(context)
+        self.draw(self._loads(state, force), context.get_time())
+        return EventStatus.Succeeded()
+
+
+def path_of(constraint: Constraint, what: str) -> str:
+    """Where a constraint's surface, force or moment stands in the scene."""
+    return f"/contact/{constraint.name}/{what}"
+
+
+def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
+    """An arrow along z that ends at the origin, with one head behind the other."""
+    # A MeshcatCone stands on its tip: turned over, it points along +z, at the origin.
+    turned = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
+    head, names = 0.2 * length, ["head", "second_head"][:heads]
+    for number, name in enumerate(names):
+        cone = f"{path}/arrow/{name}"
+        meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
+        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, -number * head]))
+    shaft = length - heads * head
+    meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
+    middle = np.array([0.0, 0.0, -heads * head - shaft / 2])
+    meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
+    # Drawn last and over everything: the force in a joint acts inside of bodies.
+    for part in (*names, "shaft"):
+        mesh = f"{path}/arrow/{part}/<object>"
+        meshcat.SetProperty(mesh, "material.depthTest", False)
+        meshcat.SetProperty(mesh, "material.transparent", True)
+        meshcat.SetProperty(mesh, "renderOrder", 1.0)

@@ -1,0 +1,81 @@
+"""The rules of `PositionOutput`, on every member."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm
+from members import subclasses
+
+from drake_dae import (
+    AxisCoordinates,
+    Cylinder,
+    ExpressionOutput,
+    JointPositions,
+    Plane,
+    PointCoordinates,
+    PointOnSurface,
+    Signal,
+    SurfaceCoordinates,
+)
+from drake_dae.errors import ModelError
+from drake_dae.robots.outputs import PositionOutput
+from drake_dae.trace.functions import TracedFunction
+
+WALL = PointOnSurface("tool", Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")
+PIPE = PointOnSurface("tool", Cylinder((0.7, 0, 0.4), (0, 1, 0), 0.1), name="pipe")
+MEMBERS = {
+    "point": PointCoordinates("tool", "zx"),
+    "other point": PointCoordinates("tool", "y", (0.0, 0.0, 0.1), "heel"),
+    "axis": AxisCoordinates("tool", "z", "xy"),
+    "wall": SurfaceCoordinates(WALL),
+    "pipe": SurfaceCoordinates(PIPE),
+    "joints": JointPositions(["joint7", "joint3"]),
+    "expression": ExpressionOutput(
+        lambda links: ca.sumsqr(links.position("tool")), [Signal("reach", "m^2")]
+    ),
+}
+
+
+def test_no_member_is_left_out():
+    assert subclasses(PositionOutput) <= {type(output) for output in MEMBERS.values()}
+
+
+@pytest.fixture(params=MEMBERS)
+def output(request):
+    return MEMBERS[request.param]
+
+
+def test_rows_are_as_many_as_names(output):
+    links = arm("seven_joint").model.links
+    names = [signal.name for signal in output.signals(links)]
+    assert output.expression(links).shape == (len(names), 1)
+    assert len(set(names)) == len(names) > 0
+
+
+def test_rows_are_independent_functions_of_the_positions(output):
+    """Their gradients are, at a configuration of no special kind."""
+    links = arm("seven_joint").model.links
+    contacts = [p for c in (WALL, PIPE) for p in c.parameters]
+    parameters = ca.vertcat(*[p.symbol for p in (*links.parameters, *contacts)])
+    values = np.concatenate([p.value for p in (*links.parameters, *contacts)])
+    expression = output.expression(links)
+    assert not ca.depends_on(expression, links.v)
+    function = TracedFunction(
+        "rows", {"q": links.q, "p": parameters}, {"slope": ca.jacobian(expression, links.q)}
+    )
+    slope = function(np.linspace(-0.9, 0.7, 7), values)[0].reshape(-1, 7)
+    assert np.linalg.svd(slope, compute_uv=False)[-1] > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        (PointCoordinates("tol"), r"no frame 'tol'; did you mean 'tool'\?"),
+        (AxisCoordinates("tol", "z", "xy"), r"no frame 'tol'; did you mean 'tool'\?"),
+        (JointPositions(["joint9"]), r"no joint position 'joint9'; did you mean 'joint\d'\?"),
+        (SurfaceCoordinates(PointOnSurface("tol", WALL.surface)), r"no frame 'tol'"),
+    ],
+)
+def test_what_is_unknown_is_named(output, message):
+    with pytest.raises(ModelError, match=message):
+        output.expression(arm("seven_joint").model.links)
