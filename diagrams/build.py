@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
 from drake_dae.diagrams.scenario import Scenario

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.scenario import FOLDER, Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError

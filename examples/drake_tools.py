@@ -36,7 +36,7 @@ from drake_dae import (
     make_closed_loop,
     poles,
 )
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.diagrams.scenario import FOLDER
 
 LOW, HIGH = 0.0, 0.6

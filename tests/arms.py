@@ -25,7 +25,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.dae.gains import GainDesign
-from drake_dae.dae.structure import Structure, find_structure
+from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.scenario import FOLDER, find_scenario
 from drake_dae.robots.actuation.stage import Stage
 

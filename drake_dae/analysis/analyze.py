@@ -16,16 +16,16 @@ from drake_dae.analysis.findings import Assumption, Finding
 from drake_dae.analysis.reference_check import check_reference
 from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray, check_whole_number
-from drake_dae.dae.assumptions import Violation
-from drake_dae.dae.constrained import (
+from drake_dae.dae.states.margins import Margin, find_margin, is_regular
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure.assumptions import Violation
+from drake_dae.dae.structure.constrained import (
     Constrained,
     check_system,
     constraint_violation,
     examine_constraints,
 )
-from drake_dae.dae.states.margins import Margin, find_margin, is_regular
-from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure import Structure, control_violation, examine_outputs
+from drake_dae.dae.structure.structure import Structure, control_violation, examine_outputs
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError

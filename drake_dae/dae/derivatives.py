@@ -181,15 +181,15 @@ class Derivatives:
         balance = ca.mtimes(system.mass_matrix, rate) - system.f
         balance -= ca.mtimes(system.g, self.constraint_input)
         constraint_rate = ca.jtimes(constraint, system.state, rate)
-        if system.motion is None:
+        if system.implicit is None:
             return balance, constraint_rate
-        shorter = ca.vertcat(*system.motion(rate, self.constraint_input))
+        shorter = ca.vertcat(*system.implicit(rate, self.constraint_input))
         longer = ca.vertcat(balance, constraint_rate)
         if shorter.shape != longer.shape or not _agree(
             system, shorter, longer, self._symbols[1], self.control
         ):
             raise ModelError(
-                f"{system.name}: 'motion' is not (E x' - f - g v, c') near the nominal state"
+                f"{system.name}: 'implicit' is not (E x' - f - g v, c') near the nominal state"
             )
         return shorter[: system.num_states], shorter[system.num_states :, :]
 

@@ -8,7 +8,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.dae.layout import Layout
 from drake_dae.errors import GainError
 
 
@@ -42,7 +43,7 @@ class FeedbackGains:
         object.__setattr__(self, "degrees", tuple(int(degree) for degree in self.degrees))
         if len(self.names) != len(self.degrees):
             raise GainError(f"{len(self.names)} output names for {len(self.degrees)} degrees")
-        matrix = _numbers("gains", self.matrix)
+        matrix = numbers("gains", self.matrix, GainError)
         shape = (len(self.degrees), sum(self.degrees))
         if matrix.shape != shape:
             raise GainError(f"gains must have shape (p, sum mu_i) = {shape}, got {matrix.shape}")
@@ -59,21 +60,20 @@ class FeedbackGains:
         if slowest >= 0.0:
             raise GainError(
                 "the error dynamics (30) are not Hurwitz: poles "
-                f"{np.array2string(self.poles, precision=4)}; all real parts must be negative"
+                f"{show(self.poles)}; all real parts must be negative"
             )
+
+    @property
+    def layout(self) -> Layout:
+        """How the error coordinates are stacked."""
+        return Layout(self.degrees)
 
     @property
     def error_matrix(self) -> FloatArray:
         """E of e' = E e, shape (N, N)."""
-        total = sum(self.degrees)
-        result = np.zeros((total, total))
-        start = 0
-        for degree, row in zip(self.degrees, self.matrix, strict=True):
-            if degree:
-                for j in range(start, start + degree - 1):
-                    result[j, j + 1] = 1.0
-                result[start + degree - 1] = -row
-            start += degree
+        layout = self.layout
+        result = np.eye(layout.chain_size, k=1)
+        result[layout.ends] = -self.matrix[layout.dynamic]
         return result
 
     @property
@@ -110,9 +110,8 @@ class FeedbackGains:
         steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
         lengths, which = np.unique(steps, return_inverse=True)
         result = np.zeros((moments.size, len(self.degrees)))
-        orders = np.concatenate([np.arange(degree) for degree in self.degrees])
-        owner = np.repeat(np.arange(len(self.degrees)), self.degrees)
-        for block in _coupled(self.degrees, self.matrix):
+        orders, owner = self.layout.orders, self.layout.owners
+        for block in _coupled(self.layout, self.matrix):
             rows = np.flatnonzero(np.isin(owner, block))
             own = matrix[np.ix_(rows, rows)]
             # In units of its own rate, a power of 2, so that the entries of exp(E t) are alike.
@@ -160,16 +159,16 @@ def gain_coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         matrix = np.zeros((len(names), sum(degrees)))
-        starts = dict(zip(names, np.cumsum([0, *degrees[:-1]]), strict=True))
+        starts = dict(zip(names, Layout(tuple(degrees)).starts, strict=True))
         for name, degree, row in _per_output(values, names, degrees):
-            numbers = np.atleast_1d(_numbers(f"coefficients of output '{name}'", row))
-            if numbers.shape != (degree,):
+            given = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
+            if given.shape != (degree,):
                 raise GainError(
                     f"output '{name}' has degree {degree} and takes {degree} coefficients "
-                    f"K_i1, ..., K_i{degree}, got {numbers.size}"
+                    f"K_i1, ..., K_i{degree}, got {given.size}"
                 )
             start = int(starts[name])
-            matrix[list(names).index(name), start : start + degree] = numbers
+            matrix[list(names).index(name), start : start + degree] = given
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
     return design
@@ -192,7 +191,7 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
                 f"matrices are needed, got {len(groups)}"
             )
         matrix = np.zeros((len(names), sum(degrees)))
-        starts = np.cumsum([0, *degrees[:-1]])
+        starts = Layout(tuple(degrees)).starts
         for degree, group in zip(occurring, groups, strict=True):
             members = [i for i, d in enumerate(degrees) if d == degree]
             if len(group) != degree:
@@ -200,7 +199,7 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
                     f"outputs of degree {degree} take {degree} matrices, got {len(group)}"
                 )
             for order, block in enumerate(group):
-                block = np.atleast_2d(_numbers("a gain matrix", block))
+                block = np.atleast_2d(numbers("a gain matrix", block, GainError))
                 if block.shape != (len(members), len(members)):
                     raise GainError(
                         f"a gain matrix has shape {block.shape}, but "
@@ -241,15 +240,6 @@ def _per_output(
     return [(name, degree, values[name if name in values else "*"]) for name, degree in dynamic]
 
 
-def _numbers(what: str, value: ArrayLike) -> FloatArray:
-    try:
-        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
-            raise TypeError
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise GainError(f"{what} must be real numbers, got {value!r}") from error
-
-
 def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
     """K_i1, ..., K_i mu_i of the polynomial (32) with the chosen roots."""
     try:
@@ -268,14 +258,11 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
     return [float(number) for number in np.real(monic)[:0:-1]]
 
 
-def _coupled(degrees: Sequence[int], matrix: FloatArray) -> list[list[int]]:
+def _coupled(layout: Layout, matrix: FloatArray) -> list[list[int]]:
     """Groups of outputs whose errors influence each other."""
-    owner = np.repeat(np.arange(len(degrees)), degrees)
     groups: list[set[int]] = []
-    for i, degree in enumerate(degrees):
-        if degree == 0:
-            continue
-        joined = {i, *(int(owner[j]) for j in np.flatnonzero(matrix[i]))}
+    for i in map(int, layout.dynamic):
+        joined = {i, *map(int, layout.owners[np.flatnonzero(matrix[i])])}
         apart = [group for group in groups if not group & joined]
         groups = [*apart, joined.union(*(group for group in groups if group & joined))]
     return [sorted(group) for group in groups]

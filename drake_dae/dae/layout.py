@@ -68,6 +68,11 @@ class Layout:
         )
 
     @cached_property
+    def starts(self) -> Indices:
+        """Where the chain of each signal begins, or would if it had one, shape (p,)."""
+        return np.cumsum([0, *self.degrees], dtype=np.intp)[:-1]
+
+    @cached_property
     def heads(self) -> Indices:
         """Where the chains of the signals with mu_i >= 1 begin."""
         return np.flatnonzero(self.orders == 0)

@@ -46,7 +46,7 @@ class DaeSystem:
         nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
         name: For messages.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
-        motion: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
+        implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
 
@@ -72,7 +72,7 @@ class DaeSystem:
     nominal_state: FloatArray = field(default=None)  # type: ignore[arg-type]
     name: str = "system"
     mass_matrix: ca.SX = None
-    motion: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
+    implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -191,7 +191,7 @@ class DaeSystem:
             g=solved[:, 1 : 1 + m],
             h=solved[:, 1 + m :],
             mass_matrix=None,
-            motion=None,
+            implicit=None,
         )
 
     @cached_property

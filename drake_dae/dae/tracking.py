@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.measured_force import MeasuredForce
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError
 from drake_dae.trace.functions import TracedFunction

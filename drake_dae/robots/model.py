@@ -248,7 +248,7 @@ class RobotModel:
             output_signals=(*position_signals, *bound.force_signals),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
-            motion=implicit,
+            implicit=implicit,
         )
 
     def _moved_rotors(self, driven: ActuationChain) -> ca.SX:

@@ -23,11 +23,12 @@ from pydrake.systems.framework import (
     SystemScalarConverter,
 )
 
-from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError, NonFiniteError, SimulationError, SingularityError
-from drake_dae.trace.functions import Failure, Fault, TracedFunction
+from drake_dae.errors import ModelError
+from drake_dae.systems.failures import evaluate_checked
+from drake_dae.trace.functions import TracedFunction
 
 STATES = ("state", "estimated_state")
 """What the argument of a formula is called that says where the system is."""
@@ -89,74 +90,6 @@ class TracedFormula:
         self, function: TracedFunction, time: float, arguments: tuple[FloatArray, ...]
     ) -> tuple[FloatArray, ...]:
         return evaluate_checked(function, time, arguments[self._state], arguments, self._signals)
-
-
-def evaluate_checked(
-    function: TracedFunction,
-    time: float,
-    state: FloatArray,
-    arguments: Sequence[FloatArray],
-    signals: Mapping[str, Sequence[Signal]],
-) -> tuple[FloatArray, ...]:
-    """The values of a function in a simulation.
-
-    Args:
-        function: The function.
-        time: In s.
-        state: Where the system is, shape (n,).
-        arguments: As `function` takes them.
-        signals: Name of an input -> names of its entries, for messages.
-
-    Raises:
-        SingularityError, NonFiniteError: The values are of no use, and why, with time and state.
-    """
-    values = function.evaluate(*arguments)
-    if function.is_valid:
-        return values
-    failure = function.failure()
-    assert failure is not None
-    raise simulation_error(failure, time, state, signals)
-
-
-def simulation_error(
-    failure: Failure,
-    time: float,
-    state: FloatArray,
-    signals: Mapping[str, Sequence[Signal]],
-) -> SimulationError:
-    """The exception for a function that has no value in a simulation.
-
-    Args:
-        failure: What was wrong.
-        time: When, in s.
-        state: Where, shape (n,).
-        signals: Name of an input -> names of its entries; the name of the input serves otherwise.
-    """
-    where = f"at t = {time:.6g} s, state {show(state)}"
-    match failure.fault:
-        case Fault.INPUT:
-            bad = [
-                signals[name][i].name if name in signals else name
-                for name, entries in failure.inputs.items()
-                for i in (entries if name in signals else entries[:1])
-            ]
-            return NonFiniteError(
-                f"{failure.function}: its input {', '.join(bad)} is not finite {where}", time, state
-            )
-        case Fault.VALUE:
-            return NonFiniteError(
-                f"{failure.function} is not finite {where}: a function left its domain or is not "
-                "differentiable there, or a matrix that is inverted is singular",
-                time,
-                state,
-            )
-        case Fault.SINGULAR:
-            return SingularityError(
-                f"{failure.singular} is singular {where}, so {failure.function} is not determined "
-                "there. Keep away from this state, or choose other constraints or outputs",
-                time,
-                state,
-            )
 
 
 class DifferentiableSystem(LeafSystem):

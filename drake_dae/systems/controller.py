@@ -15,8 +15,8 @@ from drake_dae.systems.block import (
     Formula,
     ParameterizedSystem,
     TracedFormula,
-    evaluate_checked,
 )
+from drake_dae.systems.failures import evaluate_checked
 
 
 class TrackingController(ParameterizedSystem):

@@ -12,15 +12,15 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, SimulationError
 from drake_dae.systems.block import (
     Formula,
     ParameterizedSystem,
     TracedFormula,
-    evaluate_checked,
 )
+from drake_dae.systems.failures import evaluate_checked
 from drake_dae.trace.functions import TracedFunction
 
 

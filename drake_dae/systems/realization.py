@@ -7,9 +7,10 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, ValueProducer
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.normal_form import NormalForm
+from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
-from drake_dae.systems.block import Formula, ParameterizedSystem, evaluate_checked
+from drake_dae.systems.block import Formula, ParameterizedSystem
+from drake_dae.systems.failures import evaluate_checked
 from drake_dae.trace.functions import TracedFunction
 
 

@@ -9,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems.block import DifferentiableSystem, Formula
@@ -159,6 +160,5 @@ class _ReferenceFormula:
         return stack_references(self._references, [degree + 1 for degree in self._degrees])
 
     def slope(self, moving: tuple[int, ...], time: float, *arguments: FloatArray) -> FloatArray:
-        ends = np.cumsum([degree + 2 for degree in self._degrees])
-        parts = [part[1:] for part in np.split(self._higher(time), ends[:-1])]
-        return np.concatenate(parts)[:, None]
+        higher = Layout(tuple(degree + 1 for degree in self._degrees))
+        return np.delete(self._higher(time), higher.lowest)[:, None]

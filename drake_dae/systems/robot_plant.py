@@ -4,7 +4,7 @@ from functools import partial
 
 from pydrake.systems.framework import BasicVector, Context
 
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
 from drake_dae.systems.plant import DaePlant

@@ -5,7 +5,7 @@ from problems import PROBLEMS, changed
 
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
-from drake_dae.dae.structure import find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -133,12 +133,12 @@ def test_a_robot_with_a_mass_matrix():
         )
 
 
-def test_the_motion_may_be_given_in_fewer_operations():
+def test_the_implicit_form_may_be_given_in_fewer_operations():
     arm = PROBLEMS["two_link_arm"]().system
     plain = with_inertia(arm)
     rate = ca.jtimes(arm.k, arm.state, arm.f)
 
-    def motion(x: ca.SX, v: ca.SX) -> tuple[ca.SX, ca.SX]:
+    def implicit(x: ca.SX, v: ca.SX) -> tuple[ca.SX, ca.SX]:
         reaction = ca.vertcat(ca.SX(2, 1), ca.jtimes(arm.k, arm.state, v, True)[:2])
         residual = ca.mtimes(plain.mass_matrix, x) - plain.f - reaction
         return residual, ca.jtimes(rate, arm.state, x)
@@ -150,21 +150,21 @@ def test_the_motion_may_be_given_in_fewer_operations():
             {"x": system.state},
             {"a": find_structure(system).drift, "b": find_structure(system).control_matrix},
         )(state)
-        for system in (plain, with_inertia(arm, motion=motion))
+        for system in (plain, with_inertia(arm, implicit=implicit))
     ]
     for one, two in zip(*values, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12)
     wrongs = (
-        lambda x, v: (motion(x, 2 * v)[0], motion(x, v)[1]),
-        lambda x, v: (motion(x, v)[0], 2 * motion(x, v)[1]),
-        lambda x, v: (motion(x, v)[0], ca.SX(2, 1)),
+        lambda x, v: (implicit(x, 2 * v)[0], implicit(x, v)[1]),
+        lambda x, v: (implicit(x, v)[0], 2 * implicit(x, v)[1]),
+        lambda x, v: (implicit(x, v)[0], ca.SX(2, 1)),
     )
     for wrong in wrongs:
-        with pytest.raises(ModelError, match="'motion' is not"):
-            find_structure(with_inertia(arm, motion=wrong))
+        with pytest.raises(ModelError, match="'implicit' is not"):
+            find_structure(with_inertia(arm, implicit=wrong))
 
 
-def test_a_motion_of_small_states_is_taken():
+def test_an_implicit_form_of_small_states_is_taken():
     """sqrt(y) near 1e-5: states drawn by 0.1 would be outside of its domain."""
     y = ca.SX.sym("y", 3)
     system = DaeSystem(
@@ -177,7 +177,7 @@ def test_a_motion_of_small_states_is_taken():
         m=[],
         mass_matrix=2 * ca.SX.eye(3),
         nominal_state=[1e-5] * 3,
-        motion=lambda x, v: (2 * x + ca.sqrt(y), ca.SX(0, 1)),
+        implicit=lambda x, v: (2 * x + ca.sqrt(y), ca.SX(0, 1)),
     )
     assert find_structure(system).output_degrees == (1, 1, 1)
 

@@ -2,7 +2,7 @@ import casadi as ca
 import numpy as np
 from problems import PROBLEMS, Problem
 
-from drake_dae.dae.structure import find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along, lie_derivatives
 

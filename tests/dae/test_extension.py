@@ -11,11 +11,11 @@ from problems import (
     integrated,
 )
 
-from drake_dae.dae.dynamic_extension import dynamic_extension
-from drake_dae.dae.extension import Extension, extend
+from drake_dae.dae.extension.dynamic_extension import dynamic_extension
+from drake_dae.dae.extension.extension import Extension, extend
 from drake_dae.dae.gains import poles
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import AssumptionError, ModelError

@@ -12,8 +12,8 @@ from arms import arm, consistent_states, numbers
 from problems import PROBLEMS, hidden_normal_form, knife_edge, pendulum, pendulum_tension
 from two_arms import two_arms
 
-from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.normal_form.normal_form import NormalForm
+from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 

@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 from problems import PROBLEMS, Problem, hidden_normal_form
 
-from drake_dae.dae.structure import find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.zero_dynamics import Verdict, ZeroDynamics
 

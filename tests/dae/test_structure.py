@@ -14,10 +14,10 @@ from problems import (
     system_of,
 )
 
-from drake_dae.dae import relative_degrees
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
-from drake_dae.dae.structure import examine_structure, find_structure
+from drake_dae.dae.structure import relative_degrees
+from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction

@@ -18,7 +18,7 @@ from problems import (
 
 from drake_dae.dae.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
 from drake_dae.dae.signals import Parameter
-from drake_dae.dae.structure import find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import GainError, ModelError

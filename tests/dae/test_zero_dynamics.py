@@ -24,7 +24,7 @@ from scipy.integrate import solve_ivp
 import drake_dae.dae.zero_dynamics.pursuit as module
 from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
 from drake_dae.dae.gains import poles
-from drake_dae.dae.structure import examine_structure, find_structure
+from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion

@@ -17,7 +17,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.manifold import CONSISTENT
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction

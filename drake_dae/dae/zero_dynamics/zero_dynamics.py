@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion

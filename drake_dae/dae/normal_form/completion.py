@@ -9,7 +9,7 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.trace.smoothness import find_flaw
 

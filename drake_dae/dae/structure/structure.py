@@ -7,20 +7,20 @@ import casadi as ca
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import Booleans, FloatArray, check_whole_number
-from drake_dae.dae.assumptions import Cause, Violation, rank_violation
-from drake_dae.dae.constrained import (
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.elimination import Elimination
+from drake_dae.dae.layout import Layout
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.states.margins import Margin, find_margin
+from drake_dae.dae.states.samples import draw
+from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
+from drake_dae.dae.structure.constrained import (
     Constrained,
     check_system,
     constraint_violation,
     examine_constraints,
 )
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination
-from drake_dae.dae.layout import Layout
-from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.relative_degrees import output_chains
-from drake_dae.dae.states.margins import Margin, find_margin
-from drake_dae.dae.states.samples import draw
+from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, check_whole_number, show
-from drake_dae.dae.extension import Extension, integrated, nominal_controls
+from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.relative_degrees import eliminated_at
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR
 from drake_dae.dae.states.samples import Samples, spread_of
-from drake_dae.dae.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.structure.relative_degrees import eliminated_at
+from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.factorization import Factorization

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import Structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem, check_is_system
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -158,7 +158,7 @@ def integrated(
         control_signals=tuple(controls),
         nominal_state=np.concatenate([system.nominal_state, nominal]),
         mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
-        motion=None,  # The derivatives of the constraints may differ.
+        implicit=None,  # The derivatives of the constraints may differ.
     )
 
 

@@ -7,14 +7,14 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.relative_degrees import constraint_chains
 from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
+from drake_dae.dae.structure.relative_degrees import constraint_chains
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 

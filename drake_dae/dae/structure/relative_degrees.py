@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
-from drake_dae.dae.assumptions import Cause, Violation
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, affine, eliminate_numbers
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.dae.system import DaeSystem
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized

@@ -1,0 +1,75 @@
+"""What is said in a simulation of a function that has no value."""
+
+from collections.abc import Mapping, Sequence
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
+from drake_dae.trace.functions import Failure, Fault, TracedFunction
+
+
+def evaluate_checked(
+    function: TracedFunction,
+    time: float,
+    state: FloatArray,
+    arguments: Sequence[FloatArray],
+    signals: Mapping[str, Sequence[Signal]],
+) -> tuple[FloatArray, ...]:
+    """The values of a function in a simulation.
+
+    Args:
+        function: The function.
+        time: In s.
+        state: Where the system is, shape (n,).
+        arguments: As `function` takes them.
+        signals: Name of an input -> names of its entries, for messages.
+
+    Raises:
+        SingularityError, NonFiniteError: The values are of no use, and why, with time and state.
+    """
+    values = function.evaluate(*arguments)
+    failure = function.failure()
+    if failure is None:
+        return values
+    raise simulation_error(failure, time, state, signals)
+
+
+def simulation_error(
+    failure: Failure,
+    time: float,
+    state: FloatArray,
+    signals: Mapping[str, Sequence[Signal]],
+) -> SimulationError:
+    """The exception for a function that has no value in a simulation.
+
+    Args:
+        failure: What was wrong.
+        time: When, in s.
+        state: Where, shape (n,).
+        signals: Name of an input -> names of its entries; the name of the input serves otherwise.
+    """
+    where = f"at t = {time:.6g} s, state {show(state)}"
+    match failure.fault:
+        case Fault.INPUT:
+            bad = [
+                signals[name][i].name if name in signals else name
+                for name, entries in failure.inputs.items()
+                for i in (entries if name in signals else entries[:1])
+            ]
+            return NonFiniteError(
+                f"{failure.function}: its input {', '.join(bad)} is not finite {where}", time, state
+            )
+        case Fault.VALUE:
+            return NonFiniteError(
+                f"{failure.function} is not finite {where}: a function left its domain or is not "
+                "differentiable there, or a matrix that is inverted is singular",
+                time,
+                state,
+            )
+        case Fault.SINGULAR:
+            return SingularityError(
+                f"{failure.singular} is singular {where}, so {failure.function} is not determined "
+                "there. Keep away from this state, or choose other constraints or outputs",
+                time,
+                state,
+            )
