@@ -17,7 +17,8 @@ from problems import (
 )
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.analysis.report import Analysis, Finding
+from drake_dae.analysis.findings import Finding
+from drake_dae.analysis.report import Analysis
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.structure.structure import find_structure
