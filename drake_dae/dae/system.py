@@ -224,6 +224,10 @@ class DaeSystem:
     @property
     def parameter_values(self) -> FloatArray:
         """The defaults of all parameters, in the order of `parameter_symbol`."""
+        return self._defaults.copy()
+
+    @cached_property
+    def _defaults(self) -> FloatArray:
         return np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
 
     @property
@@ -253,13 +257,21 @@ class DaeSystem:
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
         """Values of all parameters in the order of `parameter_symbol`; the defaults if None.
 
+        What comes back is not for changing.
+
         Raises:
             ModelError: A wrong shape, or a number that is not finite.
         """
-        default = self.parameter_values
         if parameters is None:
-            return default
-        return vector(f"{self.name}: parameters", parameters, default.size)
+            return self._defaults
+        if (  # In each step of a simulation, so without a copy.
+            isinstance(parameters, np.ndarray)
+            and parameters.dtype == np.float64
+            and parameters.shape == self._defaults.shape
+            and np.isfinite(parameters).all()
+        ):
+            return parameters
+        return vector(f"{self.name}: parameters", parameters, self._defaults.size)
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """A state as a new array of shape (n,).

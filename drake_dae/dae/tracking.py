@@ -41,8 +41,8 @@ class TrackingLaw:
     Attributes:
         layout: How references and chains are stacked.
         reference_signals: Names and units of R.
-        function: (state, reference, measured_force, gains, parameters) -> control and
-            tracking_error; without measured force there is no such input.
+        function: (state, reference, measured_force, parameters) -> control and tracking_error, with
+            `all_parameters`; without measured force there is no such input.
         measured_force: How the measurement enters; None without one.
 
     Raises:
@@ -84,15 +84,15 @@ class TrackingLaw:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
         ubar = highest - ca.mtimes(gain, chain - reference[layout.chained.tolist(), :])
-        inputs["gains"] = ca.vertcat(ca.SX(0, 1), *gain.nonzeros())
         control, pivot = structure.control_for(ubar)
         # By the model; what the control reaches at once is as wanted.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
-        return self.system.trace(
-            "tracking law",
+        numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
+        return TracedFunction(
+            f"{self.system.name} tracking law",
+            {"state": self.system.state, **inputs, "parameters": numbers},
             {"control": control, "tracking_error": output - values},
-            inputs,
             pivot,
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
         )
@@ -126,11 +126,17 @@ class TrackingLaw:
             )
         return found
 
-    def gain_vector(self, gains: GainDesign | FeedbackGains | None = None) -> FloatArray:
-        """What `function` takes as gains: the entries of K that the law has, column by column.
+    def all_parameters(
+        self,
+        parameters: ArrayLike | None = None,
+        gains: GainDesign | FeedbackGains | None = None,
+    ) -> FloatArray:
+        """What `function` takes as parameters: the system's, then the entries of K by columns.
 
         Args:
-            gains: Other gains than those of the law, for a context; None for its own.
+            parameters: Values of the system's parameters; the defaults if None.
+            gains: Other gains than those of the law; its own if None. Of K only those entries
+                count that are not zero in the law's own gains.
 
         Raises:
             GainError: Gains that do not fit, or that couple outputs which the law does not.
@@ -144,7 +150,8 @@ class TrackingLaw:
                 f"the law has no gain from the error of {signals[j].name} to "
                 f"{self.system.output_signals[i].name}; make a new law with such a gain"
             )
-        return chosen.matrix.T[has.T]
+        values = self.system.parameter_vector(parameters)
+        return np.concatenate([values, chosen.matrix.T[has.T]])
 
     def control(
         self,
@@ -166,8 +173,7 @@ class TrackingLaw:
             Shape (p,).
         """
         measured = [] if measured_force is None else [measured_force]
-        values = self.system.parameter_vector(parameters)
-        return self.function(state, reference, *measured, self.gain_vector(), values)[0]
+        return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
 
     def error_coordinates(
         self, state: ArrayLike, reference: ArrayLike, parameters: ArrayLike | None = None

@@ -27,8 +27,8 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.systems.failures import evaluate_checked
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.systems.failures import simulation_error
+from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 STATES = ("state", "estimated_state")
 """What the argument of a formula is called that says where the system is."""
@@ -38,8 +38,8 @@ class Formula(Protocol):
     """What an output port, or the time derivative, computes.
 
     Attributes:
-        sources: Where each argument comes from: "time", "state", the name of a group of numeric
-            parameters, or that of an input port.
+        sources: Where each argument comes from: "time", "state", "parameters", or the name of an
+            input port.
     """
 
     @property
@@ -89,7 +89,11 @@ class TracedFormula:
     def _checked(
         self, function: TracedFunction, time: float, arguments: tuple[FloatArray, ...]
     ) -> tuple[FloatArray, ...]:
-        return evaluate_checked(function, time, arguments[self._state], arguments, self._signals)
+        try:
+            return function.checked(*arguments)
+        except InvalidValueError as error:
+            state = arguments[self._state]
+            raise simulation_error(error.failure, time, state, self._signals) from None
 
 
 class DifferentiableSystem(LeafSystem):
@@ -99,17 +103,12 @@ class DifferentiableSystem(LeafSystem):
     gradients. It has no events: a converted plant does not project its state onto N*, nor does it
     refuse a start that is off N*.
 
-    Args:
-        parameters: Name of a group of numeric parameters -> default values, shape (k,).
     """
 
-    def __init__(self, parameters: Mapping[str, FloatArray] | None = None) -> None:
+    def __init__(self) -> None:
         converter = SystemScalarConverter()
         converter._AddConstructor[AutoDiffXd, float](_AutoDiffSystem)
         super().__init__(converter)
-        self.parameter_groups = tuple(parameters or {})
-        for values in (parameters or {}).values():
-            self.DeclareNumericParameter(BasicVector(values))
 
     @cached_property
     def formulas(self) -> dict[str, Formula]:
@@ -133,23 +132,25 @@ class DifferentiableSystem(LeafSystem):
 
 
 class ParameterizedSystem(DifferentiableSystem):
-    """A LeafSystem whose numeric parameter 0 holds all parameters of a DaeSystem.
+    """A LeafSystem whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
     So a study changes numbers in a context without tracing again, and a controller can be given
     other numbers than its plant.
 
     Args:
         dae: The system.
-        more: Name -> default values of further groups of numeric parameters.
+        values: The default: `dae.parameter_values`, and what else the block appends.
     """
 
-    def __init__(self, dae: DaeSystem, more: Mapping[str, FloatArray] | None = None) -> None:
-        super().__init__({"parameters": dae.parameter_values, **(more or {})})
+    def __init__(self, dae: DaeSystem, values: FloatArray) -> None:
+        super().__init__()
         self.dae = dae
+        self.DeclareNumericParameter(BasicVector(values))
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
-        return np.array(context.get_numeric_parameter(0).value())
+        values = context.get_numeric_parameter(0).value()
+        return np.array(values[: self.dae.parameter_values.size])
 
     def get_parameter(self, context: Context, name: str) -> FloatArray:
         """A parameter by name, shape (k,).
@@ -191,8 +192,7 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         self.set_name(original.get_name())
         formulas = original.formulas
         context = original.CreateDefaultContext()
-        self._groups = original.parameter_groups
-        for i in range(len(self._groups)):
+        for i in range(context.num_numeric_parameter_groups()):
             values = context.get_numeric_parameter(i).CopyToVector()
             self.DeclareNumericParameter(BasicVector_[AutoDiffXd](values))
         if context.num_continuous_states():
@@ -202,7 +202,7 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         tickets = {
             "time": self.time_ticket(),
             "state": self.xc_ticket(),
-            **dict.fromkeys(self._groups, self.all_parameters_ticket()),
+            "parameters": self.all_parameters_ticket(),
         }
         for i in range(original.num_input_ports()):
             port = original.get_input_port(i)
@@ -235,8 +235,8 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             return np.array([context.get_time()])
         if name == "state":
             return context.get_continuous_state_vector().CopyToVector()
-        if name in self._groups:
-            return context.get_numeric_parameter(self._groups.index(name)).CopyToVector()
+        if name == "parameters":
+            return context.get_numeric_parameter(0).CopyToVector()
         return self.GetInputPort(name).Eval(context)
 
     def _evaluate(self, formula: Formula, context: Context) -> Any:

@@ -16,7 +16,8 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
-from drake_dae.systems.failures import evaluate_checked
+from drake_dae.systems.failures import simulation_error
+from drake_dae.trace.functions import InvalidValueError
 
 
 class TrackingController(ParameterizedSystem):
@@ -31,9 +32,8 @@ class TrackingController(ParameterizedSystem):
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, shape (p,).
 
-    Both outputs feed through from all inputs. The context holds the model's parameters as numeric
-    parameter 0, and the gains as numeric parameter 1; see `set_parameter` and `set_gains`. Converts
-    to AutoDiffXd.
+    Both outputs feed through from all inputs. The context holds the model's parameters and then
+    the gains as one numeric parameter; see `set_parameter` and `set_gains`. Converts to AutoDiffXd.
 
     Args:
         law: The law.
@@ -47,7 +47,7 @@ class TrackingController(ParameterizedSystem):
     """
 
     def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
-        super().__init__(law.system, {"gains": law.gain_vector()})
+        super().__init__(law.system, law.all_parameters())
         _warn_of_zero_dynamics(law, outputs)
         self.law = law
         self.set_name("tracking_controller")
@@ -78,8 +78,8 @@ class TrackingController(ParameterizedSystem):
             GainError: Gains that do not fit, are not Hurwitz, or couple outputs that the law does
                 not.
         """
-        values = self.law.gain_vector(gains)
-        context.get_mutable_numeric_parameter(1).SetFromVector(values)
+        values = self.law.all_parameters(self.parameters(context), gains)
+        context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def _calc_control(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(context)[0])
@@ -89,11 +89,12 @@ class TrackingController(ParameterizedSystem):
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
         inputs = [port.Eval(context) for port in self._input_ports]
-        gains, parameters = (context.get_numeric_parameter(i).value() for i in (1, 0))
-        arguments = (*inputs, gains, parameters)
-        return evaluate_checked(
-            self.law.function, context.get_time(), inputs[0], arguments, self._signals
-        )
+        arguments = (*inputs, context.get_numeric_parameter(0).value())
+        try:
+            return self.law.function.checked(*arguments)
+        except InvalidValueError as error:
+            time, state = context.get_time(), inputs[0]
+            raise simulation_error(error.failure, time, state, self._signals) from None
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function

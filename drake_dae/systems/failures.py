@@ -5,33 +5,7 @@ from collections.abc import Mapping, Sequence
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
-from drake_dae.trace.functions import Failure, Fault, TracedFunction
-
-
-def evaluate_checked(
-    function: TracedFunction,
-    time: float,
-    state: FloatArray,
-    arguments: Sequence[FloatArray],
-    signals: Mapping[str, Sequence[Signal]],
-) -> tuple[FloatArray, ...]:
-    """The values of a function in a simulation.
-
-    Args:
-        function: The function.
-        time: In s.
-        state: Where the system is, shape (n,).
-        arguments: As `function` takes them.
-        signals: Name of an input -> names of its entries, for messages.
-
-    Raises:
-        SingularityError, NonFiniteError: The values are of no use, and why, with time and state.
-    """
-    values = function.evaluate(*arguments)
-    failure = function.failure()
-    if failure is None:
-        return values
-    raise simulation_error(failure, time, state, signals)
+from drake_dae.trace.functions import Failure, Fault
 
 
 def simulation_error(

@@ -20,8 +20,8 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
-from drake_dae.systems.failures import evaluate_checked
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.systems.failures import simulation_error
+from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 
 class DaePlant(ParameterizedSystem):
@@ -64,7 +64,7 @@ class DaePlant(ParameterizedSystem):
         self, system: DaeSystem, *, structure: Structure | None = None, project: bool = True
     ) -> None:
         structure = structure_of("DaePlant", system, structure)
-        super().__init__(system)
+        super().__init__(system, system.parameter_values)
         self.structure = structure
         self.set_name(system.name)
         elimination, derivatives = structure.elimination, structure.derivatives
@@ -139,7 +139,11 @@ class DaePlant(ParameterizedSystem):
         x = context.get_continuous_state_vector().CopyToVector()
         p = context.get_numeric_parameter(0).value()
         arguments = (x, self._control_port.Eval(context), p) if needs_control else (x, p)
-        return evaluate_checked(function, context.get_time(), x, arguments, self._signals)[0]
+        try:
+            return function.checked(*arguments)[0]
+        except InvalidValueError as error:
+            time = context.get_time()
+            raise simulation_error(error.failure, time, x, self._signals) from None
 
     def _formulas(self) -> dict[str, Formula]:
         dae, residual = self.dae, self.structure.manifold.residual_expression

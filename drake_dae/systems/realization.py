@@ -10,8 +10,8 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.block import Formula, ParameterizedSystem
-from drake_dae.systems.failures import evaluate_checked
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.systems.failures import simulation_error
+from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 
 class StateRealization(ParameterizedSystem):
@@ -59,7 +59,7 @@ class StateRealization(ParameterizedSystem):
                 "with NormalForm(system)"
             )
         structure, dae = normal_form.structure, normal_form.system
-        super().__init__(dae)
+        super().__init__(dae, dae.parameter_values)
         self.normal_form = normal_form
         self.set_name(dae.name)
         self._layout = layout = structure.layout
@@ -174,7 +174,11 @@ class StateRealization(ParameterizedSystem):
     ) -> FloatArray:
         x, p = self._state_entry.Eval(context), context.get_numeric_parameter(0).value()
         arguments = (x, self._control_port.Eval(context), p) if needs_control else (x, p)
-        return evaluate_checked(function, context.get_time(), x, arguments, self._signals)[0]
+        try:
+            return function.checked(*arguments)[0]
+        except InvalidValueError as error:
+            time = context.get_time()
+            raise simulation_error(error.failure, time, x, self._signals) from None
 
     def _formulas(self) -> dict[str, Formula]:
         raise ModelError(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray
-from drake_dae.errors import ModelError
+from drake_dae.errors import DrakeDaeError, ModelError
 
 SINGULAR_PIVOT = 1e-12
 """A matrix whose `pivot` is below this counts as singular; see `trace.factorization`."""
@@ -42,11 +42,24 @@ class Failure:
     singular: str = ""
 
 
+class InvalidValueError(DrakeDaeError):
+    """Values of a function that are of no use.
+
+    Attributes:
+        failure: Why.
+    """
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(f"{failure.function}: {failure.fault.value}")
+        self.failure = failure
+
+
 class TracedFunction:
     """CasADi expressions, evaluated on preallocated NumPy arrays.
 
     A call goes through CasADi's buffer interface and allocates nothing. Whether its values are of
-    use is one number that the call computes as well: `is_valid` costs 0.1 us.
+    use is one number that the call computes as well, so that `checked` costs 0.1 us more than
+    `evaluate`.
 
     Args:
         name: For messages.
@@ -76,10 +89,14 @@ class TracedFunction:
         self.input_names = tuple(inputs)
         self.output_names = tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
-        # Finite exactly if all outputs are.
-        check = sum((ca.sum1(ca.vec(e)) for e in dense if e.numel()), ca.SX(0))
-        regularity = ca.SX(1) if pivot is None else pivot
-        expressions = [*dense, check, regularity]
+        # Two numbers tell at once whether the values are of use: one is finite exactly if all
+        # outputs are, the other if the pivot is large enough as well.
+        finite = sum((ca.sum1(ca.vec(e)) for e in dense if e.numel()), ca.SX(0))
+        checks, regularity = [finite], ca.SX(1)
+        if pivot is not None:
+            regularity = pivot
+            checks.append(finite + ca.if_else(pivot >= SINGULAR_PIVOT, 0, np.nan))
+        expressions = [*dense, regularity, *checks]
         self._function = ca.Function(
             _identifier(name),
             list(inputs.values()),
@@ -94,7 +111,8 @@ class TracedFunction:
             self._buffer.set_arg(index, array.data)
         for index, array in enumerate(results):
             self._buffer.set_res(index, array.reshape(-1, order="F").data)
-        self._pivot, self._check = results.pop().reshape(-1), results.pop().reshape(-1)
+        results, checks = results[: len(dense)], results[len(dense) :]
+        self._pivot, self._finite, self._valid = (checks[i].reshape(-1) for i in (0, 1, -1))
         self._outputs = tuple(
             array.reshape(-1, order="F") if array.shape[1] == 1 else array for array in results
         )
@@ -113,6 +131,19 @@ class TracedFunction:
         self._evaluate()
         return self._outputs
 
+    def checked(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
+        """Calls the function as `evaluate` does, and refuses values that are of no use.
+
+        Raises:
+            InvalidValueError: A value is not finite, or a matrix that must be regular is singular.
+        """
+        for own, given in zip(self._inputs, arguments, strict=True):
+            own[:] = given
+        self._evaluate()
+        if isfinite(self._valid[0]):
+            return self._outputs
+        raise InvalidValueError(self._failure())
+
     @property
     def sizes(self) -> tuple[int, ...]:
         """How many entries each input has."""
@@ -121,22 +152,15 @@ class TracedFunction:
     @property
     def is_finite(self) -> bool:
         """Whether every output of the last call was finite."""
-        return isfinite(self._check[0])
+        return isfinite(self._finite[0])
 
     @property
     def pivot(self) -> float:
         """The pivot of the last call; 1 where there is none."""
         return float(self._pivot[0])
 
-    @property
-    def is_valid(self) -> bool:
-        """Whether the last call was finite, with regular matrices."""
-        return isfinite(self._check[0]) and self._pivot[0] >= SINGULAR_PIVOT
-
-    def failure(self) -> Failure | None:
-        """What was wrong with the last call; None if nothing was."""
-        if self.is_valid:
-            return None
+    def _failure(self) -> Failure:
+        """What was wrong with the last call."""
         bad = {
             name: tuple(int(i) for i in np.flatnonzero(~np.isfinite(given)))
             for name, given in zip(self.input_names, self._inputs, strict=True)

@@ -1,6 +1,7 @@
 """Newton's method from a guess, damped: the only one of the library."""
 
 from collections.abc import Callable
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -60,19 +61,24 @@ def newton(
         The last iterate, and whether it is a regular solution up to round-off.
     """
     x, unit = start, np.maximum(1.0, np.abs(start))
+
+    def length_of(step: FloatArray) -> float:
+        relative = step / unit
+        return sqrt(relative @ relative)
+
     for _ in range(50):
         linearization = linearize(x)
         if linearization is None:
             break
         step_from, regular = linearization
         step = step_from(x)
-        size = np.linalg.norm(step / unit)
+        size = length_of(step)
         if size <= ROUNDING:
             return x + step, regular
         for length in LENGTHS:
             trial = x + length * step
             following = step_from(trial)
-            left = np.linalg.norm(following / unit)
+            left = length_of(following)
             if left * left <= PRECISION * size:
                 # The step after that would be left / size times as long.
                 return trial + following, regular

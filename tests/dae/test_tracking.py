@@ -141,7 +141,7 @@ def test_control_by_hand():
     # Three operations.
     assert law.control(x, r) == pytest.approx([expected], rel=1e-15)
     assert law.error_coordinates(x, r) == pytest.approx([0.5, -1.5], rel=1e-15)
-    error = law.function(x, r, law.gain_vector(), law.system.parameter_values)[1]
+    error = law.function(x, r, law.all_parameters())[1]
     assert error == pytest.approx([0.5], rel=1e-15)
 
 
@@ -150,8 +150,7 @@ def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
     law = TrackingLaw(problem.system, poles(-3.0))
     state = problem.consistent(np.random.default_rng(5))
     reference = reference_at(problem, 0.2)
-    gains, parameters = law.gain_vector(), problem.system.parameter_values
-    control, error = law.function(state, reference, gains, parameters)
+    control, error = law.function(state, reference, law.all_parameters())
     closed_form = problem.known(state)
     for i, degree in enumerate(problem.output_degrees):
         if degree == 0:
@@ -189,10 +188,10 @@ def test_gains_are_parameters_of_the_traced_law():
     law = TrackingLaw(system, first)
     changed = TrackingLaw(system, second, structure=law.structure)
     # The diagonals of Lambda_1 and all of Lambda_2.
-    assert law.gain_vector().shape == (2 + 4,)
+    assert law.all_parameters().shape == (2 + 4,)
     state, reference = np.linspace(0.5, 1.2, 8), np.linspace(-1.0, 1.0, 8)
     np.testing.assert_array_equal(
-        law.function(state, reference, law.gain_vector(second), system.parameter_values)[0],
+        law.function(state, reference, law.all_parameters(gains=second))[0],
         changed.control(state, reference),
     )
 

@@ -76,14 +76,11 @@ def robot_plant(name, kind):
     return RobotPlant(found.model, structure=found.structure)
 
 
-def count(context):
-    return context.num_numeric_parameter_groups()
-
-
 def all_parameters(system):
     context = system.CreateDefaultContext()
-    groups = [context.get_numeric_parameter(i).value() for i in range(count(context))]
-    return np.concatenate([np.zeros(0), *groups])
+    if not context.num_numeric_parameter_groups():
+        return np.zeros(0)
+    return context.get_numeric_parameter(0).CopyToVector()
 
 
 def evaluate(system, inputs, state, parameters, numbers):
@@ -94,10 +91,8 @@ def evaluate(system, inputs, state, parameters, numbers):
             system.GetInputPort(name).FixValue(context, value)
     if state.size:
         context.SetContinuousState(state)
-    groups = [context.get_mutable_numeric_parameter(i) for i in range(count(context))]
-    ends = np.cumsum([group.size() for group in groups])[:-1]
-    for group, values in zip(groups, np.split(parameters, ends), strict=bool(groups)):
-        group.SetFromVector(values)
+    if parameters.size:
+        context.get_mutable_numeric_parameter(0).SetFromVector(parameters)
     parts = [system.EvalTimeDerivatives(context).CopyToVector()] if state.size else []
     parts += [
         system.get_output_port(i).Eval(context)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from arms import arm, consistent_states, law
 
-from drake_dae import DaeSystem, TrackingController, TrackingLaw, poles
-from drake_dae.errors import NonFiniteError, NonMinimumPhaseWarning, SingularityError
+from drake_dae import DaeSystem, TrackingController, TrackingLaw, gain_matrices, poles
+from drake_dae.errors import GainError, NonFiniteError, NonMinimumPhaseWarning, SingularityError
 
 
 def controller(name="two_link"):
@@ -92,3 +92,35 @@ def test_a_non_minimum_phase_system_is_named_so(rate, unstable):
     assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
     if unstable:
         assert re.search(r"^tank: non-minimum phase: .* 0\.7 1/s", str(caught[0].message))
+
+
+def test_gains_change_in_a_context():
+    """The control is then that of a law with these gains, and the context keeps its masses."""
+    system, context = controller()
+    system.set_parameter(context, "link1.mass", 3.0)
+    system.set_gains(context, poles(-9.0))
+    state, reference = [1.2, -1.6, 0.1, 0.0], np.array([0.3, 0.1, 0.0, 20.0])
+    system.GetInputPort("estimated_state").FixValue(context, state)
+    system.GetInputPort("reference").FixValue(context, reference)
+    np.testing.assert_array_equal(
+        system.GetOutputPort("control").Eval(context),
+        law("two_link", poles(-9.0)).control(
+            state, reference, parameters=system.parameters(context)
+        ),
+    )
+    with pytest.raises(GainError, match="poles of output"):
+        system.set_gains(context, poles("fast"))
+
+
+def test_gains_that_the_law_does_not_have_are_refused():
+    """Errors that the law does not couple stay so: its function has no place for the gain."""
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], 0, 0],
+        h=lambda x: [[0, 0], [0, 0], [1, 0], [0, 1]],
+        l=lambda x: [x[0], x[1]],
+    )
+    block = TrackingController(TrackingLaw(system, poles(-1.0)))
+    coupled = gain_matrices([np.array([[2.0, 0.5], [0.0, 2.0]]), 3.0 * np.eye(2)])
+    with pytest.raises(GainError, match="no gain from the error of z1 to z0; make a new law"):
+        block.set_gains(block.CreateDefaultContext(), coupled)
