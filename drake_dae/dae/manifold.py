@@ -24,8 +24,8 @@ class Manifold:
     """N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m}, equation (4).
 
     Args:
-        system: (1)-(3).
-        chains: Per constraint k_i, L_f k_i, ..., L_f^(r_i - 1) k_i.
+        system: The system (1)-(3).
+        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
 
     Attributes:
         residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
@@ -51,7 +51,7 @@ class Manifold:
 
     @property
     def dimension(self) -> int:
-        """n - (r_1 + ... + r_m), Theorem 1.1."""
+        """dim N* = n - (r_1 + ... + r_m), Theorem 1.1."""
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
@@ -85,15 +85,15 @@ class Manifold:
         """The consistent state next to a given one, to round-off, by Newton's method.
 
         Args:
-            state: Shape (n,), near N*.
+            state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            Shape (n,).
+            The consistent state, shape (n,).
 
         Raises:
             InconsistentStateError: Newton's method does not reach N* from there.
-            ModelError: A wrong shape.
+            ModelError: The state has a wrong shape.
         """
         p = self.system.parameter_vector(parameters)
         start = numbers(f"{self.system.name}: a state", state).reshape(-1)
@@ -125,7 +125,7 @@ class Manifold:
         return shortest_steps(gradients, lambda x: self._residual(x, parameters)[0])
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
-        """What a Newton iteration that ended at a state failed on."""
+        """Why a Newton iteration that ended at a state failed, in words."""
         name = self.system.name
         values = zip(self.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]

@@ -36,8 +36,8 @@ class Linearization(NamedTuple):
 
     Attributes:
         step: x -> the Newton step from x by the matrix of the iterate, shape (n,).
-        is_regular: Whether that matrix is regular, so that a solution near it is isolated, or as
-            isolated as the equations are many.
+        is_regular: Whether that matrix has full rank, so that near a solution there are no others
+            but those that the number of equations leaves.
     """
 
     step: Callable[[FloatArray], FloatArray]
@@ -100,7 +100,7 @@ def shortest_steps(
 
     Args:
         gradients: C, shape (k, n).
-        residual: x -> shape (k,).
+        residual: A function x -> residual of shape (k,).
     """
     if not np.all(np.isfinite(gradients)):
         return None

@@ -49,7 +49,7 @@ class Equilibria:
         self.sizes = np.maximum(examined, pinned.system.nominal_spread)
 
     def held_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """R of constant outputs as they are at a state.
+        """R with constant outputs, as they are at a state.
 
         The state does not tell outputs of degree 0; they are as brings it nearest to rest.
         """
@@ -106,7 +106,7 @@ class Equilibria:
         )
 
     def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
-        """What moves at a point, or is singular, if anything is.
+        """What moves at a point, or that it is singular; None at a regular equilibrium.
 
         Neither moves what a tiny change of the state brings to rest, as in a fast system.
         """

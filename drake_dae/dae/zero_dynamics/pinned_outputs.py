@@ -24,7 +24,7 @@ from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
 VANISHED = 1e-9
-"""Below this part of its usual margin A or B counts as singular, also where it is one number."""
+"""A or B counts as singular below this part of its usual margin, also where it is one number."""
 
 
 class Regularity(Enum):
@@ -46,7 +46,7 @@ class Point:
         control: u, shape (p,).
         constraint_input: v, shape (m,).
         A, B: The matrices of Assumptions (2) and (5).
-        pivot: 0 exactly where one of them is singular, shape (1,).
+        pivot: A number that is 0 exactly where one of them is singular, shape (1,).
         unrest: |E x'| relative to the sizes of the terms that cancel in it at rest, shape (n,).
     """
 
@@ -74,7 +74,7 @@ class PinnedOutputs:
     """Z(R) and the motion on it; all arguments are arrays of the right sizes.
 
     Args:
-        structure: What is assumed of the system.
+        structure: The structure of the system.
 
     Attributes:
         layout: How R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) is stacked.
@@ -126,7 +126,11 @@ class PinnedOutputs:
         )
 
     def state(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """A state on Z(R), to round-off; raises InconsistentStateError if none is found."""
+        """A state on Z(R), to round-off.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
         name, outputs = self.system.name, self.describe(reference)
         found, converged = self.project(guess, reference, parameters)
         if converged:
@@ -175,7 +179,7 @@ class PinnedOutputs:
     def residual(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """What is zero on Z(R), as `residual_signals`."""
+        """What is zero on Z(R), named by `residual_signals`, shape (k,)."""
         return self._residual.evaluate(state, reference, parameters)[0].copy()
 
     def gradients(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -240,7 +244,7 @@ class PinnedOutputs:
         )
 
     def point(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> Point:
-        """What belongs to a state on Z(R)."""
+        """A state on Z(R) with its rate, inputs and matrices."""
         values = self._motion.evaluate(state, reference, parameters)
         return Point(state, *(value.copy() for value in values))
 
@@ -266,7 +270,7 @@ class PinnedOutputs:
 
 
 def _square(matrix: FloatArray) -> FloatArray:
-    """A square matrix, which came as a vector if it has one column."""
+    """A square matrix; one with one column comes as a vector."""
     return matrix.reshape(round(matrix.size**0.5), round(matrix.size**0.5))
 
 
