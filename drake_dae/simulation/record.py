@@ -20,8 +20,8 @@ class Recorded:
     """A vector signal over time.
 
     Attributes:
-        values: shape (k, size).
-        signals: Name and unit of each column.
+        values: The values, one row per time, shape (k, size).
+        signals: The name and unit of each column.
     """
 
     values: FloatArray
@@ -36,18 +36,18 @@ class Record:
     in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
 
     Attributes:
-        time: s, shape (k,), strictly increasing.
-        signals: Name -> values.
+        time: The times in s, shape (k,), strictly increasing.
+        signals: Name of a signal -> its values.
     """
 
     time: FloatArray
     signals: Mapping[str, Recorded]
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Values of a signal, shape (k, size).
+        """The values of a signal, shape (k, size).
 
         Raises:
-            ModelError: No such signal.
+            ModelError: The record has no such signal.
         """
         if name not in self.signals:
             raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
@@ -61,7 +61,7 @@ class Record:
 
         Args:
             loggers: Name -> (sink, names and units of its input).
-            context: Of the diagram.
+            context: The context of the diagram.
         """
         logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
         times = [log.sample_times() for log in logs.values()]
@@ -79,7 +79,7 @@ class Record:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes `record.npz`."""
+        """Writes the record as one `.npz` file."""
         arrays: dict[str, np.ndarray] = {"time": self.time}
         for name, recorded in self.signals.items():
             arrays[name] = recorded.values

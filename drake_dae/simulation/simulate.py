@@ -27,7 +27,7 @@ from tqdm import tqdm
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
-"""Between two updates of the progress bar, or two lines where there is no terminal for it, in s."""
+"""The time between updates of the progress bar, or between lines where it has no terminal, in s."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class RunStatistics:
     """What a run took.
 
     Attributes:
-        simulated_time: How far it came, s.
-        wall_time: s.
-        steps: Of the integrator.
+        simulated_time: How far it came, in s.
+        wall_time: How long it took, in s.
+        steps: How many steps the integrator took.
         interrupted: Whether Ctrl-C ended it early.
     """
 
@@ -67,12 +67,12 @@ def simulate(
     Args:
         diagram: The system.
         context: Its context with the start state; changed in place.
-        duration: How long, s.
+        duration: How long to simulate, in s.
         config: Drake's integrator settings. The run begins at its start_time.
         progress: Shows simulated time and speed on stderr.
 
     Raises:
-        ModelError: A duration or settings that make no sense.
+        ModelError: The duration or the settings make no sense.
         InconsistentStateError: The start state is not on the manifold.
         SimulationError: The run cannot go on.
     """
@@ -123,7 +123,7 @@ def check_duration(duration: float) -> None:
     """Refuses a duration that is not positive.
 
     Raises:
-        ModelError: It is not.
+        ModelError: The duration is not positive.
     """
     if not (isfinite(duration) and duration > 0.0):
         raise ModelError(f"a duration must be positive, got {duration} s")
@@ -133,7 +133,7 @@ def check_config(config: SimulatorConfig) -> None:
     """Refuses settings that Drake takes and that then hang, fail late, or are ignored.
 
     Raises:
-        ModelError: The setting, and what would fit.
+        ModelError: A setting does not fit; the message names it, and what would.
     """
     scheme = config.integration_scheme
     # CENIC simulates a MultibodyPlant, and a constrained robot is none.
@@ -173,7 +173,7 @@ class _Pace:
 
     STEPS = 1000
     SLOWEST = 1e-7
-    """Of the duration in that many steps."""
+    """The least part of the duration that so many steps must simulate."""
 
     def __init__(self, start: float, duration: float) -> None:
         self._steps, self._time, self._least = 0, start, self.SLOWEST * duration
@@ -252,7 +252,7 @@ class _Progress:
 
 
 def _default_size() -> dict[str, int]:
-    """For tqdm, where the terminal says that it has no columns, as in some containers."""
+    """The size for tqdm where the terminal says that it has no columns, as in some containers."""
     try:
         known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except OSError:

@@ -69,7 +69,7 @@ def add_view(
     """Adds the blocks that draw a robot of a diagram, and draws what does not move.
 
     Args:
-        builder: With the plant in it.
+        builder: The builder of the diagram, with the plant in it.
         plant: The robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
         meshcat: Where to draw.
@@ -141,7 +141,7 @@ def draw_surroundings(
 def scene_extent(
     model: RobotModel, loads: ConstraintLoads, state: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Middle and size, in m, of the box around a robot and the points where it is held.
+    """The middle and the size, in m, of the box around a robot and the points where it is held.
 
     Args:
         model: The robot.
