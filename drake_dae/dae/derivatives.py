@@ -53,7 +53,7 @@ class Derivatives:
             and mass[i, i].is_one()
         ]
         self._rows = [i for i in range(system.num_states) if i not in plain]
-        force = g[self._rows, :]
+        g_rows = g[self._rows, :]
         self.constraint_gradient = ca.jacobian(constraint, x)
         self._symbols: list[ca.SX] = [x]
         self._rates: list[ca.SX] = []
@@ -64,17 +64,17 @@ class Derivatives:
         self._rates.append(rate)
         self._symbols.append(first)
         #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
-        self.constraint_input = first[len(self._rows) :, :]  # Of a scalar [1:] would be a row.
+        self.constraint_input = first[len(self._rows) :, :]  # A slice [1:] of a scalar is a row.
         balance, self._constraint_rate = self._first_order(constraint)
         self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
-        if _agree(system, gradient, force):
-            gradient = force
+        if _agree(system, gradient, g_rows):
+            gradient = g_rows
         self._matrix = ca.blockcat(
-            mass[self._rows, self._rows], -force, gradient.T, ca.SX(force.shape[1], force.shape[1])
+            mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
         )
         self._unknowns, self.constraint_matrix, self.pivot = _solver(
-            mass[self._rows, self._rows], force, gradient
+            mass[self._rows, self._rows], g_rows, gradient
         )
         self._equations: list[ca.SX] = []
         self._solve_order()
@@ -114,8 +114,8 @@ class Derivatives:
         it is inverse dynamics.
 
         Args:
-            expression: Shape (p, 1), in terms of the state and of this motion's unknowns.
-            wanted: Shape (p, 1).
+            expression: Of the state and of the unknowns, shape (p, 1).
+            wanted: The wanted values, shape (p, 1).
 
         Returns:
             u in terms of the state, shape (p, 1), and a scalar that is 0 exactly where it is not
@@ -270,7 +270,7 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
 
 
 def _solver(
-    mass: ca.SX, force: ca.SX, gradient: ca.SX
+    mass: ca.SX, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
     """A solver of [[E, -g], [dc/dx, 0]] (w, v) = -(balance, rate), from E, g and (dc/dx)^T.
 
@@ -278,9 +278,9 @@ def _solver(
         The solver, A(x), and a scalar that is 0 exactly where A is singular.
     """
     inertia = PositiveDefiniteFactorization(mass)
-    half = inertia.forward(force)
+    half = inertia.forward(g)
     coupling: Factorization | PositiveDefiniteFactorization
-    if gradient is force:  # A = g^T E^-1 g, as J M^-1 J^T
+    if gradient is g:  # A = g^T E^-1 g, as J M^-1 J^T
         other = ca.sparsify(inertia.scaled(half))
         matrix = ca.sparsify(ca.tril2symm(ca.tril(ca.mtimes(other.T, half))))
         coupling = PositiveDefiniteFactorization(matrix)
@@ -291,7 +291,7 @@ def _solver(
 
     def solve(balance: ca.SX, rate: ca.SX) -> ca.SX:
         free = inertia.forward(-balance)
-        multiplier = coupling.solve(-rate - ca.mtimes(other.T, free))
-        return ca.vertcat(inertia.backward(free + ca.mtimes(half, multiplier)), multiplier)
+        v = coupling.solve(-rate - ca.mtimes(other.T, free))
+        return ca.vertcat(inertia.backward(free + ca.mtimes(half, v)), v)
 
     return solve, matrix, coupling.pivot

@@ -122,8 +122,8 @@ class StateRealization(ParameterizedSystem):
         if not manifold.is_consistent(x, p):
             residual = manifold.residual(x, p)
             raise InconsistentStateError(
-                f"{self.dae.name}: the state is not on the constraint: the largest of its "
-                f"residuals is {np.max(np.abs(residual)):.3g}. Start from "
+                f"{self.dae.name}: the state is not on the constraint: its largest constraint "
+                f"residual is {np.max(np.abs(residual)):.3g}. Start from "
                 "structure.manifold.project(guess)",
                 residual,
             )
@@ -164,7 +164,7 @@ class StateRealization(ParameterizedSystem):
             value.set_value(self.normal_form.state(wanted, None, p))
         except InconsistentStateError:
             raise SimulationError(
-                f"the motion came to an end of its coordinates at t = {context.get_time():.6g} s, "
+                f"the motion left the domain of its coordinates at t = {context.get_time():.6g} s, "
                 f"last state {show(last)}: {reason}. DaePlant needs no coordinates",
                 context.get_time(),
                 last,

@@ -12,7 +12,7 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
 
 AT_REST = 1e-8
-"""A state is at rest if its forces balance to this, relative to their sizes."""
+"""A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Unrest:
 
     Attributes:
         regularity: Whether the motion is determined there.
-        moving: If it is, the state that moves most, relative to the forces that it balances.
-        rate: Its time derivative.
+        moving: If it is, the state that moves most, relative to the terms that cancel in its rate.
+        rate: The time derivative of this state.
     """
 
     regularity: Regularity

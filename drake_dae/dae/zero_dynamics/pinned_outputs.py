@@ -96,7 +96,7 @@ class PinnedOutputs:
         derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
         factors = Factorization(structure.control_matrix)
         control = factors.solve(highest - structure.drift)
-        self._rate, force = (
+        self._rate, constraint_input = (
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
         )
@@ -105,18 +105,18 @@ class PinnedOutputs:
         self._gradient = system.trace(
             "gradient of the pinned outputs",
             {"gradient": ca.jacobian(ca.cse(residual), system.state)},
-            often=False,  # It shares what the residual does; to find more takes long.
+            often=False,  # Those of the residual are removed above; finding more takes long.
         )
         # E x' = f + g v + h u, and the sizes of what cancels in it at rest.
         mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
         sizes = ca.mtimes(mass, ca.fmax(1.0, ca.fabs(system.state))) + ca.fabs(system.f)
-        sizes += ca.mtimes(g, ca.fabs(force)) + ca.mtimes(h, ca.fabs(control))
+        sizes += ca.mtimes(g, ca.fabs(constraint_input)) + ca.mtimes(h, ca.fabs(control))
         self._motion = system.trace(
             "pinned motion",
             {
                 "rate": self._rate,
                 "control": control,
-                "constraint_input": force,
+                "constraint_input": constraint_input,
                 "constraint_matrix": structure.elimination.constraint_matrix,
                 "control_matrix": structure.control_matrix,
                 "pivot": ca.fmin(factors.pivot, structure.elimination.pivot),

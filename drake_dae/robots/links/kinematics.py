@@ -19,7 +19,8 @@ class Frames(Protocol):
     """
 
     @property
-    def q(self) -> ca.SX: ...
+    def q(self) -> ca.SX:
+        """Generalized positions, symbols, shape (nq, 1)."""
 
     def rotation(self, frame: Any) -> ca.SX:
         """R_WF, shape (3, 3): the orientation of a frame in the world."""
