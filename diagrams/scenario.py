@@ -158,7 +158,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
 
     Raises:
         ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
-            given twice, and values cannot be used; all of these are told at once.
+            given twice, or values cannot be used; all of these are told at once.
     """
     path = Path(path)
     try:

@@ -109,13 +109,13 @@ class Findings:
 
     @property
     def manifold_dimension(self) -> int | None:
-        """dim N* = n - sum r_i, Theorem 1.1."""
+        """The dimension of N*, n - sum r_i, Theorem 1.1."""
         degrees = self._degrees_of_manifold
         return None if degrees is None else self.system.num_states - sum(degrees)
 
     @property
     def zero_dynamics_dimension(self) -> int | None:
-        """dim xi of (22): n - sum r_i - sum mu_i."""
+        """The dimension of xi in (22), n - sum r_i - sum mu_i."""
         known, degrees = self.manifold_dimension, self.output_degrees
         return None if known is None or degrees is None else known - sum(degrees)
 

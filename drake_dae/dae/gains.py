@@ -78,7 +78,7 @@ class FeedbackGains:
 
     @property
     def poles(self) -> np.typing.NDArray[np.complex128]:
-        """Eigenvalues of E in 1/s, shape (N,)."""
+        """The poles of the errors, the eigenvalues of E, in 1/s, shape (N,)."""
         return np.linalg.eigvals(self.error_matrix).astype(complex)
 
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:

@@ -110,7 +110,7 @@ class Layout:
         )
 
     def values(self, reference: ArrayLike) -> FloatArray:
-        """r_1, ..., r_p of a reference, shape (p,)."""
+        """The values r_1, ..., r_p of a reference, shape (p,)."""
         return np.asarray(reference, dtype=float).reshape(-1)[self.lowest]
 
     def constant(self, values: ArrayLike) -> FloatArray:

@@ -51,7 +51,7 @@ class Manifold:
 
     @property
     def dimension(self) -> int:
-        """dim N* = n - (r_1 + ... + r_m), Theorem 1.1."""
+        """The dimension of N*, n - (r_1 + ... + r_m), Theorem 1.1."""
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:

@@ -50,7 +50,7 @@ class Reference(ABC):
         """
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        """The same as an expression of a symbol, shape (sum (mu_i + 1), 1); None if it is none.
+        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None if they are no expression.
 
         Raises:
             ReferenceSignalError: The reference is not smooth enough for these degrees.

@@ -146,7 +146,7 @@ class DaeSystem:
             labels: The remaining fields of the class.
 
         Raises:
-            ModelError: A function fails, or what they return makes no system; see the class.
+            ModelError: A function fails, or the functions make no system; see the class.
         """
         owner = labels.get("name", "system")
         own = {"state", "parameters", "state_signals", *"fghklm"}
@@ -203,17 +203,17 @@ class DaeSystem:
 
     @property
     def num_states(self) -> int:
-        """n."""
+        """n, the number of states."""
         return int(self.state.numel())
 
     @property
     def num_constraints(self) -> int:
-        """m."""
+        """m, the number of constraints."""
         return int(self.k.numel())
 
     @property
     def num_controls(self) -> int:
-        """p, which is also the number of controlled outputs."""
+        """p, the number of controls and of controlled outputs."""
         return int(self.h.shape[1])
 
     @property

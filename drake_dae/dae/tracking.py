@@ -71,7 +71,7 @@ class TrackingLaw:
         self.function = self._trace()
 
     def _trace(self) -> TracedFunction:
-        """(28)."""
+        """The law (28) and the tracking error (29) as one function."""
         structure, layout, measured = self.structure, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols where K is not zero: the errors of most outputs are not coupled.
@@ -161,7 +161,7 @@ class TrackingLaw:
         measured_force: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """u(x, R) of (28).
+        """The control u(x, R) of (28).
 
         Args:
             state: x, shape (n,).

@@ -113,7 +113,7 @@ class SurfaceCoordinates(PositionOutput):
 
 @dataclass(frozen=True)
 class JointPositions(PositionOutput):
-    """Generalized positions by name.
+    """The generalized positions with given names.
 
     Attributes:
         joints: Names as in the links' `position_signals`.

@@ -74,7 +74,7 @@ def simulate(
     Raises:
         ModelError: The duration or the settings make no sense.
         InconsistentStateError: The start state is not on the manifold.
-        SimulationError: The run cannot go on.
+        SimulationError: The run cannot go on; the exception has time and state.
     """
     check_duration(duration)
     check_config(config)
@@ -179,7 +179,7 @@ class _Pace:
         self._steps, self._time, self._least = 0, start, self.SLOWEST * duration
 
     def check(self, context: Context) -> None:
-        """Counts a step.
+        """Counts a step, and looks at the pace now and then.
 
         Raises:
             SimulationError: The last steps led nowhere.

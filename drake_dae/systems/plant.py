@@ -110,7 +110,7 @@ class DaePlant(ParameterizedSystem):
             self.DeclarePerStepUnrestrictedUpdateEvent(self._project)
 
     def state(self, context: Context) -> FloatArray:
-        """x, shape (n,)."""
+        """The state x in a context, shape (n,)."""
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:

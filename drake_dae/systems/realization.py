@@ -107,7 +107,7 @@ class StateRealization(ParameterizedSystem):
         )
 
     def state(self, context: Context) -> FloatArray:
-        """x = Phi^-1(0, zeta, xi), shape (n,)."""
+        """The state x = Phi^-1(0, zeta, xi) in a context, shape (n,)."""
         return self._state_entry.Eval(context).copy()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:

@@ -33,7 +33,7 @@ class Failure:
         function: The function's name.
         fault: What is wrong.
         inputs: Name of an input -> its entries that are not finite; empty unless `fault` is INPUT.
-        singular: The matrix that is singular; empty if none is.
+        singular: The matrix that must be regular, which is singular if `fault` is SINGULAR.
     """
 
     function: str

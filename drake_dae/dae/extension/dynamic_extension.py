@@ -273,7 +273,7 @@ def _structure_at_nominal(chain: _Chain) -> Structure:
     """The structure of the extended system, which is regular nearly everywhere.
 
     Raises:
-        AssumptionError: It is singular at the nominal state or near it.
+        AssumptionError: B(x) is singular at the nominal state or near it.
     """
     try:
         return find_structure(chain.system, spread=chain.spread)

@@ -46,7 +46,7 @@ class Extension:
     def original_control(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """u of the original system, shape (p,).
+        """The control u of the original system, shape (p,).
 
         Args:
             state: x_e, the state of the extended system.
@@ -166,7 +166,7 @@ def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> F
     """Values of the controls at the nominal state by their names, 0 where not given, shape (p,).
 
     Raises:
-        ModelError: No control has a name, or a value is not finite.
+        ModelError: A name is that of no control, or a value is not finite.
     """
     values = values or {}
     _check_names(system, values, "nominal_control")

@@ -93,7 +93,7 @@ class Structure:
 
     @property
     def zero_dynamics_dimension(self) -> int:
-        """dim xi of (22): n - sum r_i - sum mu_i."""
+        """The dimension of xi in (22), n - sum r_i - sum mu_i."""
         return self.manifold.dimension - self.layout.chain_size
 
     @property

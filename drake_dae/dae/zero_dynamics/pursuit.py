@@ -192,7 +192,7 @@ class _Pursuit:
         )
 
     def _goal(self, time: float) -> FloatArray:
-        """R(t)."""
+        """R at a time, shape (sum (mu_i + 1),); the motion ends where it is not finite."""
         layout = self._pinned.layout
         try:
             goal = np.asarray(self._reference(time), dtype=float).reshape(-1)

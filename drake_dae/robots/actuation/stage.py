@@ -1,4 +1,4 @@
-"""What stands between the control and the joints: a chain of stages toward the motor.
+"""What a stage of actuation, between the control and the joints, says of itself.
 
 No stage is rigid joints (37), where the control is the joint torque. A stage delivers a force to
 its load, the joints or the shaft of the stage before it, and is driven by the stage after it or by
