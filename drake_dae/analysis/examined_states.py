@@ -43,7 +43,7 @@ class ExaminedStates:
         """The nominal state first, then random ones, in a region or around the nominal one.
 
         Raises:
-            ModelError: A name is that of no state, or an interval is no two finite numbers in order.
+            ModelError: A name is that of no state, or an interval is no two finite ordered numbers.
         """
         nominal = system.nominal_state
         drawn = nominal + system.nominal_spread * random.standard_normal((count, nominal.size))
