@@ -17,7 +17,7 @@ import drake_dae
 from drake_dae import Record, cli, load_scenario
 from drake_dae.cli import FILES, main
 from drake_dae.diagrams.scenario import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
-from drake_dae.errors import NonMinimumPhaseWarning
+from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation.plots import PLOTS
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
@@ -375,13 +375,12 @@ def test_a_bar_on_a_terminal(tmp_path):
 def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, capsys):
     """`analyze` tells of unstable zero dynamics in its report, and does not warn of them too."""
 
-    def warn(options):
+    def warn(name):
         warnings.warn("two tanks: non-minimum phase", NonMinimumPhaseWarning, stacklevel=1)
-        return 0
+        raise ScenarioError(("", "empty"))
 
-    monkeypatch.setattr(cli, "_simulate", warn)
-    monkeypatch.setattr(cli, "_analyze", warn)
-    assert main(["simulate", "two_link_wall"]) == 0
-    assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\n"
-    assert main(["analyze", "two_link_wall"]) == 0
-    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(cli, "find_scenario", warn)
+    assert main(["simulate", "two_tanks"]) == 1
+    assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty\n"
+    assert main(["analyze", "two_tanks"]) == 1
+    assert capsys.readouterr().err == "error: empty\n"

@@ -140,12 +140,30 @@ class ParameterizedSystem(DifferentiableSystem):
     Args:
         dae: The system.
         values: The default: `dae.parameter_values`, and what else the block appends.
+        signals: Name of an input of the block's functions -> names of its entries, for messages.
     """
 
-    def __init__(self, dae: DaeSystem, values: FloatArray) -> None:
+    def __init__(
+        self, dae: DaeSystem, values: FloatArray, signals: Mapping[str, Sequence[Signal]]
+    ) -> None:
         super().__init__()
         self.dae = dae
+        self._signals = signals
         self.DeclareNumericParameter(BasicVector(values))
+
+    def _checked(
+        self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
+    ) -> tuple[FloatArray, ...]:
+        """The values of a function of (state, inputs, parameters).
+
+        Raises:
+            SingularityError, NonFiniteError: They are of no use, and why, with time and state.
+        """
+        try:
+            return function.checked(state, *inputs, context.get_numeric_parameter(0).value())
+        except InvalidValueError as error:
+            time = context.get_time()
+            raise simulation_error(error.failure, time, state, self._signals) from None
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""

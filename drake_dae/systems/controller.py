@@ -16,8 +16,6 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
-from drake_dae.systems.failures import simulation_error
-from drake_dae.trace.functions import InvalidValueError
 
 
 class TrackingController(ParameterizedSystem):
@@ -49,19 +47,19 @@ class TrackingController(ParameterizedSystem):
     """
 
     def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
-        super().__init__(law.system, law.all_parameters())
-        _warn_of_zero_dynamics(law, outputs)
-        self.law = law
-        self.set_name("tracking_controller")
         dae = law.system
-        sizes = {"estimated_state": dae.num_states, "reference": law.layout.reference_size}
-        if law.measured_force:
-            sizes["measured_force"] = dae.num_constraints
-        self._signals = {
+        signals = {
             "state": dae.state_signals,
             "reference": law.reference_signals,
             "measured_force": dae.constraint_input_signals,
         }
+        super().__init__(dae, law.all_parameters(), signals)
+        _warn_of_zero_dynamics(law, outputs)
+        self.law = law
+        self.set_name("tracking_controller")
+        sizes = {"estimated_state": dae.num_states, "reference": law.layout.reference_size}
+        if law.measured_force:
+            sizes["measured_force"] = dae.num_constraints
         self._input_ports = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         self.DeclareVectorOutputPort("control", dae.num_controls, self._calc_control, sources)
@@ -91,12 +89,7 @@ class TrackingController(ParameterizedSystem):
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
         inputs = [port.Eval(context) for port in self._input_ports]
-        arguments = (*inputs, context.get_numeric_parameter(0).value())
-        try:
-            return self.law.function.checked(*arguments)
-        except InvalidValueError as error:
-            time, state = context.get_time(), inputs[0]
-            raise simulation_error(error.failure, time, state, self._signals) from None
+        return self._checked(self.law.function, context, *inputs)
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function

@@ -20,8 +20,7 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
-from drake_dae.systems.failures import simulation_error
-from drake_dae.trace.functions import InvalidValueError, TracedFunction
+from drake_dae.trace.functions import TracedFunction
 
 
 class DaePlant(ParameterizedSystem):
@@ -67,13 +66,13 @@ class DaePlant(ParameterizedSystem):
         self, system: DaeSystem, *, structure: Structure | None = None, project: bool = True
     ) -> None:
         structure = structure_of("DaePlant", system, structure)
-        super().__init__(system, system.parameter_values)
+        signals = {"state": system.state_signals, "control": system.control_signals}
+        super().__init__(system, system.parameter_values, signals)
         self.structure = structure
         self.set_name(system.name)
         elimination, derivatives = structure.elimination, structure.derivatives
         force = derivatives.expand(derivatives.constraint_input)
         output = system.l + ca.mtimes(system.m, force)
-        self._signals = {"state": system.state_signals, "control": system.control_signals}
         self._force_needs_control = elimination.beta.nnz() > 0
         self._output_needs_control = elimination.n_star.nnz() > 0
         self.dynamics = structure.trace("dynamics", derivatives.expand(derivatives.rate), True)
@@ -140,13 +139,8 @@ class DaePlant(ParameterizedSystem):
         self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
         x = context.get_continuous_state_vector().CopyToVector()
-        p = context.get_numeric_parameter(0).value()
-        arguments = (x, self._control_port.Eval(context), p) if needs_control else (x, p)
-        try:
-            return function.checked(*arguments)[0]
-        except InvalidValueError as error:
-            time = context.get_time()
-            raise simulation_error(error.failure, time, x, self._signals) from None
+        inputs = (self._control_port.Eval(context),) if needs_control else ()
+        return self._checked(function, context, x, *inputs)[0]
 
     def _formulas(self) -> dict[str, Formula]:
         dae, residual = self.dae, self.structure.manifold.residual_expression

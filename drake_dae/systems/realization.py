@@ -10,8 +10,7 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.block import Formula, ParameterizedSystem
-from drake_dae.systems.failures import simulation_error
-from drake_dae.trace.functions import InvalidValueError, TracedFunction
+from drake_dae.trace.functions import TracedFunction
 
 
 class StateRealization(ParameterizedSystem):
@@ -60,12 +59,12 @@ class StateRealization(ParameterizedSystem):
                 "with NormalForm(system)"
             )
         structure, dae = normal_form.structure, normal_form.system
-        super().__init__(dae, dae.parameter_values)
+        signals = {"state": dae.state_signals, "control": dae.control_signals}
+        super().__init__(dae, dae.parameter_values, signals)
         self.normal_form = normal_form
         self.set_name(dae.name)
         self._layout = layout = structure.layout
         self._on_manifold = np.zeros(sum(structure.constraint_degrees))
-        self._signals = {"state": dae.state_signals, "control": dae.control_signals}
         elimination, derivatives = structure.elimination, structure.derivatives
         highest = structure.drift + ca.mtimes(structure.control_matrix, derivatives.control)
         rate = ca.SX(0, 1)
@@ -173,13 +172,9 @@ class StateRealization(ParameterizedSystem):
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
-        x, p = self._state_entry.Eval(context), context.get_numeric_parameter(0).value()
-        arguments = (x, self._control_port.Eval(context), p) if needs_control else (x, p)
-        try:
-            return function.checked(*arguments)[0]
-        except InvalidValueError as error:
-            time = context.get_time()
-            raise simulation_error(error.failure, time, x, self._signals) from None
+        x = self._state_entry.Eval(context)
+        inputs = (self._control_port.Eval(context),) if needs_control else ()
+        return self._checked(function, context, x, *inputs)[0]
 
     def _formulas(self) -> dict[str, Formula]:
         raise ModelError(
