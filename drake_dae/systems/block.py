@@ -157,7 +157,8 @@ class ParameterizedSystem(DifferentiableSystem):
         """The values of a function of (state, inputs, parameters).
 
         Raises:
-            SingularityError, NonFiniteError: They are of no use, and why, with time and state.
+            SingularityError: A matrix in it is singular; the exception has time and state.
+            NonFiniteError: A value is not finite, likewise.
         """
         try:
             return function.checked(state, *inputs, context.get_numeric_parameter(0).value())
