@@ -182,8 +182,6 @@ class MultibodyExpressions:
             energy -= ca.dot(gravity, mass * origin + rotation @ first)
         return energy
 
-    # What is read from the plant.
-
     def _read_signals(self) -> None:
         positions, velocities = [], []
         for joint, name in zip(self._joints, unique_names(self.plant, self._joints), strict=True):
