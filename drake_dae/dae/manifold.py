@@ -11,6 +11,7 @@ from drake_dae.dae.layout import Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import Linearization, are_dependent, newton, shortest_steps
+from drake_dae.trace.round_off import positive
 
 CONSISTENT = 1e-8
 """A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
@@ -74,7 +75,7 @@ class Manifold:
         The arguments are those of `residual`.
         """
         p = self.system.parameter_vector(parameters)
-        residual, (step,) = self._residual(state, p)[0], self._newton(state, state, p)
+        (residual,), (step,) = self._residual(state, p), self._newton(state, state, p)
         reach = float(np.linalg.norm(step))
         # A step of exactly zero with something left: no state changes it.
         if np.isfinite(reach) and (reach > 0.0 or not residual.any()):
@@ -104,12 +105,14 @@ class Manifold:
             )
         found, converged = newton(start, lambda x: self._linearize(x, p))
         if not converged:
-            # Where gradients depend on each other, QR gives no step, but least squares do.
-            found, converged = newton(found, lambda x: self._least_squares(x, p))
+            # Gradients that depend on each other, or steps that mislead: least squares, downhill.
+            found, converged = newton(start, lambda x: self._downhill(x, p))
+        if converged and found is not start:
+            return found
         residual = self._residual.evaluate(found, p)[0].copy()
+        # Else it is round-off, in units in which that is much, or no state changes what is left.
         if np.linalg.norm(residual) <= CONSISTENT:
             return found
-        # Round-off, in units in which that is much; unless no state changes what is left.
         if converged and self._newton.evaluate(found, found, p)[0].any():
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
@@ -120,9 +123,19 @@ class Manifold:
             lambda x: self._newton.evaluate(x, state, parameters)[0].copy(), is_regular=True
         )
 
-    def _least_squares(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
+        """Steps of least squares that make the residual smaller, its rows scaled to length one."""
         gradients = self.gradients(state, parameters)
-        return shortest_steps(gradients, lambda x: self._residual(x, parameters)[0])
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(x: FloatArray) -> FloatArray:
+            return self._residual(x, parameters)[0]
+
+        def measure(x: FloatArray) -> float:
+            return float(np.linalg.norm(residual(x) / length))
+
+        steps = shortest_steps(gradients, residual)
+        return None if steps is None else steps._replace(measure=measure)
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
         """Why a Newton iteration that ended at a state failed, in words."""

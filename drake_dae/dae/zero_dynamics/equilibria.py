@@ -80,17 +80,16 @@ class Equilibria:
             slopes, _ = pinned.slopes(x, reference, parameters)
             if onto is None or not np.all(np.isfinite(slopes)):
                 return None
-            step_onto, regular = onto
             tangent = scipy.linalg.null_space(gradients)
             along = tangent.T @ slopes @ tangent
             noise = ROUND_OFF * balanced_norm(slopes) / (np.linalg.norm(along) or 1.0)
             inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
 
             def step(x: FloatArray) -> FloatArray:
-                across = step_onto(x)
+                across = onto.step(x)
                 return across - inner @ (pinned.rate(x, reference, parameters) + slopes @ across)
 
-            return Linearization(step, regular)
+            return Linearization(step, onto.is_regular)
 
         start = pinned.state(reference, guess, parameters)
         state, converged = newton(start, linearize)
