@@ -7,6 +7,7 @@ that is no data is `written` as another one; a member of a family is chosen by a
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
+from math import isfinite
 from types import UnionType
 from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -78,7 +79,8 @@ class Form:
         for annotation, form in self.written.items():
             if _members(annotation) <= members:
                 return form | None if type(None) in members else form
-        return hint
+        # In data a tuple is a list.
+        return Annotated[hint, pydantic.Strict(False)] if get_origin(hint) is tuple else hint
 
 
 def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, bool]]:
@@ -138,7 +140,7 @@ def _numbers(value: Any) -> Any:
     is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
     entries = [entry for row in rows for entry in row] if is_matrix else rows
     for entry in entries:
-        if type(entry) not in (int, float) or not np.isfinite(entry):
+        if type(entry) not in (int, float) or not isfinite(float(entry)):
             wanted = "a number, a list of numbers, or a matrix as a list of rows"
             raise ValueError(f"expected {wanted}, got {_show(entry)}")
     if is_matrix and len({len(row) for row in rows}) > 1:
@@ -185,7 +187,8 @@ class Reader(Generic[T]):
         try:
             return self._adapter.validate_python(data)
         except pydantic.ValidationError as error:
-            problems = [self._problem(details, data) for details in error.errors()]
+            # Each member of a Union says the same.
+            problems = dict.fromkeys(self._problem(details, data) for details in error.errors())
             raise ScenarioError(*problems) from None
 
     def write(self, value: T) -> Any:
@@ -197,7 +200,9 @@ class Reader(Generic[T]):
         kind, loc, value = details["type"], details["loc"], details["input"]
         if kind in ("missing", "extra_forbidden"):
             place = _place(loc[:-1], self.schema, data)
-            return place.key, _wrong_key(place, str(loc[-1]), value, kind == "missing")
+            if "properties" in place.schema:
+                return place.key, _wrong_key(place, str(loc[-1]), value, kind == "missing")
+            return place.key, _wrong_value(place.schema, place.data)  # Of a tuple.
         place = _place(loc, self.schema, data)
         if kind == "value_error":
             return place.key, str(details["ctx"]["error"])
@@ -220,6 +225,8 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
     keys: list[str] = []
     tag = tags = ""
     for part in loc:
+        if "anyOf" in schema:
+            break  # The rest of the location is about one of several types.
         if "oneOf" in schema:
             tag, tags = str(part), _tags(schema)
             schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
@@ -256,7 +263,7 @@ def _wrong_value(schema: Mapping[str, Any], value: Any) -> str:
     elif "minItems" in schema:
         expected = f"{schema['minItems']} numbers"
     else:
-        expected = _IN_WORDS[schema["type"]]
+        expected = _in_words(schema)
     text = f"expected {expected}, got {_show(value)}"
     if schema.get("type") == "string" and isinstance(value, (bool, int, float)):
         text += "; text that reads as something else goes in quotes"
@@ -270,7 +277,17 @@ _IN_WORDS = {
     "string": "text",
     "array": "a list",
     "object": "names with values",
+    "null": "nothing",
 }
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """What a plain value must be."""
+    if "anyOf" in schema:
+        return " or ".join(map(_in_words, schema["anyOf"]))
+    if "enum" in schema or "const" in schema:
+        return "one of " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
+    return _IN_WORDS.get(schema.get("type", ""), "something else")
 
 
 def _tag(schema: Mapping[str, Any]) -> str:

@@ -21,7 +21,7 @@ from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, outputs
-from drake_dae.robots.contact import surfaces
+from drake_dae.robots.contact import surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
 
 FOLDER = Path(__file__).resolve().parent
@@ -30,27 +30,30 @@ DEFAULT_SCENARIO = "seven_joint_wall"
 T = TypeVar("T")
 
 
-# The families that a tag chooses from, and what stands in a file for the types of their fields. A
-# new member is one line here.
+# The families that a tag chooses from. A new member is one line here. Vectors and arrays stand in a
+# file as `_WRITTEN` tells; numbers, text, truth values, Literals, dataclasses, tuples, and lists
+# and dictionaries of these stand for themselves.
+
+_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers}
 
 Surface = Annotated[
     surfaces.Plane | surfaces.Sphere | surfaces.Cylinder | surfaces.Ellipsoid | surfaces.Torus,
-    Choice({surfaces.Vector: Triple}),
+    Choice(_WRITTEN),
 ]
 Constraint = Annotated[
     contact.PointOnSurface | parts.WeldedFrames | contact.CoincidentPoints,
-    Choice({surfaces.Vector: Triple, surfaces.Surface: Surface}),
+    Choice({**_WRITTEN, surface.Surface: Surface}),
 ]
 Output = Annotated[
     outputs.PointCoordinates
     | outputs.AxisCoordinates
     | parts.SurfaceCoordinates
     | outputs.JointPositions,
-    Choice({surfaces.Vector: Triple}),
+    Choice(_WRITTEN),
 ]
 Stage = Annotated[
     actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
-    Choice({ArrayLike: Numbers}),
+    Choice(_WRITTEN),
 ]
 Reference = Annotated[
     Annotated[references.ConstantReference, Form(tag="!Constant")]
@@ -58,7 +61,7 @@ Reference = Annotated[
     | Annotated[
         references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
     ],
-    Choice({ArrayLike: Row}),
+    Choice({**_WRITTEN, ArrayLike: Row}),
 ]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

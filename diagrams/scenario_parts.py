@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Generic, TypeVar, cast
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -85,7 +85,7 @@ class SurfaceCoordinates(Written[outputs.PositionOutput]):
         named = {constraint.name: constraint for constraint in constraints}
         if self.constraint not in named:
             raise ModelError(unknown_name("constraint", self.constraint, named))
-        return outputs.SurfaceCoordinates(cast(contact.PointOnSurface, named[self.constraint]))
+        return outputs.SurfaceCoordinates(named[self.constraint])
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -139,14 +139,14 @@ class RobotModel:
                 f"{self.name}: outputs and guess have shapes {wanted.shape} and {q.shape}, "
                 f"expected ({count},) and ({self.links.q.numel()},)"
             )
-        values = self.dae.parameter_values if parameters is None else np.asarray(parameters)
+        values = self.dae.parameter_vector(parameters)
         found, left = self._placing.solve(wanted, q, values)
         size = float(np.max(np.abs(left), initial=0.0))
         if size < 1e-10:
             return found
         raise InconsistentStateError(
             f"{self.name}: no configuration near the guess satisfies the constraints with "
-            f"outputs {np.array2string(wanted, precision=4)}; {size:.2g} is left. They may be out "
+            f"outputs {show(wanted)}; {size:.2g} is left. They may be out "
             "of reach",
             left,
         )
@@ -170,13 +170,13 @@ class RobotModel:
         Raises:
             ModelError: No drive holds the robot there.
         """
-        values = self.dae.parameter_values if parameters is None else np.asarray(parameters)
+        values = self.dae.parameter_vector(parameters)
         q, load = numbers("positions", positions), numbers("forces", forces)
         state, left = self._balance.rest(q, load, values)
         if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
                 f"{self.name}: no drive holds the robot at rest at q = "
-                f"{np.array2string(q, precision=4)} with forces {load}; {left:.2g} N m is left. It "
+                f"{show(q)} with forces {load}; {left:.2g} N m is left. It "
                 "has fewer actuators than joints"
             )
         return state

@@ -75,8 +75,7 @@ class ConstraintLoads:
                 for name, column in columns.items()
             },
         )
-        values = model.dae.parameter_values if parameters is None else parameters
-        self._parameters = np.asarray(values, dtype=float)
+        self._parameters = model.dae.parameter_vector(parameters).copy()
         self._sizes = links.q.numel(), links.v.numel()
 
     def __call__(self, state: FloatArray, constraint_force: ArrayLike) -> Loads:

@@ -221,3 +221,14 @@ def test_tangents_are_upright():
 def test_refusals(make, message):
     with pytest.raises(ModelError, match=message):
         make()
+
+
+def test_a_surface_without_points_is_not_drawn_and_says_so():
+    with pytest.warns(UserWarning, match=r"ImplicitSurface: no point of it is found within 0\.4 m"):
+        assert ImplicitSurface(lambda p: ca.sumsqr(p) + 1.0).picture([0.1, 0.0, 0.0], 0.4) is None
+
+
+def test_a_surface_is_drawn_around_its_tip():
+    """The gradient vanishes at the tip of a cone; beside it there is a normal."""
+    cone = ImplicitSurface(lambda p: p[2] ** 2 - p[0] ** 2 - p[1] ** 2)
+    assert cone.picture([0.0, 0.0, 0.0], 0.4) is not None

@@ -180,6 +180,11 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
     check_is_system(system, owner)
     if structure is None:
         return find_structure(system)
+    if not isinstance(structure, Structure):
+        raise ModelError(
+            f"{owner}: structure must be what find_structure returns, got "
+            f"{type(structure).__name__}"
+        )
     if structure.system is not system:
         raise ModelError(
             f"{owner}: the structure is that of another system, '{structure.system.name}' and not "

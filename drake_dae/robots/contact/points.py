@@ -67,8 +67,9 @@ class PointOnSurface(Constraint):
         normal = self.surface.unit_normal(self.offset(kinematics))
         return Application(kinematics.position(self.frame, self.point), normal, ca.SX(3, 1))
 
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture:
-        return self.surface.picture(point - values, size).moved(values)
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
+        picture = self.surface.picture(point - values, size)
+        return None if picture is None else picture.moved(values)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What a surface says of itself, and how any surface is drawn."""
 
+import warnings
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture, mesh_of_grid
@@ -69,14 +70,24 @@ class Surface(ABC):
         p = ca.SX.sym("p", 3)
         return ca.substitute(ca.gradient(self.distance(p), p), p, offset)
 
-    def picture(self, center: ArrayLike, size: float) -> Picture:
+    def picture(self, center: ArrayLike, size: float) -> Picture | None:
         """What is to be seen of the surface, standing with its reference point at the origin.
+
+        Warns where Newton's method finds nothing of it near the center: it is then not drawn.
 
         Args:
             center: A point of interest, relative to the reference point, m, shape (3,).
             size: How large a piece of it to draw if it has no end, m.
         """
-        return Picture(mesh_of_grid(self._patch(np.asarray(center, float), size)), RigidTransform())
+        grid = self._patch(np.asarray(center, float), size)
+        if np.all(np.isfinite(grid), axis=2).sum() < 3:
+            warnings.warn(
+                f"{type(self).__name__}: no point of it is found within {size:.3g} m of {show(center)}, relative "
+                "to its reference point; it is not drawn",
+                stacklevel=2,
+            )
+            return None
+        return Picture(mesh_of_grid(grid), RigidTransform())
 
     def _patch(self, center: FloatArray, size: float) -> FloatArray:
         """A grid of points on the surface, shape (k, k, 3); NaN where there is none.
@@ -105,6 +116,11 @@ class Surface(ABC):
         if not np.all(np.isfinite(middle)):
             middle = center
         normal = function(middle)[1]
+        if not (np.all(np.isfinite(normal)) and normal.any()):
+            # A tip or an axis, where the distance has no gradient; beside it there is one.
+            normal = function(middle + size * np.array([0.07, 0.11, 0.13]))[1]
+        if not (np.all(np.isfinite(normal)) and normal.any()):
+            return np.full((1, 1, 3), np.nan)
         first, second = tangents(normal / np.linalg.norm(normal))
         steps = size * np.linspace(-0.5, 0.5, CELLS + 1)
         return np.array([[foot(middle + a * first + b * second) for b in steps] for a in steps])
