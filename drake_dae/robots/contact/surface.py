@@ -82,8 +82,8 @@ class Surface(ABC):
         grid = self._patch(np.asarray(center, float), size)
         if np.all(np.isfinite(grid), axis=2).sum() < 3:
             warnings.warn(
-                f"{type(self).__name__}: no point of it is found within {size:.3g} m of {show(center)}, relative "
-                "to its reference point; it is not drawn",
+                f"{type(self).__name__}: no point of it is found within {size:.3g} m of "
+                f"{show(center)}, relative to its reference point; it is not drawn",
                 stacklevel=2,
             )
             return None
