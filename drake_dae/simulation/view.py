@@ -11,7 +11,7 @@ from pydrake.geometry import (
     Rgba,
     SceneGraph,
 )
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arrays import FloatArray
@@ -44,71 +44,58 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The blocks of a diagram that draw a robot.
+    """What draws a robot, as a diagram with the input ports `link_state` and `constraint_force`.
 
     Attributes:
-        meshcat: Where they draw.
-        plant: The robot.
+        meshcat: Where it draws.
+        diagram: The blocks.
         links: Drake's picture of the links; None if they have no geometry.
         forces: The arrows.
     """
 
     meshcat: Meshcat
-    plant: RobotPlant
+    diagram: Diagram
     links: MeshcatVisualizer | None
     forces: ConstraintForceVisualizer
 
 
-def add_view(
-    builder: DiagramBuilder,
-    plant: RobotPlant,
-    scene_graph: SceneGraph | None,
-    meshcat: Meshcat,
-    live: bool,
+def make_view(
+    plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat, live: bool
 ) -> View:
-    """Adds the blocks that draw a robot of a diagram, and draws what does not move.
+    """What draws a robot; what does not move is drawn at once.
 
     Args:
-        builder: With the plant in it.
         plant: The robot.
-        scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
+        scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
+            has a copy.
         meshcat: Where to draw.
-        live: Whether to draw while the diagram runs; if not, only when told to.
+        live: Whether to draw `FRAME_RATE` times a second of the run; if not, only when told to.
     """
     model, dae = plant.model, plant.dae
-    links = None if scene_graph is None else _add_links(builder, plant, scene_graph, meshcat, live)
     state = plant.structure.manifold.project(dae.nominal_state)
     loads = ConstraintLoads(model)
     draw_surroundings(meshcat, model, loads, state, dae.parameter_values)
     # From behind, the side and a little above.
     middle, size = scene_extent(model, loads, state)
     meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
+
+    builder = DiagramBuilder()
     period = 1.0 / FRAME_RATE if live else None
     forces = builder.AddSystem(ConstraintForceVisualizer(meshcat, model, period, 0.2 * size))
     for name in ("link_state", "constraint_force"):
-        builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
-    return View(meshcat, plant, links, forces)
-
-
-def _add_links(
-    builder: DiagramBuilder,
-    plant: RobotPlant,
-    scene_graph: SceneGraph,
-    meshcat: Meshcat,
-    live: bool,
-) -> MeshcatVisualizer | None:
-    """Drake's own picture of the robot, posed by our link state; its plant is not simulated."""
-    drawn = plant.model.links.plant
-    if drawn is None or drawn.get_source_id() is None:
-        return None
-    builder.AddSystem(scene_graph)
-    pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
-    builder.Connect(plant.GetOutputPort("link_state"), pose.get_input_port())
-    builder.Connect(pose.get_output_port(), scene_graph.get_source_pose_port(drawn.get_source_id()))
-    period = 1.0 / FRAME_RATE if live else _ON_REQUEST
-    return MeshcatVisualizer.AddToBuilder(
-        builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
-    )
+        builder.ExportInput(forces.GetInputPort(name), name)
+    drawn, links = model.links.plant, None
+    if scene_graph is not None and drawn is not None and drawn.get_source_id() is not None:
+        # Drake's own picture of the robot, posed by our link state; its plant is not simulated.
+        scene = builder.AddSystem(scene_graph.Clone())
+        pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
+        builder.ConnectInput("link_state", pose.get_input_port())
+        builder.Connect(pose.get_output_port(), scene.get_source_pose_port(drawn.get_source_id()))
+        parameters = MeshcatVisualizerParams(publish_period=period or _ON_REQUEST)
+        links = MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
+    diagram = builder.Build()
+    diagram.set_name("view")
+    return View(meshcat, diagram, links, forces)
 
 
 def draw_surroundings(
