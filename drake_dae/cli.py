@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TextIO
 
@@ -30,7 +31,7 @@ from drake_dae.diagrams.scenario import (
 )
 from drake_dae.errors import DrakeDaeError, ModelError, NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation.animation import make_animation
-from drake_dae.simulation.interruption import end_at_once, ending_signals
+from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.plots import PLOTS, save_plots
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
@@ -91,6 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
     options = parser.parse_args(arguments)
+    if isinstance(sys.stdout, TextIOWrapper):
+        # Names may have letters that the terminal does not.
+        sys.stdout.reconfigure(errors="backslashreplace")
     # Drake tells where each Meshcat listens, also the one that only records.
     logging.getLogger("drake").setLevel(logging.WARNING)
     try:
@@ -215,19 +219,23 @@ def _write(
     writer: RecordWriter,
 ) -> bool:
     """Writes the files, prints the summary, and says whether all files are complete."""
-    record = loop.record(context)
-    if record.time.size == 0:
-        return True
-    predicted = loop.predicted_error(record)
-    limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
-    text = summary(record, predicted, limits, run, failure)
     problems: list[str] = []
-    try:
+    # A signal that comes now does not stop before the record is written, but before the pictures.
+    with ending_signals(ending := Ending()):
+        record = loop.record(context)
+        if record.time.size == 0:
+            return True
+        predicted = loop.predicted_error(record)
+        limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
+        text = summary(record, predicted, limits, run, failure)
         if scenario.write.record:
             with _collected(problems):
                 _write_record(record, context, folder, writer)
         with _collected(problems), stage(folder, "summary.txt") as place:
             (place / "summary.txt").write_text(text + "\n", encoding="utf-8")
+    try:
+        if ending.signal is not None:
+            end_at_once(ending.signal)
         if scenario.write.plots and pictures:
             with _collected(problems), stage(folder, *PLOTS) as place:
                 save_plots(record, predicted, limits.control, place)

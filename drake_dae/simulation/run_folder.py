@@ -61,7 +61,7 @@ def _prepare(folder: Path) -> int:
         _lock(lock, folder)
         _check(folder, (folder / SCENARIO).read_text("utf-8"))
         if os.path.lexists(folder / PART):
-            warnings.warn(f"{folder / PART}, of a run that was killed, is removed", stacklevel=5)
+            warnings.warn(f"{folder / PART} of a run that did not end is removed", stacklevel=5)
         for file in _present(folder)[1:]:
             file.unlink()
         for stale in folder.glob(f"{_STAGE}*"):
