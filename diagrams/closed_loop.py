@@ -15,7 +15,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
-from drake_dae.simulation.view import make_view
+from drake_dae.simulation.view import add_live_view
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
@@ -166,9 +166,7 @@ def make_closed_loop(
     if isinstance(plant, RobotPlant):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
         if meshcat is not None:
-            view = builder.AddSystem(make_view(plant, scene_graph, meshcat, live=True).diagram)
-            for name in ("link_state", "constraint_force"):
-                builder.Connect(plant.GetOutputPort(name), view.GetInputPort(name))
+            add_live_view(builder, plant, scene_graph, meshcat)
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")

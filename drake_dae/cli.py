@@ -259,7 +259,7 @@ def _write_record(record: Record, context: Context, folder: Path, writer: Record
     except OSError as error:
         with suppress(OSError):
             writer.finish(context)  # Rows that fit are kept.
-        with suppress(OSError, ModelError):
+        with suppress(OSError, ModelError, IndexError):
             kept = Record.load(writer.path).time[-1]
             error.strerror = f"{error.strerror or error}; {PART} has the record up to {kept:.6g} s"
         raise

@@ -11,7 +11,13 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import ConstraintLoads
 from drake_dae.simulation.record import Record
-from drake_dae.simulation.view import FRAME_RATE, draw_surroundings, make_view, start_meshcat
+from drake_dae.simulation.view import (
+    FRAME_RATE,
+    draw_scene,
+    draw_surroundings,
+    start_meshcat,
+    view_of_links,
+)
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.robot_plant import RobotPlant
 
@@ -47,9 +53,10 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
     plant = loop.plant
     if not isinstance(plant, RobotPlant):
         raise ModelError("an animation needs a closed loop of a RobotPlant")
-    # A server of its own, only now and only as long as this takes.
-    view = make_view(plant, loop.scene_graph, start_meshcat(), live=False)
-    meshcat, model = view.meshcat, plant.model
+    # A server of its own, made only now: a run that nobody watches opens no port.
+    meshcat, model = start_meshcat(), plant.model
+    arrows = draw_scene(plant, meshcat)
+    links = view_of_links(plant, loop.scene_graph, meshcat)
     parameters = plant.parameters(plant.GetMyContextFromRoot(context))
     loads = ConstraintLoads(model, parameters)
 
@@ -58,7 +65,7 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
     forces = _interpolated(record, "constraint_force", times)
     desired = _interpolated(record, "desired_output", times)
     course = [loads(state, force) for state, force in zip(states, forces, strict=True)]
-    view.forces.measure(course)
+    arrows.measure(course)
 
     # What stands still: what it touches, where it went, and where the reference wanted it.
     draw_surroundings(meshcat, model, loads, states[0], parameters)
@@ -70,15 +77,15 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
         _draw_paths(meshcat, loads, points, "desired")
 
     # What moves: the links and the arrows, frame by frame.
-    replay = view.diagram.CreateDefaultContext()
-    link_state = view.diagram.GetInputPort("link_state")
+    replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
     for time, state, load in zip(times, states, course, strict=True):
-        replay.SetTime(time)
-        link_state.FixValue(replay, state[: link_state.size()])
-        if view.links is not None:
-            view.links.ForcedPublish(view.links.GetMyContextFromRoot(replay))
-        view.forces.draw(load, time)
+        if links is not None and replay is not None:
+            replay.SetTime(time)
+            link_state = links.get_input_port()
+            link_state.FixValue(replay, state[: link_state.size()])
+            links.ForcedPublish(replay)
+        arrows.draw(load, time)
     meshcat.StopRecording()
     meshcat.PublishRecording()
     return meshcat.StaticHtml()

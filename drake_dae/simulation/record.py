@@ -110,7 +110,7 @@ class Record:
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
                 return cls(file["time"], signals)
-        except (AttributeError, KeyError, TypeError, ValueError, BadZipFile) as error:
+        except (AttributeError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise ModelError(f"{path} is not a record of a run: {error}") from None
 
 
@@ -120,8 +120,9 @@ def _read_rows(file: BinaryIO) -> tuple[FloatArray, dict[str, Recorded]]:
     named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
     stops = np.cumsum([1, *map(len, named.values())])
     data = file.read()
-    count = len(data) // (8 * int(stops[-1]))
-    rows = np.frombuffer(data, "<f8", count * stops[-1]).reshape(count, -1).astype(float)
+    width = int(stops[-1])
+    count = len(data) // (8 * width)
+    rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
     # A machine that lost its power may leave zeros where nothing was synced.
     whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
     time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]

@@ -1,7 +1,5 @@
 """A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from pydrake.geometry import (
     Meshcat,
@@ -19,6 +17,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import (
     ConstraintForceVisualizer,
     ConstraintLoads,
+    ForceArrows,
     path_of,
 )
 from drake_dae.systems.robot_plant import RobotPlant
@@ -42,34 +41,34 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
     return meshcat
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """What draws a robot, as a diagram with the input ports `link_state` and `constraint_force`.
+def add_live_view(
+    builder: DiagramBuilder, plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat
+) -> None:
+    """Adds what draws a robot `FRAME_RATE` times a second while its diagram runs.
 
-    Attributes:
-        meshcat: Where it draws.
-        diagram: The blocks.
-        links: Drake's picture of the links; None if they have no geometry.
-        forces: The arrows.
+    Args:
+        builder: With the plant in it.
+        plant: The robot.
+        scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
+        meshcat: Where to draw.
     """
+    period = 1.0 / FRAME_RATE
+    arrows = draw_scene(plant, meshcat)
+    forces = builder.AddSystem(ConstraintForceVisualizer(arrows, plant.model, period))
+    for name in ("link_state", "constraint_force"):
+        builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
+    links = view_of_links(plant, scene_graph, meshcat, period)
+    if links is not None:
+        builder.AddSystem(links)
+        builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
 
-    meshcat: Meshcat
-    diagram: Diagram
-    links: MeshcatVisualizer | None
-    forces: ConstraintForceVisualizer
 
-
-def make_view(
-    plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat, live: bool
-) -> View:
-    """What draws a robot; what does not move is drawn at once.
+def draw_scene(plant: RobotPlant, meshcat: Meshcat) -> ForceArrows:
+    """Draws what does not move, and returns what draws the constraint forces.
 
     Args:
         plant: The robot.
-        scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
-            has a copy.
         meshcat: Where to draw.
-        live: Whether to draw `FRAME_RATE` times a second of the run; if not, only when told to.
     """
     model, dae = plant.model, plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
@@ -78,24 +77,37 @@ def make_view(
     # From behind, the side and a little above.
     middle, size = scene_extent(model, loads, state)
     meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
+    return ForceArrows(meshcat, model, 0.2 * size)
 
+
+def view_of_links(
+    plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
+) -> Diagram | None:
+    """Drake's own picture of a robot, posed by our link state; its plant is not simulated.
+
+    Args:
+        plant: The robot.
+        scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
+            has a copy of it.
+        meshcat: Where to draw.
+        period: Time between pictures in s; without one they are drawn when asked for.
+
+    Returns:
+        A diagram with (q, v) as its input, or None if the links have no geometry.
+    """
+    drawn = plant.model.links.plant
+    if scene_graph is None or drawn is None or drawn.get_source_id() is None:
+        return None
     builder = DiagramBuilder()
-    period = 1.0 / FRAME_RATE if live else None
-    forces = builder.AddSystem(ConstraintForceVisualizer(meshcat, model, period, 0.2 * size))
-    for name in ("link_state", "constraint_force"):
-        builder.ExportInput(forces.GetInputPort(name), name)
-    drawn, links = model.links.plant, None
-    if scene_graph is not None and drawn is not None and drawn.get_source_id() is not None:
-        # Drake's own picture of the robot, posed by our link state; its plant is not simulated.
-        scene = builder.AddSystem(scene_graph.Clone())
-        pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
-        builder.ConnectInput("link_state", pose.get_input_port())
-        builder.Connect(pose.get_output_port(), scene.get_source_pose_port(drawn.get_source_id()))
-        parameters = MeshcatVisualizerParams(publish_period=period or _ON_REQUEST)
-        links = MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
+    scene = builder.AddSystem(scene_graph.Clone())
+    pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
+    builder.ExportInput(pose.get_input_port(), "link_state")
+    builder.Connect(pose.get_output_port(), scene.get_source_pose_port(drawn.get_source_id()))
+    parameters = MeshcatVisualizerParams(publish_period=period)
+    MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
     diagram = builder.Build()
-    diagram.set_name("view")
-    return View(meshcat, diagram, links, forces)
+    diagram.set_name("view_of_links")
+    return diagram
 
 
 def draw_surroundings(

@@ -38,9 +38,9 @@ from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact import surfaces
 from drake_dae.simulation.animation import frame_times
-from drake_dae.simulation.constraint_forces import ConstraintForceVisualizer, ConstraintLoads
+from drake_dae.simulation.constraint_forces import ConstraintLoads, ForceArrows
 from drake_dae.simulation.record import Recorded
-from drake_dae.simulation.view import FRAME_RATE, make_view, scene_extent
+from drake_dae.simulation.view import FRAME_RATE, draw_scene, scene_extent
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 
@@ -310,13 +310,13 @@ def test_only_this_machine_reaches_meshcat():
 def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     model = arm("two_link").model
     meshcat = start_meshcat()
-    visualizer = ConstraintForceVisualizer(meshcat, model, None, length=0.3)
+    arrows = ForceArrows(meshcat, model, length=0.3)
     loads = ConstraintLoads(model)
     state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
     seen = {}
     for force in (0.0, 10.0, -20.0):
         meshcat.StartRecording()
-        visualizer.draw(loads(state, [force]), 0.0)
+        arrows.draw(loads(state, [force]), 0.0)
         meshcat.StopRecording()
         meshcat.PublishRecording()
         tracks = animation(meshcat.StaticHtml())
@@ -326,7 +326,7 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     # The wall's normal is -x; the largest force so far has the full length.
     assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
     assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
-    assert visualizer.largest_force == 20.0
+    assert arrows.largest_force == 20.0
 
 
 def shown_at_rest(model, forces):
@@ -334,10 +334,10 @@ def shown_at_rest(model, forces):
     meshcat = start_meshcat()
     plant = RobotPlant(model)
     state = plant.structure.manifold.project(model.dae.nominal_state)
-    view = make_view(plant, None, meshcat, live=False)
+    arrows = draw_scene(plant, meshcat)
     loads = ConstraintLoads(model)(state, forces)
     meshcat.StartRecording()
-    view.forces.draw(loads, 0.0)
+    arrows.draw(loads, 0.0)
     meshcat.StopRecording()
     meshcat.PublishRecording()
     return state, meshcat.StaticHtml()
