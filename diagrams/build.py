@@ -1,4 +1,4 @@
-"""From a scenario to the closed loop that it describes."""
+"""The closed loop that a scenario describes."""
 
 from collections.abc import Sequence
 
@@ -37,11 +37,11 @@ def build_scenario(
     """The closed loop of a scenario, and its context at the start.
 
     Args:
-        scenario: As loaded.
-        meshcat: Where to draw while it runs, or None.
+        scenario: What `load_scenario` returns.
+        meshcat: Where to draw while the run goes on; None draws nothing.
 
     Raises:
-        ScenarioError: What does not fit, with the key.
+        ScenarioError: Something does not fit; the message names its key.
     """
     scene_graph = SceneGraph()
     model = scenario_model(scenario, scene_graph)
@@ -63,14 +63,14 @@ def wire_scenario(
     """The closed loop of a scenario's robot, and its context at the start.
 
     Args:
-        scenario: As loaded.
-        model: Its `scenario_model`.
-        structure: That of the model's system.
+        scenario: What `load_scenario` returns.
+        model: The scenario's robot, by `scenario_model`.
+        structure: The structure of the model's system.
         scene_graph: Where the robot's geometry is registered; needed to draw it.
-        meshcat: Where to draw while it runs, or None.
+        meshcat: Where to draw while the run goes on; None draws nothing.
 
     Raises:
-        ScenarioError: What does not fit, with the key.
+        ScenarioError: Something does not fit; the message names its key.
     """
     # The law, the sensor that it may need, and the references.
     force = scenario.force

@@ -28,10 +28,10 @@ class ClosedLoop:
     """A plant that follows a reference under the law (28).
 
     Attributes:
-        diagram: With the output ports `state`, `constraint_force`, `constraint_residual`,
-            `controlled_output`, `control`, `reference` and `tracking_error`; `link_state` for a
-            robot.
-        plant, controller, reference: Its systems.
+        diagram: The diagram, with the output ports `state`, `constraint_force`,
+            `constraint_residual`, `controlled_output`, `control`, `reference` and
+            `tracking_error`; `link_state` for a robot.
+        plant, controller, reference: The systems in it.
         loggers: Port name -> (sink, names and units), one sample per step.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
@@ -98,10 +98,10 @@ def make_closed_loop(
 
     Args:
         system: A `RobotPlant`, or any `DaePlant`.
-        law: For a system of the same structure.
-        references: Together one for each controlled output.
-        sensor: Measures the constraint force for a law with measured force. Without one the force
-            is connected as it is, where that closes no algebraic loop.
+        law: A law for the plant's system, or for a model of the same structure.
+        references: References that together cover all controlled outputs, in their order.
+        sensor: The sensor of the constraint force, for a law with measured force. Without one the
+            force is connected as it is, where that closes no algebraic loop.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
             its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
@@ -112,11 +112,11 @@ def make_closed_loop(
     A loop that draws nothing and samples nothing converts to AutoDiffXd, for Drake's Linearize.
 
     Warns:
-        NonMinimumPhaseWarning: As `TrackingController`.
+        NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
 
     Raises:
-        WiringError: A law or a sensor of sizes that are not the plant's; measured force that would
-            close an algebraic loop, or a sampled loop that diverges; or a sensor that no law uses.
+        WiringError: The law or the sensor has other sizes than the plant; measured force would
+            close an algebraic loop, or a sampled loop that diverges; or no law uses the sensor.
     """
     if not isinstance(system, DaePlant):
         raise WiringError(
@@ -174,7 +174,7 @@ def make_closed_loop(
 
 
 def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
-    """Drake would name the ports, but not what is wrong with them."""
+    """Refuses wrong sizes: Drake would name the ports, but not what is wrong with them."""
     own, other = plant.dae, law.system
     sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
     if sizes[0] != sizes[1]:
@@ -201,7 +201,7 @@ def _add_force_feedback(
     controller: TrackingController,
     sensor: ForceSensor | None,
 ) -> RandomSource | None:
-    """From the constraint force, through the sensor if there is one, to the controller.
+    """Connects the constraint force to the controller, through the sensor if there is one.
 
     Returns:
         The source of the sensor's noise, if it has one.

@@ -19,29 +19,29 @@ from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 
 SAMPLES = 1001
-"""At how many times along the reference, at least."""
+"""How many times along a reference are examined, at least."""
 
 MOST_SAMPLES = 20_000
-"""At how many times along a reference that varies fast, at most."""
+"""How many times along a reference that varies fast are examined, at most."""
 
 _STRAIGHT = 0.01
-"""How far a reference is from a straight line between two times, of the range that it covers."""
+"""How far a reference may be off a straight line between two times, relative to its range."""
 
 _SLACK = 1e-9
-"""Of joint limits, in their unit: a start on the limit is not beyond it."""
+"""How far a value must be beyond its limit to count, in its unit: a start may be on the limit."""
 
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
     """Analyzes the robot of a scenario, and what its reference takes.
 
-    All is for the law's model, started without errors: the least that the scenario asks for.
+    The figures are those of the law's model without errors: the least that the scenario asks for.
 
     Args:
-        scenario: As loaded.
+        scenario: What `load_scenario` returns.
 
     Raises:
-        ScenarioError: What does not fit, with the key. A violated assumption is no error: the
-            analysis tells it.
+        ScenarioError: Something does not fit; the message names its key. A violated assumption is
+            no error: the analysis tells it.
     """
     model = scenario_model(scenario)
     try:
@@ -67,8 +67,8 @@ def sample_times(
     is tried at a random place, until a whole round finds nothing new.
 
     Args:
-        reference: t -> R(t).
-        begin, end: In s.
+        reference: The function t -> R(t).
+        begin, end: The first and the last time, in s.
 
     Returns:
         Between SAMPLES and MOST_SAMPLES increasing times in s, and whether these are enough.
@@ -81,7 +81,7 @@ def sample_times(
         tried = times[:-1] + share * np.diff(times)
         found = np.array([reference(time) for time in tried])
         known = np.concatenate([values, found])
-        # Beside what is round-off of a constant.
+        # A constant varies by its round-off.
         allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
         off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
         new = np.flatnonzero(np.any(off > allowed, axis=1))

@@ -40,7 +40,7 @@ class SignalRange:
         return self.largest, self.largest_time
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers; None for an infinite limit."""
+        """The range as plain numbers; None for an infinite limit."""
         return {
             "name": self.signal.name,
             "unit": self.signal.unit,
@@ -56,15 +56,15 @@ class SignalRange:
 class Feasibility:
     """The analysis of a scenario's robot, and what its reference takes.
 
-    All is for the law's model, started without errors: the least that the scenario asks for.
+    The figures are those of the law's model without errors: the least that the scenario asks for.
 
     Attributes:
-        analysis: Of the robot, around the start and along the reference.
-        duration: Of the scenario, in s.
-        controls: u, against what the actuators can do.
-        joint_forces: What the actuation puts on the joints, against their effort limits; empty
-            with rigid joints, where that is u.
-        constraint_forces: Of the constraints.
+        analysis: What `analyze` says of the robot, around the start and along the reference.
+        duration: How long the scenario lasts, in s.
+        controls: u, with what the actuators can do as limits.
+        joint_forces: What the actuation puts on the joints, with their effort limits; empty with
+            rigid joints, where that is u.
+        constraint_forces: lambda; zero is the lower limit where a constraint can only push.
         joints: Positions and velocities of the joints that have limits.
         is_resolved: Whether the times follow the reference; if not, it varies faster than they do,
             and the values between them are not known.
@@ -96,11 +96,11 @@ class Feasibility:
         return to_text(self._parts())
 
     def to_markdown(self) -> str:
-        """The same with Markdown tables."""
+        """The report with Markdown tables."""
         return to_markdown(self._parts())
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, lists and texts."""
+        """The report as plain numbers, lists and texts."""
         return {
             "analysis": self.analysis.to_dict(),
             "duration": self.duration,
@@ -164,7 +164,7 @@ def _joint_row(r: SignalRange) -> list[str]:
 
 
 def _when(r: SignalRange, time: float) -> str:
-    """Nothing for a constant, whose extremes are round-off."""
+    """When, in words; nothing for a constant, whose extremes are round-off."""
     size = max(abs(r.least), abs(r.largest))
     return f"{time:.4g} s" if r.largest - r.least > 1e-9 * size else ""
 

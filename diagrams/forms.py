@@ -27,7 +27,7 @@ class Form:
     Attributes:
         written: Annotation of a field -> the type that stands for it in data.
         defaults: Name of a field -> value where data leave it out, if not that of the class.
-        tag: With which data choose the class, "!Sphere"; empty if there is no choice.
+        tag: The tag by which data choose the class, "!Sphere"; empty if there is no choice.
         needs_tag: Whether data without a tag mean another class.
     """
 
@@ -82,7 +82,7 @@ class Form:
 
 
 def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, bool]]:
-    """Name, annotation, and whether there is no default."""
+    """The name and the annotation of each field, and whether it has no default."""
     if not is_dataclass(source):
         yield from ((item.name, item.type, False) for item in source.__fields__)
         return
@@ -94,7 +94,7 @@ def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, bool]]:
 
 
 def _members(hint: Any) -> set[Any]:
-    """Those of a Union; what is none stands for itself."""
+    """The members of a Union; any other annotation is its own only member."""
     return set(get_args(hint)) if get_origin(hint) in (Union, UnionType) else {hint}
 
 
@@ -106,7 +106,7 @@ class Choice:
     defaults.
 
     Attributes:
-        written: As in `Form`, for all of them.
+        written: The types that stand for others in data, as in `Form`, for all members.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
@@ -177,10 +177,10 @@ class Reader(Generic[T]):
         self.free_names = set(_free_names(self.schema, ""))
 
     def read(self, data: Any) -> T:
-        """The dataclass.
+        """The dataclass that plain data describe.
 
         Raises:
-            ScenarioError: All keys that are unknown or missing, and all values that are wrong.
+            ScenarioError: Keys are unknown or missing, or values are wrong; all of them are told.
         """
         try:
             return self._adapter.validate_python(data)
@@ -189,11 +189,11 @@ class Reader(Generic[T]):
             raise ScenarioError(*problems) from None
 
     def write(self, value: T) -> Any:
-        """Plain data that `read` makes the same of."""
+        """The plain data of which `read` makes the same value."""
         return self._adapter.dump_python(value, mode="json")
 
     def _problem(self, details: ErrorDetails, data: Any) -> tuple[str, str]:
-        """Dotted key and text."""
+        """The dotted key and the text of a problem."""
         kind, loc, value = details["type"], details["loc"], details["input"]
         if kind in ("missing", "extra_forbidden"):
             place = _place(loc[:-1], self.schema, data)
@@ -232,7 +232,7 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
 
 
 def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
-    """What is wrong about a key that is missing or should not be there."""
+    """What is wrong with a key that is missing or should not be there."""
     if name == TAG:
         return f"takes no tag, got {value}"
     names = [name for name in place.schema["properties"] if name != TAG]

@@ -83,18 +83,18 @@ class Scenario:
 
     Attributes:
         description: One line for `drake-dae list`.
-        robot: Where it is read from.
+        robot: The file that the robot is read from.
         constraints: What it touches or holds; a form without a tag is a PointOnSurface.
         outputs: Position outputs; the constraint forces follow them.
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not.
-        gains: Of the tracking law (28).
-        references: One below the other, in the order of the outputs, the forces last.
-        start: Where it starts.
-        duration: In s.
+        gains: The gains of the tracking law (28).
+        references: The references, in the order of the outputs, the forces last.
+        start: Where the robot starts.
+        duration: How long the run lasts, in s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
-        write: What to keep.
+        write: What the run leaves in its folder.
     """
 
     description: str = field(default="", kw_only=True)
@@ -137,7 +137,7 @@ def find_scenario(name: str) -> Path:
     """The file of a shipped scenario, or a path as it is.
 
     Raises:
-        ScenarioError: There is neither.
+        ScenarioError: There is neither such a scenario nor such a file.
     """
     shipped = shipped_scenarios()
     if name in shipped:
@@ -157,8 +157,8 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
             "constraints.0.surface.point=[0.7, 0, 0]".
 
     Raises:
-        ScenarioError: No such file, broken YAML, or keys that are unknown, missing or given twice
-            and values that cannot be used, all at once.
+        ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
+            given twice, or values cannot be used; all of these are told at once.
     """
     path = Path(path)
     try:
@@ -168,7 +168,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     data = load_yaml(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):
-        # As Drake has it: a place for anchors.
+        # Drake's convention: keys with an underscore are a place for anchors.
         data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
     for setting in settings:
         set_entry(data, setting, _reader().free_names)
@@ -186,9 +186,9 @@ def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> No
     """Writes a scenario file that `load_scenario` reads back equal.
 
     Args:
-        scenario: What.
-        path: Where.
-        comment: A first line, with its "#".
+        scenario: The scenario.
+        path: The file to write.
+        comment: A first line, with its "#"; empty for none.
     """
     head = f"{comment}\n" if comment else ""
     Path(path).write_text(head + dump_yaml(_reader().write(scenario)), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""From a scenario to its robot, with what it touches and what it shall steer."""
+"""The robot of a scenario, with what it touches and what it shall steer."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -30,11 +30,11 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     """The robot of a scenario, with what it touches and what it shall steer.
 
     Args:
-        scenario: As loaded.
-        scene_graph: Where its geometry is registered, or None.
+        scenario: What `load_scenario` returns.
+        scene_graph: Where the robot's geometry is registered; needed to draw it.
 
     Raises:
-        ScenarioError: What does not fit, with the key.
+        ScenarioError: Something does not fit; the message names its key.
     """
     # The robot.
     name = Path(scenario.robot.file).name.split(".")[0]  # Of "two_arms.dmd.yaml", too.
@@ -55,8 +55,8 @@ def scenario_structure(model: RobotModel) -> Structure:
     """The structure of a scenario's robot.
 
     Raises:
-        AssumptionError: An assumption that it violates.
-        ScenarioError: It starts nowhere near its constraints.
+        AssumptionError: The robot violates an assumption of the theory.
+        ScenarioError: The robot starts nowhere near its constraints.
     """
     try:
         return find_structure(model.dae)

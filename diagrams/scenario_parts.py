@@ -23,18 +23,18 @@ class Written(ABC, Generic[T]):
 
     @abstractmethod
     def made(self, constraints: Sequence[contact.Constraint]) -> T:
-        """What the library holds.
+        """The object that the library holds.
 
         Args:
-            constraints: Those of the scenario, as far as they are made.
+            constraints: The scenario's constraints, as far as they are made.
 
         Raises:
-            ModelError: What does not fit.
+            ModelError: Something does not fit.
         """
 
 
 def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
-    """What the library holds; its own classes are their forms."""
+    """The object that the library holds for a form; its own classes are their own forms."""
     return form.made(constraints) if isinstance(form, Written) else form
 
 
@@ -97,7 +97,7 @@ class ModelForce:
     gain: ClassVar = 0.0
 
     def sensor(self, size: int) -> ForceSensor | None:
-        """None is needed."""
+        """No sensor, since none is needed."""
         return None
 
 
@@ -106,11 +106,11 @@ class MeasuredForce:
     """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
 
     Attributes:
-        time_constant: Of the sensor's lag, in s.
-        sample_period: In s; 0 for none.
-        bias: In N (N m for a moment), one number for all forces or one each.
-        noise_deviation: Likewise.
-        seed: Of the noise.
+        time_constant: The time constant of the sensor's lag, in s; 0 for none.
+        sample_period: The time between samples, in s; 0 for none.
+        bias: A constant error in N (N m for a moment), one number for all forces or one each.
+        noise_deviation: The standard deviation of the noise, likewise.
+        seed: The seed of the noise.
         gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
     """
 
@@ -127,7 +127,7 @@ class MeasuredForce:
             raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
 
     def sensor(self, size: int) -> ForceSensor | None:
-        """The sensor of a number of forces."""
+        """The sensor of m = `size` forces."""
         return ForceSensor(
             size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
         )
@@ -150,7 +150,7 @@ class Poles(PerOutput):
     """`dae.gains.poles`; complex ones are written as Coefficients."""
 
     def design(self) -> GainDesign:
-        """The gains."""
+        """The design of the gains."""
         return poles(self.all or self.outputs)
 
 
@@ -159,7 +159,7 @@ class Coefficients(PerOutput):
     """`dae.gains.gain_coefficients`: K_i1, ..., K_i mu_i."""
 
     def design(self) -> GainDesign:
-        """The gains."""
+        """The design of the gains."""
         return gain_coefficients(self.all or self.outputs)
 
 
@@ -175,13 +175,13 @@ class Matrices:
                 raise GainError(f"groups: the rows of {matrix} have different lengths")
 
     def design(self) -> GainDesign:
-        """The gains."""
+        """The design of the gains."""
         return gain_matrices(*self.groups)
 
 
 @dataclass(frozen=True)
 class Start:
-    """At rest, on the constraint, with given errors of the position outputs.
+    """A start at rest, on the constraints, with given errors of the outputs.
 
     Attributes:
         positions: Joint name -> position near which the robot starts, in rad or m; the robot's

@@ -9,7 +9,7 @@ import yaml  # type: ignore[import-untyped]
 from drake_dae.errors import ScenarioError
 
 TAG = "_tag"
-"""The entry of a mapping that holds its tag."""
+"""The key under which a mapping holds its tag."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -58,11 +58,12 @@ def load_yaml(text: str, name: str) -> Any:
     """YAML as lists, dictionaries and plain values; a tag becomes the entry "_tag".
 
     Args:
-        text: YAML.
-        name: Of the text, for messages.
+        text: A text in YAML.
+        name: What messages call the text.
 
     Raises:
-        ScenarioError: Broken YAML, or a key that is no text or given twice; with the line.
+        ScenarioError: The YAML is broken, or a key is no text or given twice; the message has the
+            line.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -84,12 +85,12 @@ def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
     """Changes plain data by "a.b.0.c=value".
 
     Args:
-        data: Is changed.
-        setting: A dotted key, and YAML.
+        data: Lists and dictionaries; changed in place.
+        setting: A dotted key, "=", and a value in YAML.
         names: Dotted keys of dictionaries whose names may have dots themselves.
 
     Raises:
-        ScenarioError: No such place, or broken YAML.
+        ScenarioError: There is no such place, or the YAML is broken.
     """
     key, separator, text = setting.partition("=")
     parts = key.split(".")

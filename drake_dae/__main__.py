@@ -1,4 +1,4 @@
-"""`python -m drake_dae`."""
+"""The command `drake-dae`, as `python -m drake_dae`."""
 
 import sys
 

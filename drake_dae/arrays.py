@@ -1,4 +1,4 @@
-"""Arrays of numbers, and what everything says of them: checks of arguments, and texts."""
+"""Arrays of numbers: how arguments are checked, and how messages show them."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -19,8 +19,8 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
 
     Args:
         what: How a message calls them.
-        value: Numbers, of any shape.
-        error: What is raised.
+        value: The numbers, in any shape.
+        error: The class of exception to raise.
 
     Raises:
         ModelError: The value holds something else, or rows of different lengths.
@@ -50,7 +50,7 @@ def vector(
 
 
 def check_whole_number(what: str, value: Any, least: int) -> None:
-    """Refuses what is no whole number from a least one.
+    """Refuses what is no whole number that is at least `least`.
 
     Raises:
         ModelError: The value is too small, or no whole number.
@@ -70,10 +70,10 @@ def check_axes(name: str, axes: str) -> None:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """What to say of a name that is not among those that are known.
+    """What a message says of a name that is not among those that are known.
 
     Args:
-        kind: What the name should be of, as in "frame".
+        kind: What the name should belong to, for example "frame".
         name: The one that was given.
         known: Those that would do.
 

@@ -1,4 +1,4 @@
-"""The exception family: every failure says what was wrong, which value, and what to do."""
+"""The exceptions: each says what was wrong, which value, and what to do."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ class ScenarioError(DrakeDaeError, ValueError):
     """A scenario that cannot be used; the message has a line "key: text" for each problem.
 
     Attributes:
-        problems: (dotted key, text) of each; the key is "" where the problem has none.
+        problems: The dotted key and the text of each; the key is "" where a problem has none.
     """
 
     def __init__(self, *problems: tuple[str, str]) -> None:
@@ -40,10 +40,10 @@ class AssumptionError(DrakeDaeError):
     """An assumption of the theory that the system violates.
 
     Attributes:
-        assumption: Number of the assumption in the paper, (1) to (5).
+        assumption: The number of the assumption in the paper, 1 to 5.
         state: A consistent state, shape (n,), where it fails, or None if it fails everywhere.
-        violation: What was found, as a `dae.assumptions.Violation`; None where integrators were
-            looked for and none help.
+        violation: What was found, as a `dae.structure.assumptions.Violation`; None where
+            integrators were sought and none help.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class SimulationError(DrakeDaeError):
 
 
 class SingularityError(SimulationError):
-    """A(x) of (13) or B(x) of (16) lost its rank on the way."""
+    """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank on the way."""
 
 
 class NonFiniteError(SimulationError):

@@ -68,15 +68,16 @@ def from_symbolic(
 
     Args:
         state: The variables x, in order.
-        f, g, h, k, l, m: As in `DaeSystem`: an Expression, Variable or number, or a list or array
-            of these, of lists for a matrix, row by row. Without constraints leave out g, k and m.
+        f, g, h, k, l, m: The functions of (1)-(3): an Expression, Variable or number, or a list or
+            array of these, of lists for a matrix, row by row. Without constraints leave out g, k
+            and m.
         parameters: Variable -> default.
         labels: The remaining fields of `DaeSystem`; the states are named as their variables.
 
     Raises:
-        ModelError: As `DaeSystem`; a variable that is neither a state nor a parameter; or an
-            expression that is not smooth, such as abs, or not known, such as an uninterpreted
-            function.
+        ModelError: A variable is neither a state nor a parameter; an expression is not smooth, such
+            as abs, or not known, such as an uninterpreted function; or the functions make no
+            system, see `DaeSystem`.
     """
     owner = labels.get("name", "system")
     if isinstance(state, Variable):
@@ -128,7 +129,7 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX]) -> ca.SX:
         symbols: Variable.get_id() -> what stands for it.
 
     Raises:
-        ModelError: A variable without symbol, or a function that is not smooth or not known.
+        ModelError: A variable has no symbol, or a function is not smooth or not known.
     """
     if isinstance(expression, Variable):
         if expression.get_id() not in symbols:

@@ -310,6 +310,7 @@ def test_the_reason_of_a_failure_is_printed_too_when_files_fail(tmp_path, monkey
     assert "cannot go on at t = 0.1" in second
 
 
+@pytest.mark.slow
 def test_a_terminal_without_letters_of_a_name(tmp_path):
     out = tmp_path / "größe \N{SNOWMAN}"
     process = command(

@@ -107,6 +107,7 @@ def check(sent, code, folder, undisturbed, complete=FILES):
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("always")
 def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
     moments = [(sent, 0.7 * SECONDS) for sent in (signal.SIGKILL, *ENDING_SIGNALS)]

@@ -37,7 +37,7 @@ STATEMENTS = (
     "u acts on z_i first in derivative mu_i",
     "B(x) has rank p, so u can steer all outputs",
 )
-"""Assumptions (1) to (5) in a line each."""
+"""What Assumptions (1) to (5) ask for, in a line each."""
 
 
 def analyze(
@@ -61,27 +61,27 @@ def analyze(
     There is no proof that none was missed.
 
     Args:
-        system: (1)-(3).
+        system: The system (1)-(3).
         region: State name -> (lowest, highest); other states are drawn around the nominal one.
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
             few others close to the first: what is zero at one state alone is not zero.
-        reference: t -> R(t), output-major as for `TrackingLaw`; the margins are also taken along
+        reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
             the motion that it commands, and the zero dynamics judged at its first outputs.
-        times: In s, increasing, shape (k,); where on the reference.
+        times: Times in s at which the reference is examined, increasing, shape (k,).
         start: State near which the motion along the reference starts, shape (n,); the first
             examined state if None; only with a reference.
         count: How many random states are drawn.
-        seed: Of the random numbers.
+        seed: The seed of the random numbers.
 
     Returns:
         The report. An assumption that is violated is part of it, with what is known before.
 
     Raises:
-        InconsistentStateError: No consistent state in the region or around the nominal state, or
-            given states that are not consistent.
-        ModelError: Arguments that make no sense, such as a reference whose derivatives are not
-            those of its values; a system without controls, with a function that
-            is not finite, or a mass matrix that is not symmetric and positive definite.
+        InconsistentStateError: There is no consistent state in the region or around the nominal
+            state, or given states are not consistent.
+        ModelError: Arguments make no sense, such as a reference whose derivatives are not those of
+            its values; or the system has no controls, a function that is not finite, or a mass
+            matrix that is not symmetric and positive definite.
     """
     check_is_system(system, "analyze")
     if region is not None and states is not None:
@@ -145,7 +145,7 @@ def analyze(
 
 
 def _examine(constrained: Constrained, samples: Samples, where: str, search: bool) -> Analysis:
-    """From the constraints on, with margins at given samples; without the zero dynamics."""
+    """All but the zero dynamics and the reference, with margins at given samples."""
     system, elimination = samples.system, constrained.elimination
     known: dict[str, Any] = {"constraint_degrees": constrained.degrees}
     margins: dict[int, Margin] = {}
@@ -190,7 +190,7 @@ def _assumptions(
     violations: Sequence[Violation],
     margins: Mapping[int, Margin] | None = None,
 ) -> tuple[Assumption, ...]:
-    """(1), ..., (5); what is neither satisfied nor violated was not examined."""
+    """Assumptions (1)-(5); one that is neither satisfied nor violated was not examined."""
     violated = {violation.assumption: violation for violation in violations}
     before = f"Assumption ({violations[0].assumption}) is violated" if violations else ""
     result = []

@@ -14,21 +14,21 @@ from drake_dae.dae.system import DaeSystem, usual_spread
 from drake_dae.errors import InconsistentStateError, ModelError
 
 Bounds = Mapping[str, tuple[float, float]]
-"""State name -> (lowest, highest)."""
+"""A region: state name -> (lowest, highest)."""
 
 _NEIGHBOURS = 5
-"""Beside states that are given, where the first of them may have a zero that others have not."""
+"""How many states are added close to the first given one, which may be a zero of a function."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExaminedStates:
-    """What an analysis starts from.
+    """The states that an analysis starts from.
 
     Attributes:
-        guesses: States near which consistent ones are looked for, shape (count, n).
+        guesses: States near which consistent ones are sought, shape (count, n).
         num_given: How many of them, the first ones, were given as they are; 0 if they were drawn.
-        bounds: What region was asked for; empty if none was.
-        region: The same as a box; None if none was.
+        bounds: The region that was asked for; empty if none was.
+        region: The same region as a box; None if none was asked for.
     """
 
     guesses: FloatArray
@@ -43,7 +43,7 @@ class ExaminedStates:
         """The nominal state first, then random ones, in a region or around the nominal one.
 
         Raises:
-            ModelError: A region that is none.
+            ModelError: A name is that of no state, or an interval is no two finite ordered numbers.
         """
         nominal = system.nominal_state
         drawn = nominal + system.nominal_spread * random.standard_normal((count, nominal.size))
@@ -63,7 +63,7 @@ class ExaminedStates:
         """The given states, and a few close to the first: what is zero at one alone is not zero.
 
         Raises:
-            ModelError: Not finite numbers of shape (k, n).
+            ModelError: The states are not finite numbers of shape (k, n).
         """
         given = numbers(f"{system.name}: states", states)
         shape = (len(given) if given.ndim else 0, system.num_states)
@@ -99,11 +99,12 @@ def check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) -
 
     Args:
         manifold: N*.
-        given: Shape (k, n).
+        given: The given states, shape (k, n).
         taken: Those that were found consistent and inside the domain, shape (l, n).
 
     Raises:
-        InconsistentStateError, ModelError: Which one, and why.
+        InconsistentStateError: A state is not consistent; the message tells which, and why.
+        ModelError: A state is outside the domain.
     """
     name = manifold.system.name
     for number, state in enumerate(given):

@@ -29,11 +29,11 @@ class Assumption:
     """One of Assumptions (1)-(5) and what was found of it.
 
     Attributes:
-        number: In the paper.
+        number: Its number in the paper.
         statement: What it asks for.
         finding: Whether it holds at the examined states and between them.
-        margin: Of A(x) for (2), of B(x) for (5), or for (1) and (4) where a row of these vanishes;
-            else None.
+        margin: The margin of A(x) for (2), and of B(x) for (5); for (1) and (4) where a row of
+            these vanishes; else None.
         reason: How it is violated and what to change, or why it was not examined; else empty.
         violation: The same as data; None if it is not violated.
     """
@@ -64,15 +64,16 @@ class Findings:
         system: The system.
         where: Which states were examined, in words.
         states: The states, consistent where the constraints have degrees, shape (samples, n).
-        assumptions: (1), ..., (5).
+        assumptions: Assumptions (1), ..., (5), in this order.
         constraint_degrees: r_1, ..., r_m.
         output_degrees: mu_1, ..., mu_p in the order of the system's outputs.
         independence: Margin of the gradients of all chains, which are linearly independent by
             Theorem 2.1; None also where there are no chains.
         zero_dynamics: Assumption 2.2, by linearization at an equilibrium.
-        motion: Along the reference; None also without one.
-        structure: For laws and blocks; None where A(x) or B(x) is singular at an examined state
-            itself. One that is singular only between them violates its assumption, no more.
+        motion: The motion along the reference; None also without one.
+        structure: The structure, for laws and blocks; None where A(x) or B(x) is singular at an
+            examined state itself. One that is singular only between them violates its assumption,
+            no more.
     """
 
     system: DaeSystem
@@ -108,13 +109,13 @@ class Findings:
 
     @property
     def manifold_dimension(self) -> int | None:
-        """dim N* = n - sum r_i, Theorem 1.1."""
+        """The dimension of N*, n - sum r_i, Theorem 1.1."""
         degrees = self._degrees_of_manifold
         return None if degrees is None else self.system.num_states - sum(degrees)
 
     @property
     def zero_dynamics_dimension(self) -> int | None:
-        """dim xi of (22): n - sum r_i - sum mu_i."""
+        """The dimension of xi in (22), n - sum r_i - sum mu_i."""
         known, degrees = self.manifold_dimension, self.output_degrees
         return None if known is None or degrees is None else known - sum(degrees)
 

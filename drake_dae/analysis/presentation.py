@@ -15,7 +15,7 @@ from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 
 def as_dict(findings: Findings) -> dict[str, Any]:
-    """What is printed as plain numbers, lists and texts, with the states of the margins."""
+    """What is printed, as plain numbers, lists and texts, with the states of the margins."""
     system = findings.system
     zero, motion = findings.zero_dynamics, findings.motion
     return {
@@ -60,7 +60,7 @@ def as_dict(findings: Findings) -> dict[str, Any]:
 
 
 def parts_of(findings: Findings) -> list[Part]:
-    """Paragraphs and tables, without the problems."""
+    """The paragraphs and tables of the findings, without the problems."""
     system = findings.system
     counts = (
         count_of(system.num_states, "state"),
@@ -205,7 +205,7 @@ def _worst(motion: PinnedMotion) -> dict[str, tuple[float, float]]:
 
 
 def _complex(values: ComplexArray) -> str:
-    """A conjugate pair as one."""
+    """Eigenvalues in words; a conjugate pair is one."""
     size = np.abs(values).max(initial=0.0)
     texts = []
     for value in values:

@@ -20,10 +20,10 @@ def check_reference(
     other, as at a kink of the highest derivative, nothing is said.
 
     Args:
-        system: (1)-(3).
+        system: The system (1)-(3).
         layout: How R(t) is stacked.
-        reference: t -> R(t).
-        times: In s, shape (k,); where on the reference.
+        reference: The function t -> R(t).
+        times: Times in s, shape (k,), between the first and last of which it is checked.
 
     Raises:
         ModelError: The size is wrong, or an entry is not the derivative of the one before.

@@ -20,17 +20,17 @@ class Analysis(Findings):
         return to_text([*self.parts(), *([problem] for problem in self.problems)])
 
     def to_markdown(self) -> str:
-        """The same with Markdown tables."""
+        """The report with Markdown tables."""
         return to_markdown([*self.parts(), *([problem] for problem in self.problems)])
 
     def _repr_markdown_(self) -> str:
-        """For notebooks."""
+        """What notebooks show."""
         return self.to_markdown()
 
     def to_dict(self) -> dict[str, Any]:
-        """What is printed as plain numbers, lists and texts, with the states of the margins."""
+        """The report as plain numbers, lists and texts, with the states of the margins."""
         return as_dict(self)
 
     def parts(self) -> list[Part]:
-        """Paragraphs and tables, without the problems."""
+        """The report's paragraphs and tables, without the problems."""
         return parts_of(self)

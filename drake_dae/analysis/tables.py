@@ -8,7 +8,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 
 _WIDTH = 100
-"""Of a paragraph, in characters."""
+"""The width of a paragraph, in characters."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Table:
 
     Attributes:
         head: A title per column.
-        rows: As many texts each.
+        rows: As many texts in each row.
         left: How many columns begin at the left.
     """
 
@@ -29,7 +29,7 @@ class Table:
         return column < self.left or not self.head[column]
 
     def lines(self) -> list[str]:
-        """Columns as wide as they must be."""
+        """The lines of the table, with columns as wide as they must be."""
         rows = [self.head, *self.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
         return [
@@ -44,14 +44,14 @@ class Table:
         return "\n".join(self.lines())
 
     def to_markdown(self) -> str:
-        """For notebooks and GitHub."""
+        """The table in Markdown, for notebooks and GitHub."""
         marks = [":--" if self._is_left(i) else "--:" for i in range(len(self.head))]
         rows = [self.head, marks, *self.rows]
         return "\n".join("| " + " | ".join(t.replace("|", "\\|") for t in r) + " |" for r in rows)
 
 
 def digits(value: float) -> str:
-    """Four digits; what is only round-off of numbers that people use is 0."""
+    """A number with four digits; what is only round-off of numbers that people use is 0."""
     return f"{value:.4g}" if abs(value) > 1e-12 else "0"
 
 
@@ -60,7 +60,7 @@ Part = Table | Sequence[str]
 
 
 def to_text(parts: Sequence[Part]) -> str:
-    """One below the other; long lines of paragraphs are wrapped."""
+    """The parts below each other as plain text; long lines of paragraphs are wrapped."""
 
     def text(part: Part) -> str:
         if isinstance(part, Table):
@@ -73,14 +73,14 @@ def to_text(parts: Sequence[Part]) -> str:
 
 
 def to_markdown(parts: Sequence[Part]) -> str:
-    """One below the other."""
+    """The parts below each other in Markdown."""
     return "\n\n".join(
         part.to_markdown() if isinstance(part, Table) else "  \n".join(part) for part in parts
     )
 
 
 def count_of(number: int, noun: str) -> str:
-    """As in 1 state, 2 states."""
+    """A number with its noun, as in "1 state" and "2 states"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 

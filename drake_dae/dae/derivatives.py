@@ -27,14 +27,14 @@ class Derivatives:
     """The motion of a system on N* and its time derivatives, the control held constant.
 
     Args:
-        system: (1)-(3).
-        constraint: c = (L_f^(r_1 - 1) k_1, ..., L_f^(r_m - 1) k_m), shape (m, 1).
+        system: The system (1)-(3).
+        constraint: The column c = (L_f^(r_1 - 1) k_1, ..., L_f^(r_m - 1) k_m), shape (m, 1).
 
     Attributes:
-        control: The symbol u, shape (p, 1).
+        control: The symbols u, shape (p, 1).
         constraint_gradient: dc/dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        pivot: 0 exactly where A(x) is singular; see `trace.factorization`.
+        pivot: A scalar that is 0 exactly where A(x) is singular; see `trace.factorization`.
     """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX) -> None:
@@ -53,7 +53,7 @@ class Derivatives:
             and mass[i, i].is_one()
         ]
         self._rows = [i for i in range(system.num_states) if i not in plain]
-        force = g[self._rows, :]
+        g_rows = g[self._rows, :]
         self.constraint_gradient = ca.jacobian(constraint, x)
         self._symbols: list[ca.SX] = [x]
         self._rates: list[ca.SX] = []
@@ -64,17 +64,17 @@ class Derivatives:
         self._rates.append(rate)
         self._symbols.append(first)
         #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
-        self.constraint_input = first[len(self._rows) :, :]  # Of a scalar [1:] would be a row.
+        self.constraint_input = first[len(self._rows) :, :]  # A slice [1:] of a scalar is a row.
         balance, self._constraint_rate = self._first_order(constraint)
         self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
-        if _agree(system, gradient, force):
-            gradient = force
+        if _agree(system, gradient, g_rows):
+            gradient = g_rows
         self._matrix = ca.blockcat(
-            mass[self._rows, self._rows], -force, gradient.T, ca.SX(force.shape[1], force.shape[1])
+            mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
         )
         self._unknowns, self.constraint_matrix, self.pivot = _solver(
-            mass[self._rows, self._rows], force, gradient
+            mass[self._rows, self._rows], g_rows, gradient
         )
         self._equations: list[ca.SX] = []
         self._solve_order()
@@ -85,13 +85,13 @@ class Derivatives:
         return self._rates[0]
 
     def derivative(self, expression: ca.SX) -> ca.SX:
-        """The time derivative of an expression of the state and of this motion's unknowns.
+        """The time derivative of an expression along the motion.
 
         Args:
-            expression: Shape (k, 1).
+            expression: Of the state and of the unknowns, shape (k, 1).
 
         Returns:
-            Shape (k, 1), in terms of the state and of unknowns; see `expand`.
+            The derivative in terms of the state and of unknowns, shape (k, 1); see `expand`.
         """
         if ca.depends_on(expression, self._symbols[-1]):
             self._add_order()
@@ -102,7 +102,7 @@ class Derivatives:
         return self._inline(expression, len(self._values))
 
     def has_unknowns(self, expression: ca.SX) -> bool:
-        """Whether an expression holds unknowns, which A(x) must be regular for."""
+        """Whether an expression holds unknowns, so that A(x) must be regular for it."""
         return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
 
     def inverse(self, expression: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX] | None:
@@ -114,8 +114,8 @@ class Derivatives:
         it is inverse dynamics.
 
         Args:
-            expression: Shape (p, 1), in terms of the state and of this motion's unknowns.
-            wanted: Shape (p, 1).
+            expression: Of the state and of the unknowns, shape (p, 1).
+            wanted: The wanted values, shape (p, 1).
 
         Returns:
             u in terms of the state, shape (p, 1), and a scalar that is 0 exactly where it is not
@@ -158,7 +158,7 @@ class Derivatives:
         return found[0], found[1]
 
     def _slopes(self, expression: ca.SX, orders: int, moved: Sequence[bool]) -> ca.SX:
-        """The derivatives of the equations of some orders, and of an expression, by what moves."""
+        """The derivatives of equations of some orders, and of an expression, by what moves."""
         rows = [*self._equations[:orders], expression]
         blocks = []
         for k, row in enumerate(rows):
@@ -211,7 +211,7 @@ class Derivatives:
         self._solve_order()
 
     def _solve_order(self) -> None:
-        """The newest unknowns enter residual and constraint rate linearly: solve for them."""
+        """Solves for the newest unknowns, which enter the balance and constraint rate linearly."""
         newest = self._symbols[-1]
         self._equations.append(ca.vertcat(self._balance, self._constraint_rate))
         known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
@@ -220,7 +220,7 @@ class Derivatives:
         self._values.append(ca.densify(self._inline(solution, len(self._values))))
 
     def _inline(self, expression: ca.SX, orders: int) -> ca.SX:
-        """Puts the values of the first `orders` unknowns in."""
+        """An expression with the values of the first `orders` unknowns put in."""
         return (
             ca.substitute(
                 expression,
@@ -270,17 +270,17 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
 
 
 def _solver(
-    mass: ca.SX, force: ca.SX, gradient: ca.SX
+    mass: ca.SX, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
-    """Solves [[E, -g], [dc/dx, 0]] (w, v) = -(residual, rate), from E, g and (dc/dx)^T.
+    """A solver of [[E, -g], [dc/dx, 0]] (w, v) = -(balance, rate), from E, g and (dc/dx)^T.
 
     Returns:
         The solver, A(x), and a scalar that is 0 exactly where A is singular.
     """
     inertia = PositiveDefiniteFactorization(mass)
-    half = inertia.forward(force)
+    half = inertia.forward(g)
     coupling: Factorization | PositiveDefiniteFactorization
-    if gradient is force:  # A = g^T E^-1 g, as J M^-1 J^T
+    if gradient is g:  # A = g^T E^-1 g, as J M^-1 J^T
         other = ca.sparsify(inertia.scaled(half))
         matrix = ca.sparsify(ca.tril2symm(ca.tril(ca.mtimes(other.T, half))))
         coupling = PositiveDefiniteFactorization(matrix)
@@ -289,9 +289,9 @@ def _solver(
         matrix = ca.sparsify(ca.mtimes(other.T, half))
         coupling = Factorization(matrix)
 
-    def solve(residual: ca.SX, rate: ca.SX) -> ca.SX:
-        free = inertia.forward(-residual)
-        multiplier = coupling.solve(-rate - ca.mtimes(other.T, free))
-        return ca.vertcat(inertia.backward(free + ca.mtimes(half, multiplier)), multiplier)
+    def solve(balance: ca.SX, rate: ca.SX) -> ca.SX:
+        free = inertia.forward(-balance)
+        v = coupling.solve(-rate - ca.mtimes(other.T, free))
+        return ca.vertcat(inertia.backward(free + ca.mtimes(half, v)), v)
 
     return solve, matrix, coupling.pivot

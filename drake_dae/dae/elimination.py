@@ -1,4 +1,4 @@
-"""The constraint inputs eliminated: v = alpha + beta u, and the system that remains.   (9)-(14)"""
+"""The constraint inputs eliminated: v = alpha + beta u, and the system that remains.  (9)-(14)"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ class Elimination:
         x' = f* + h* u,    z = l* + n* u.
 
     Attributes:
-        constraint_gradient: d L_f^(r_i - 1) k_i / dx, shape (m, n).
+        constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        alpha: (13), shape (m, 1).
-        beta: (14), shape (m, p).
+        alpha: v where u = 0, equation (13), shape (m, 1).
+        beta: How u enters v, equation (14), shape (m, p).
         f_star: f + g alpha (9), shape (n, 1).
         h_star: h + g beta (10), shape (n, p).
         l_star: l + m alpha (11), shape (p, 1).
         n_star: m beta (12), shape (p, p).
-        pivot: 0 exactly where A(x) is singular; see `trace.factorization`.
+        pivot: A scalar that is 0 exactly where A(x) is singular; see `trace.factorization`.
     """
 
     constraint_gradient: ca.SX
@@ -43,7 +43,7 @@ class Elimination:
 
 
 def eliminate(derivatives: Derivatives) -> Elimination:
-    """What remains of a system on N*, which is affine in the control, by its own equations."""
+    """Reads (9)-(14) off the derivatives on N*, which are affine in the control."""
     system, control = derivatives.system, derivatives.control
     alpha, beta = affine(derivatives.expand(derivatives.constraint_input), control)
     f_star, h_star = affine(derivatives.expand(derivatives.rate), control)
@@ -73,7 +73,7 @@ def eliminate_numbers(
 
     Args:
         fields: g, h and m of the system with E = 1, by letter.
-        constraint_gradient: d L_f^(r_i - 1) k_i / dx, shape (m, n).
+        constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
         constraint_matrix: A, shape (m, m).
         scale: How large each state is, shape (n,).
     """

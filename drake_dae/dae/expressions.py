@@ -1,4 +1,4 @@
-"""What users give as expressions, names and functions, and what is said of it.
+"""What users give as expressions, names and functions: converted and checked.
 
 CasADi's own messages tell neither which function of (1)-(3) was wrong nor what would be right.
 """
@@ -25,7 +25,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
         value: A list of lists is a matrix, row by row.
 
     Raises:
-        ModelError: The value is nothing of these.
+        ModelError: The value is none of these.
     """
     if isinstance(value, ca.MX):
         raise ModelError(f"{owner}: {key} is a CasADi MX; use SX symbols and expressions")
@@ -50,13 +50,13 @@ def as_functions(
 
     Args:
         owner: The name of the system, for messages.
-        given: Letter -> what `as_expression` takes.
+        given: Name of a function -> what `as_expression` takes.
         state: x, shape (n, 1).
         parameters: The symbols of all parameters, below each other.
 
     Raises:
-        ModelError: A shape that does not fit, a symbol that is neither state nor parameter, a
-            constant that is not finite, or a function that is not smooth in the state.
+        ModelError: A shape does not fit, a symbol is neither state nor parameter, a constant is
+            not finite, or a function is not smooth in the state.
     """
     values = {key: as_expression(owner, key, value) for key, value in given.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
@@ -117,7 +117,7 @@ def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
     """Refuses names that stand twice.
 
     Raises:
-        ModelError: Which names do.
+        ModelError: A name stands twice.
     """
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
@@ -171,7 +171,7 @@ def call(
 
 
 def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
-    """What a function's own error means here."""
+    """The text of an error in a user's function, and what it means here."""
     text = str(error)
     try:
         signature(function).bind(*arguments)

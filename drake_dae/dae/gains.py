@@ -31,7 +31,7 @@ class FeedbackGains:
         matrix: K, shape (p, N); rows of outputs with degree 0 are zero.
 
     Raises:
-        GainError: A wrong shape, or error dynamics that are not Hurwitz (32).
+        GainError: The shape is wrong, or the error dynamics are not Hurwitz (32).
     """
 
     names: tuple[str, ...]
@@ -78,21 +78,21 @@ class FeedbackGains:
 
     @property
     def poles(self) -> np.typing.NDArray[np.complex128]:
-        """Eigenvalues of E in 1/s, shape (N,)."""
+        """The poles of the errors, the eigenvalues of E, in 1/s, shape (N,)."""
         return np.linalg.eigvals(self.error_matrix).astype(complex)
 
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
         """The exact tracking error exp(E t) e(0) of (30), (31).
 
         Args:
-            times: In s after the start, shape (k,).
+            times: Times in s after the start, shape (k,).
             initial: Error coordinates at the start, shape (N,).
 
         Returns:
-            Error of each output, shape (k, p).
+            The error of each output, shape (k, p).
 
         Raises:
-            GainError: A wrong number of error coordinates.
+            GainError: The number of error coordinates is wrong.
         """
         moments = np.atleast_1d(np.asarray(times, dtype=float))
         coordinates = np.asarray(initial, dtype=float)
@@ -218,7 +218,7 @@ T = TypeVar("T")
 def _per_output(
     values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
 ) -> list[tuple[str, int, T]]:
-    """(name, degree, what was given for it) of each output with a degree above 0."""
+    """The name, the degree and what was given of each output with a degree above 0."""
     dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
     if not isinstance(values, Mapping):
         return [(name, degree, values) for name, degree in dynamic]

@@ -32,12 +32,12 @@ class Layout:
 
     @property
     def chain_size(self) -> int:
-        """sum mu_i."""
+        """The size of a chain, sum mu_i."""
         return sum(self.degrees)
 
     @property
     def reference_size(self) -> int:
-        """sum (mu_i + 1)."""
+        """The size of a reference, sum (mu_i + 1)."""
         return sum(self.degrees) + len(self.degrees)
 
     @cached_property
@@ -52,7 +52,7 @@ class Layout:
 
     @cached_property
     def chained(self) -> Indices:
-        """Where a reference has what belongs to each element of a chain, shape (sum mu_i,)."""
+        """Where a reference holds the goal of each element of a chain, shape (sum mu_i,)."""
         return np.setdiff1d(np.arange(self.reference_size), self.highest)
 
     @cached_property
@@ -110,11 +110,11 @@ class Layout:
         )
 
     def values(self, reference: ArrayLike) -> FloatArray:
-        """r_1, ..., r_p of a reference, shape (p,)."""
+        """The values r_1, ..., r_p of a reference, shape (p,)."""
         return np.asarray(reference, dtype=float).reshape(-1)[self.lowest]
 
     def constant(self, values: ArrayLike) -> FloatArray:
-        """The reference that stays at given values, shape (p,)."""
+        """The reference that stays at given values of shape (p,)."""
         reference = np.zeros(self.reference_size)
         reference[self.lowest] = values
         return reference

@@ -11,6 +11,7 @@ from drake_dae.dae.layout import Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import Linearization, are_dependent, newton, shortest_steps
+from drake_dae.trace.round_off import positive
 
 CONSISTENT = 1e-8
 """A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
@@ -24,8 +25,8 @@ class Manifold:
     """N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m}, equation (4).
 
     Args:
-        system: (1)-(3).
-        chains: Per constraint k_i, L_f k_i, ..., L_f^(r_i - 1) k_i.
+        system: The system (1)-(3).
+        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
 
     Attributes:
         residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
@@ -51,7 +52,7 @@ class Manifold:
 
     @property
     def dimension(self) -> int:
-        """n - (r_1 + ... + r_m), Theorem 1.1."""
+        """The dimension of N*, n - (r_1 + ... + r_m), Theorem 1.1."""
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
@@ -74,7 +75,7 @@ class Manifold:
         The arguments are those of `residual`.
         """
         p = self.system.parameter_vector(parameters)
-        residual, (step,) = self._residual(state, p)[0], self._newton(state, state, p)
+        (residual,), (step,) = self._residual(state, p), self._newton(state, state, p)
         reach = float(np.linalg.norm(step))
         # A step of exactly zero with something left: no state changes it.
         if np.isfinite(reach) and (reach > 0.0 or not residual.any()):
@@ -85,15 +86,15 @@ class Manifold:
         """The consistent state next to a given one, to round-off, by Newton's method.
 
         Args:
-            state: Shape (n,), near N*.
+            state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            Shape (n,).
+            The consistent state, shape (n,).
 
         Raises:
             InconsistentStateError: Newton's method does not reach N* from there.
-            ModelError: A wrong shape.
+            ModelError: The state has a wrong shape.
         """
         p = self.system.parameter_vector(parameters)
         start = numbers(f"{self.system.name}: a state", state).reshape(-1)
@@ -104,12 +105,14 @@ class Manifold:
             )
         found, converged = newton(start, lambda x: self._linearize(x, p))
         if not converged:
-            # Where gradients depend on each other, QR gives no step, but least squares do.
-            found, converged = newton(found, lambda x: self._least_squares(x, p))
+            # Gradients that depend on each other, or steps that mislead: least squares, downhill.
+            found, converged = newton(start, lambda x: self._downhill(x, p))
+        if converged and found is not start:
+            return found
         residual = self._residual.evaluate(found, p)[0].copy()
+        # Else it is round-off, in units in which that is much, or no state changes what is left.
         if np.linalg.norm(residual) <= CONSISTENT:
             return found
-        # Round-off, in units in which that is much; unless no state changes what is left.
         if converged and self._newton.evaluate(found, found, p)[0].any():
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
@@ -120,12 +123,22 @@ class Manifold:
             lambda x: self._newton.evaluate(x, state, parameters)[0].copy(), is_regular=True
         )
 
-    def _least_squares(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
+        """Steps of least squares that make the residual smaller, its rows scaled to length one."""
         gradients = self.gradients(state, parameters)
-        return shortest_steps(gradients, lambda x: self._residual(x, parameters)[0])
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(x: FloatArray) -> FloatArray:
+            return self._residual(x, parameters)[0]
+
+        def measure(x: FloatArray) -> float:
+            return float(np.linalg.norm(residual(x) / length))
+
+        steps = shortest_steps(gradients, residual)
+        return None if steps is None else steps._replace(measure=measure)
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
-        """What a Newton iteration that ended at a state failed on."""
+        """Why a Newton iteration that ended at a state failed, in words."""
         name = self.system.name
         values = zip(self.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]

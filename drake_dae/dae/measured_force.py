@@ -24,7 +24,7 @@ class MeasuredForce:
         layout: How references and chains are stacked.
         inputs: Output index i -> constraint input index j.
         gain: Gbar, shape (m, m), positive semidefinite.
-        symbol: v, shape (m, 1).
+        symbol: The symbols v of the measurement, shape (m, 1).
     """
 
     layout: Layout
@@ -37,12 +37,12 @@ class MeasuredForce:
         """The measurement of all constraint inputs of a system.
 
         Args:
-            system: (1)-(3).
-            layout: Of its references and chains.
+            system: The system (1)-(3).
+            layout: How its references and chains are stacked.
             gain: Gbar, a number or shape (m, m).
 
         Raises:
-            GainError: A gain that is not positive semidefinite, or for an output with mu_i >= 1.
+            GainError: The gain is not positive semidefinite, or is for an output with mu_i >= 1.
             ModelError: No output is a constraint input.
         """
         inputs = _force_outputs(system)
@@ -60,7 +60,7 @@ class MeasuredForce:
         """The output chains with the measurement in place of the model's l*_i.
 
         Args:
-            chain: The model's, shape (sum mu_i, 1).
+            chain: The output chains by the model, shape (sum mu_i, 1).
         """
         result = ca.SX(chain)
         for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
@@ -89,11 +89,11 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
     """Gbar of (59) as a matrix of shape (m, m).
 
     Args:
-        value: A number for all, or the matrix.
-        size: m.
+        value: A number for all forces, or the matrix.
+        size: The number of forces, m.
 
     Raises:
-        GainError: A wrong shape, or a matrix that is not positive semidefinite.
+        GainError: The shape is wrong, or the matrix is not positive semidefinite.
     """
     gain = numbers("force_gain", value, GainError)
     if gain.ndim == 0:
@@ -110,7 +110,7 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
 
 
 def _force_outputs(system: DaeSystem) -> dict[int, int]:
-    """Output index -> constraint input index, for the outputs z_i = v_j."""
+    """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
     found = {}
     for i in range(system.num_controls):
         row = ca.sparsify(system.m[i, :])

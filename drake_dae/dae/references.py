@@ -43,17 +43,17 @@ class Reference(ABC):
         """Prepares r_1, r_1', ..., r_1^(mu_1), r_2, ... as a function of the time in s.
 
         Args:
-            degrees: mu of each covered output.
+            degrees: The degree mu of each covered output.
 
         Raises:
             ReferenceSignalError: The reference is not smooth enough for these degrees.
         """
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        """The same at a symbolic time, shape (sum (mu_i + 1), 1); None if it is no expression.
+        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None if they are no expression.
 
         Raises:
-            ReferenceSignalError: As `derivatives`.
+            ReferenceSignalError: The reference is not smooth enough for these degrees.
         """
         return None
 
@@ -93,13 +93,13 @@ class _Expression(Reference):
 
 @dataclass(frozen=True)
 class ConstantReference(_Expression):
-    """Stays at given values.
+    """A reference that stays at given values.
 
     Attributes:
-        values: In the outputs' units, shape (k,), or one number.
+        values: The values in the outputs' units, shape (k,), or one number.
 
     Raises:
-        ReferenceSignalError: They are not finite numbers, or there are none.
+        ReferenceSignalError: The values are not finite numbers, or there are none.
     """
 
     values: ArrayLike
@@ -120,13 +120,13 @@ class SinusoidReference(_Expression):
     """The sum r(t) = offset + sum_i amplitude_i sin(frequency_i t + phase_i), for one output.
 
     Attributes:
-        offset: In the output's unit.
-        amplitudes: In the output's unit, shape (k,); as the others, or one number for all.
-        frequencies: In rad/s, likewise.
-        phases: In rad, likewise.
+        offset: The mean, in the output's unit.
+        amplitudes: The amplitudes in the output's unit, shape (k,), or one number for all.
+        frequencies: The frequencies in rad/s, likewise.
+        phases: The phases at t = 0 in rad, likewise.
 
     Raises:
-        ReferenceSignalError: What is not finite, or shapes that do not fit.
+        ReferenceSignalError: A number is not finite, or shapes do not fit.
     """
 
     offset: float
@@ -154,14 +154,14 @@ class PointToPointReference(_Expression):
     order 2 is the quintic.
 
     Attributes:
-        start: In the outputs' units, shape (k,), or one number for all.
-        end: Likewise.
-        start_time: In s.
-        end_time: In s.
+        start: The values before, in the outputs' units, shape (k,), or one number for all.
+        end: The values after, likewise.
+        start_time: When the move begins, in s.
+        end_time: When the move ends, in s.
         order: How many derivatives are continuous, from 0 to 30; at least mu of the outputs.
 
     Raises:
-        ReferenceSignalError: What is not finite, or shapes or times that do not fit.
+        ReferenceSignalError: A number is not finite, or shapes or times do not fit.
     """
 
     start: ArrayLike
@@ -203,15 +203,15 @@ class PointToPointReference(_Expression):
 
 @dataclass(frozen=True, eq=False)
 class ExpressionReference(_Expression):
-    """Any CasADi expression of time.
+    """A reference that is any CasADi expression of time.
 
     Attributes:
         function: Takes the time in s, a CasADi scalar; returns an expression, or a list of these.
 
     Raises:
-        ReferenceSignalError: What it returns is no such expression; at preparation, for an output
-            with mu_i >= 1: a constant that is not finite, or an operation on time that is not
-            smooth, such as fabs.
+        ReferenceSignalError: The function returns no such expression; or, when `derivatives` is
+            called with mu_i >= 1, the expression has a constant that is not finite, or an
+            operation on time that is not smooth, such as fabs.
     """
 
     function: Callable[[ca.SX], Any]
@@ -278,11 +278,11 @@ def stack_references(
     """All references as one function of the time in s; expressions are traced together.
 
     Args:
-        references: One below the other.
-        degrees: mu of all covered outputs.
+        references: The references, in the order of the outputs.
+        degrees: The degrees mu_1, ..., mu_p of all outputs.
 
     Raises:
-        ReferenceSignalError: A reference that is not smooth enough.
+        ReferenceSignalError: A reference is not smooth enough.
     """
     ends = np.cumsum([0, *[reference.size for reference in references]])
     parts = list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))

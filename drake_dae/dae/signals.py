@@ -16,8 +16,8 @@ class Signal:
     """A scalar of a vector signal.
 
     Attributes:
-        name: Unique in its vector.
-        unit: SI unit as text, "" for a pure number.
+        name: Its name, unique in its vector.
+        unit: Its SI unit as text, "" for a pure number.
     """
 
     name: str
@@ -36,15 +36,15 @@ class Parameter:
     """A number, or a vector of numbers, that a study changes without tracing again.
 
     Attributes:
-        name: Unique in its system, for example "link1.mass".
+        name: Its name, unique in its system, for example "link1.mass".
         value: The default, shape (k,); a float is taken as shape (1,).
-        unit: SI unit as text.
+        unit: Its SI unit as text, "" for a pure number.
         positive: Whether only positive numbers make sense, as for a mass.
         symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
             not given.
 
     Raises:
-        ModelError: A value that is not finite, or a symbol that does not fit it.
+        ModelError: The value is not finite, or the symbol does not fit it.
     """
 
     name: str
@@ -71,10 +71,10 @@ class Parameter:
             )
 
     def check(self, value: FloatArray) -> None:
-        """Refuses numbers that make no sense.
+        """Refuses values that make no sense for the parameter.
 
         Raises:
-            ModelError: One is not finite, or not positive where it must be.
+            ModelError: A number is not finite, or not positive where it must be.
         """
         if not np.all(np.isfinite(value)):
             raise ModelError(f"parameter '{self.name}' must be finite, got {value}")

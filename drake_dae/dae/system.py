@@ -32,28 +32,28 @@ class DaeSystem:
     and NumPy arrays are taken as constants. The data checks itself when it is made.
 
     Attributes:
-        state: The symbol x, shape (n, 1).
-        f: Drift, shape (n, 1).
+        state: The symbols x, shape (n, 1).
+        f: The drift, shape (n, 1).
         g: How the constraint inputs v enter, shape (n, m).
         h: How the control inputs u enter, shape (n, p).
-        k: Constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
-        l: Controlled outputs at v = 0, shape (p, 1).
+        k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
+        l: The controlled outputs at v = 0, shape (p, 1).
         m: How v enters the controlled outputs, shape (p, m).
         parameters: Named numbers that the expressions depend on.
         state_signals, constraint_input_signals, control_signals, constraint_output_signals,
             output_signals: Names and units of x, v, u, y and z; a plain name is a Signal without
             unit. Made up ("x0", "x1", ...) where not given.
         nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
-        name: For messages.
+        name: What messages call the system.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
 
     Raises:
-        ModelError: A shape that does not fit, a symbol that is neither state nor parameter, names
-            or symbols that are not unique, a constant that is not finite, or a function that is not
-            smooth in the state, such as fabs.
+        ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
+            are not unique, a constant is not finite, or a function is not smooth in the state, such
+            as fabs.
     """
 
     state: ca.SX
@@ -141,12 +141,12 @@ class DaeSystem:
 
         Args:
             state: Names (or Signals) of the states, or their number n.
-            f, g, h, k, l, m: As in the class. Without constraints leave out g, k and m.
+            f, g, h, k, l, m: The functions of (1)-(3). Without constraints leave out g, k and m.
             parameters: Name -> default; a name must be a Python identifier.
             labels: The remaining fields of the class.
 
         Raises:
-            ModelError: As the class, or a function that fails.
+            ModelError: A function fails, or the functions make no system; see the class.
         """
         owner = labels.get("name", "system")
         own = {"state", "parameters", "state_signals", *"fghklm"}
@@ -203,22 +203,22 @@ class DaeSystem:
 
     @property
     def num_states(self) -> int:
-        """n."""
+        """n, the number of states."""
         return int(self.state.numel())
 
     @property
     def num_constraints(self) -> int:
-        """m."""
+        """m, the number of constraints."""
         return int(self.k.numel())
 
     @property
     def num_controls(self) -> int:
-        """p, which is also the number of controlled outputs."""
+        """p, the number of controls and of controlled outputs."""
         return int(self.h.shape[1])
 
     @property
     def parameter_symbol(self) -> ca.SX:
-        """All parameters below each other."""
+        """The symbols of all parameters, below each other."""
         return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters])
 
     @property
@@ -248,7 +248,7 @@ class DaeSystem:
 
         Args:
             name: What the outputs are, for messages.
-            outputs, pivot, regular, often: As in `TracedFunction`.
+            outputs, pivot, regular, often: The arguments of `TracedFunction`.
             inputs: Other symbols, which stand between "state" and "parameters".
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
@@ -257,10 +257,10 @@ class DaeSystem:
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
         """Values of all parameters in the order of `parameter_symbol`; the defaults if None.
 
-        What comes back is not for changing.
+        The array may be shared: do not change it.
 
         Raises:
-            ModelError: A wrong shape, or a number that is not finite.
+            ModelError: The shape is wrong, or a number is not finite.
         """
         if parameters is None:
             return self._defaults
@@ -277,7 +277,7 @@ class DaeSystem:
         """A state as a new array of shape (n,).
 
         Raises:
-            ModelError: A wrong shape, or a number that is not finite.
+            ModelError: The shape is wrong, or a number is not finite.
         """
         return vector(f"{self.name}: a state", state, self.num_states)
 
@@ -311,7 +311,7 @@ def check_is_system(value: Any, owner: str) -> None:
     """Refuses what is no DaeSystem.
 
     Raises:
-        ModelError: With the attribute that was meant, if there is one.
+        ModelError: It is none; the message names the attribute that was meant, if there is one.
     """
     if isinstance(value, DaeSystem):
         return

@@ -30,9 +30,9 @@ class TrackingLaw:
     numbers.
 
     Args:
-        system: (1)-(3).
+        system: The system (1)-(3).
         gains: A design such as `poles(-4.0)`, or finished gains.
-        structure: If it is known already; found otherwise.
+        structure: The structure of the system; found if None.
         measured_force: Whether the law takes a measurement of v. In a diagram it needs a sensor
             with state where mu_i = 0; see `ForceSensor`.
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
@@ -41,15 +41,15 @@ class TrackingLaw:
     Attributes:
         layout: How references and chains are stacked.
         reference_signals: Names and units of R.
-        function: (state, reference, measured_force, parameters) -> control and tracking_error, with
-            `all_parameters`; without measured force there is no such input.
+        function: The law as (state, reference, measured_force, parameters) -> control and
+            tracking_error, with `all_parameters`; without measured force there is no such input.
         measured_force: How the measurement enters; None without one.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
         GainError: The gains do not fit, or are not Hurwitz.
-        ModelError: No DaeSystem; the structure is that of another system; or measured force, and
-            no output is a constraint input.
+        ModelError: This is no DaeSystem, or the structure is that of another system; or force is
+            measured, and no output is a constraint input.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class TrackingLaw:
         self.function = self._trace()
 
     def _trace(self) -> TracedFunction:
-        """(28)."""
+        """The law (28) and the tracking error (29) as one function."""
         structure, layout, measured = self.structure, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols where K is not zero: the errors of most outputs are not coupled.
@@ -98,7 +98,7 @@ class TrackingLaw:
         )
 
     def _trace_error_coordinates(self) -> TracedFunction:
-        """The initial value of (30)."""
+        """The error coordinates as a function of state and reference: the initial value of (30)."""
         reference = ca.SX.sym("R", self.layout.reference_size)
         chain = self.structure.chain - reference[self.layout.chained.tolist(), :]
         inputs = {"reference": reference}
@@ -110,10 +110,10 @@ class TrackingLaw:
         return self.layout.degrees
 
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
-        """Gains for the outputs of this law.
+        """The gains for the outputs of this law.
 
         Raises:
-            GainError: The gains are for other outputs or degrees, or no gains.
+            GainError: The gains are for other outputs or degrees, or are no gains.
         """
         names = tuple(signal.name for signal in self.system.output_signals)
         if not (isinstance(gains, FeedbackGains) or callable(gains)):
@@ -139,7 +139,7 @@ class TrackingLaw:
                 count that are not zero in the law's own gains.
 
         Raises:
-            GainError: Gains that do not fit, or that couple outputs which the law does not.
+            GainError: The gains do not fit, or couple outputs that the law does not.
         """
         chosen = self.gains if gains is None else self.design(gains)
         has = self.gains.matrix != 0.0
@@ -161,7 +161,7 @@ class TrackingLaw:
         measured_force: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """u(x, R) of (28).
+        """The control u(x, R) of (28).
 
         Args:
             state: x, shape (n,).
@@ -170,7 +170,7 @@ class TrackingLaw:
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            Shape (p,).
+            u, shape (p,).
         """
         measured = [] if measured_force is None else [measured_force]
         return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
@@ -195,8 +195,8 @@ class TrackingLaw:
         """The error that theory predicts after a start from a state, shape (k, p).
 
         Args:
-            times: In s after the start, shape (k,).
-            state: At the start, shape (n,).
+            times: Times in s after the start, shape (k,).
+            state: The state at the start, shape (n,).
             reference: R at the start.
             parameters: Values of all parameters; the defaults if None.
         """

@@ -39,17 +39,17 @@ class RobotModel:
     outputs as there are actuators less constraints.
 
     Args:
-        links: M, H and kinematics.
-        constraints: phi, one below the other; none is a robot that moves freely.
-        positions: h_1, one below the other.
+        links: The links, which provide M, H and the frames.
+        constraints: The constraints phi, one below the other; a robot without moves freely.
+        positions: The position outputs h_1, one below the other.
         nominal_positions: A configuration of the robot at work, shape (nq,), near which the
             structure is examined; `links.default_positions` if None.
         name: The robot's name in messages.
-        actuation: Stages from the joints toward the motor; none is rigid joints.
+        actuation: The stages from the joints toward the motor; none is rigid joints.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, constraints, positions, name: As given.
+        links, constraints, positions, name: The arguments.
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
         control_limits: The largest |u| per actuator, infinite where there is none or where u is
@@ -125,7 +125,7 @@ class RobotModel:
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            Shape (nq,); where the outputs leave freedom, the one next to the guess.
+            q, shape (nq,); where the outputs leave freedom, the one next to the guess.
 
         Raises:
             InconsistentStateError: There is no such configuration near the guess.
@@ -182,7 +182,7 @@ class RobotModel:
         return state
 
     def _check_outputs(self, m: int, count: int) -> None:
-        """m constraint forces and the position outputs are as many as the actuators."""
+        """Refuses outputs that, with the m constraint forces, are not as many as the actuators."""
         nu = self.links.actuation_matrix.shape[1]
         if m > nu:
             raise ModelError(
@@ -259,7 +259,7 @@ class RobotModel:
         return ca.SX(ca.sparsify(ca.DM(B * self.links.reflected_inertia @ B.T)))
 
     def _nominal_rest(self, nominal: FloatArray) -> FloatArray:
-        """At rest on the constraints: shafts that rest off them would strain the springs."""
+        """The state at rest on the constraints: shafts off them would strain the springs."""
         with suppress(InconsistentStateError):
             nominal = self.configuration(None, nominal)
         forces = np.zeros(self.dae.num_constraints)

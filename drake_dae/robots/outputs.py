@@ -34,11 +34,11 @@ class PositionOutput(ABC):
 
 @dataclass(frozen=True)
 class PointCoordinates(PositionOutput):
-    """World coordinates of a point that is fixed in a frame, m.
+    """The world coordinates of a point that is fixed in a frame, in m.
 
     Attributes:
         frame: Name of the frame.
-        axes: Which of "xyz", for example "yz".
+        axes: The axes, letters of "xyz", for example "yz".
         point: The point in the frame, m, shape (3,).
         name: What stands before the axis in the names, "<name>.y"; the frame's name if empty. Two
             points of one frame need it.
@@ -61,12 +61,12 @@ class PointCoordinates(PositionOutput):
 
 @dataclass(frozen=True)
 class AxisCoordinates(PositionOutput):
-    """World components of an axis of a frame: two of them steer where the axis points.
+    """The world components of an axis of a frame: two of them steer where the axis points.
 
     Attributes:
         frame: Name of the frame.
-        axis: Which axis of the frame, "x", "y" or "z".
-        components: Which world components of it, for example "yz".
+        axis: The axis of the frame, "x", "y" or "z".
+        components: Its world components, letters of "xyz", for example "yz".
     """
 
     frame: str
@@ -89,7 +89,7 @@ class AxisCoordinates(PositionOutput):
 
 @dataclass(frozen=True)
 class SurfaceCoordinates(PositionOutput):
-    """Coordinates of where the robot is along a constraint; which, the constraint tells.
+    """The coordinates along a constraint; the constraint tells what they are.
 
     Attributes:
         contact: A constraint with coordinates, as a `PointOnSurface`.
@@ -113,7 +113,7 @@ class SurfaceCoordinates(PositionOutput):
 
 @dataclass(frozen=True)
 class JointPositions(PositionOutput):
-    """Generalized positions by name.
+    """The generalized positions with given names.
 
     Attributes:
         joints: Names as in the links' `position_signals`.

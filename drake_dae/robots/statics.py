@@ -1,4 +1,4 @@
-"""Where a robot can stand, and what holds it there: two problems for Newton's method.   (58)"""
+"""Where a robot can stand (58), and what holds it there: two problems for Newton's method."""
 
 import casadi as ca
 import numpy as np
@@ -10,7 +10,7 @@ from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
 
 class Placing:
-    """0 = phi(q), h_1(q) = z_1, to be solved for q.
+    """The equations 0 = phi(q), h_1(q) = z_1, to be solved for q: q = psi(z_1) of (58).
 
     Args:
         dae: The robot's system, for its parameters.
@@ -52,7 +52,7 @@ class Placing:
 
 
 class Balance:
-    """0 = f + g lambda + h u at v = 0, to be solved for the stages' state s and for u.
+    """The equations 0 = f + g lambda + h u at v = 0, to be solved for the stages' s and for u.
 
     Args:
         dae: The robot's system, with the state (q, v, s).

@@ -92,7 +92,7 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
-    """Moments to show, in s after the start; the last one is the end or the next after it."""
+    """The moments to show, in s after the start; the last one is the end or the next after it."""
     return np.arange(int(np.ceil(duration * rate - 1e-9)) + 1) / rate
 
 

@@ -48,7 +48,7 @@ class ConstraintLoads:
         parameters: Values of all parameters; the defaults if None.
 
     Attributes:
-        constraints: Those that act at a point.
+        constraints: The constraints that act at a point.
         with_moment: Whether each of these has a moment besides its force.
     """
 
@@ -80,7 +80,7 @@ class ConstraintLoads:
         self._sizes = links.q.numel(), links.v.numel()
 
     def __call__(self, state: FloatArray, constraint_force: ArrayLike) -> Loads:
-        """What acts at one moment.
+        """The loads at one moment.
 
         Args:
             state: x, or the link state (q, v) that it begins with.
@@ -121,7 +121,7 @@ class ForceArrows:
         """Draws the arrows.
 
         Args:
-            loads: What acts.
+            loads: The loads at this moment.
             time: The time in a recording, s.
         """
         self.measure([loads])

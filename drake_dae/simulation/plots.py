@@ -21,10 +21,10 @@ def save_plots(
     """Draws a run into PNG files: outputs, errors, constraint residual, controls.
 
     Args:
-        record: With desired_output, controlled_output, constraint_residual and control.
-        predicted: Tracking error by theory, shape (k, p).
-        limits: Largest |u|, shape (p,), infinite or None where there is none.
-        folder: Where to.
+        record: A record with desired_output, controlled_output, constraint_residual and control.
+        predicted: The tracking error by theory, shape (k, p).
+        limits: The largest |u|, shape (p,), infinite or None where there is none.
+        folder: The folder to write to.
     """
     figures = (
         plot_outputs(record),

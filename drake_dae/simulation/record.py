@@ -21,8 +21,8 @@ class Recorded:
     """A vector signal over time.
 
     Attributes:
-        values: shape (k, size).
-        signals: Name and unit of each column.
+        values: The values, one row per time, shape (k, size).
+        signals: The name and unit of each column.
     """
 
     values: FloatArray
@@ -37,18 +37,18 @@ class Record:
     in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
 
     Attributes:
-        time: s, shape (k,), strictly increasing.
-        signals: Name -> values.
+        time: The times in s, shape (k,), strictly increasing.
+        signals: Name of a signal -> its values.
     """
 
     time: FloatArray
     signals: Mapping[str, Recorded]
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Values of a signal, shape (k, size).
+        """The values of a signal, shape (k, size).
 
         Raises:
-            ModelError: No such signal.
+            ModelError: The record has no such signal.
         """
         if name not in self.signals:
             raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
@@ -65,8 +65,8 @@ class Record:
 
         Args:
             loggers: Name -> (sink, names and units of its input).
-            context: Of the diagram.
-            after: Only what was logged later than this time, in s.
+            context: The context of the diagram.
+            after: Only what was logged later than this time is collected, in s.
         """
         logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
         times = [log.sample_times() for log in logs.values()]
@@ -86,7 +86,7 @@ class Record:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes `record.npz`."""
+        """Writes the record as one `.npz` file."""
         arrays: dict[str, np.ndarray] = {"time": self.time}
         for name, recorded in self.signals.items():
             arrays[name] = recorded.values

@@ -28,7 +28,7 @@ from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.interruption import Ending, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
-"""Between two updates of the progress bar, or two lines where there is no terminal for it, in s."""
+"""The time between updates of the progress bar, or between lines where it has no terminal, in s."""
 
 MANY_STEPS = 1e7
 """More than these take over an hour, and gigabytes for their log: hardly anyone wants them."""
@@ -42,9 +42,9 @@ class RunStatistics:
     """What a run took.
 
     Attributes:
-        simulated_time: How far it came, s.
-        wall_time: s.
-        steps: Of the integrator.
+        simulated_time: How far it came, in s.
+        wall_time: How long it took, in s.
+        steps: How many steps the integrator took.
         interrupted: The signal that ended it early, SIGINT for Ctrl-C; None if none did.
     """
 
@@ -75,7 +75,7 @@ def simulate(
     Args:
         diagram: The system.
         context: Its context with the start state; changed in place.
-        duration: How long, s.
+        duration: How long to simulate, in s.
         config: Drake's integrator settings. The run begins at its start_time.
         progress: Shows simulated time and speed on stderr.
         after_step: Called with the context after each step, such as `RecordWriter.update`.
@@ -84,9 +84,9 @@ def simulate(
         UserWarning: The largest step allowed is so small that the run takes hours.
 
     Raises:
-        ModelError: A duration or settings that make no sense.
+        ModelError: The duration or the settings make no sense.
         InconsistentStateError: The start state is not on the manifold.
-        SimulationError: The run cannot go on.
+        SimulationError: The run cannot go on; the exception has time and state.
     """
     check_duration(duration)
     check_config(config)
@@ -151,7 +151,7 @@ def check_duration(duration: float) -> None:
     """Refuses a duration that is not positive.
 
     Raises:
-        ModelError: It is not.
+        ModelError: The duration is not positive.
     """
     if not (isfinite(duration) and duration > 0.0):
         raise ModelError(f"a duration must be positive, got {duration} s")
@@ -161,7 +161,7 @@ def check_config(config: SimulatorConfig) -> None:
     """Refuses settings that Drake takes and that then hang, fail late, or are ignored.
 
     Raises:
-        ModelError: The setting, and what would fit.
+        ModelError: A setting does not fit; the message names it, and what would.
     """
     scheme = config.integration_scheme
     # CENIC simulates a MultibodyPlant, and a constrained robot is none.
@@ -201,14 +201,14 @@ class _Pace:
 
     STEPS = 1000
     SLOWEST = 1e-7
-    """Of the duration in that many steps, or a tenth of what the largest steps would lead."""
+    """Of the duration that so many steps must simulate, or a tenth of what the longest would."""
 
     def __init__(self, start: float, duration: float, max_step_size: float) -> None:
         self._steps, self._time = 0, start
         self._least = min(self.SLOWEST * duration, 0.1 * self.STEPS * max_step_size)
 
     def check(self, context: Context) -> None:
-        """Counts a step.
+        """Counts a step, and looks at the pace now and then.
 
         Raises:
             SimulationError: The last steps led nowhere.
@@ -284,7 +284,7 @@ class _Progress:
 
 
 def _default_size() -> dict[str, int]:
-    """For tqdm, where the terminal says that it has no columns, as in some containers."""
+    """The size for tqdm where the terminal says that it has no columns, as in some containers."""
     try:
         known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
     except OSError:

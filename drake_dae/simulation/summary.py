@@ -13,7 +13,7 @@ from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 
 _SLACK = 1e-9
-"""What is not yet beyond a joint limit, in its unit: a start on the limit."""
+"""How far a value must be beyond a joint limit to count, in its unit: a start may be on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,9 @@ def summary(
     """What a run did, in plain text.
 
     Args:
-        record: With state, tracking_error, constraint_residual, constraint_force and control.
-        predicted: Tracking error by theory, shape (k, p).
+        record: A record with state, tracking_error, constraint_residual, constraint_force and
+            control.
+        predicted: The tracking error by theory, shape (k, p).
         limits: What the robot can take.
         run: What it took; None for a run that failed.
         failure: Why it failed.

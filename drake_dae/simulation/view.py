@@ -47,7 +47,7 @@ def add_live_view(
     """Adds what draws a robot `FRAME_RATE` times a second while its diagram runs.
 
     Args:
-        builder: With the plant in it.
+        builder: The builder of the diagram, with the plant in it.
         plant: The robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
         meshcat: Where to draw.
@@ -140,7 +140,7 @@ def draw_surroundings(
 def scene_extent(
     model: RobotModel, loads: ConstraintLoads, state: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Middle and size, in m, of the box around a robot and the points where it is held.
+    """The middle and the size, in m, of the box around a robot and the points where it is held.
 
     Args:
         model: The robot.

@@ -31,7 +31,7 @@ from drake_dae.systems.failures import simulation_error
 from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 STATES = ("state", "estimated_state")
-"""What the argument of a formula is called that says where the system is."""
+"""The names of the argument of a formula that says where the system is."""
 
 
 class Formula(Protocol):
@@ -58,7 +58,7 @@ class TracedFormula:
     Args:
         function: The function.
         output: Which of its outputs.
-        sources: Where its arguments come from; their own names if None.
+        sources: Where its arguments come from, as in `Formula`; their own names if None.
         signals: Name of an argument -> names of its entries, for messages.
     """
 
@@ -112,7 +112,7 @@ class DifferentiableSystem(LeafSystem):
 
     @cached_property
     def formulas(self) -> dict[str, Formula]:
-        """Per output port, by its name, and for "derivative" what it computes.
+        """Name of an output port -> what it computes; "derivative" -> the time derivative.
 
         Raises:
             ModelError: The system does not convert to AutoDiffXd.
@@ -157,7 +157,8 @@ class ParameterizedSystem(DifferentiableSystem):
         """The values of a function of (state, inputs, parameters).
 
         Raises:
-            SingularityError, NonFiniteError: They are of no use, and why, with time and state.
+            SingularityError: A matrix in it is singular; the exception has time and state.
+            NonFiniteError: A value is not finite, likewise.
         """
         try:
             return function.checked(state, *inputs, context.get_numeric_parameter(0).value())
@@ -182,12 +183,12 @@ class ParameterizedSystem(DifferentiableSystem):
         """Changes a parameter in a context.
 
         Args:
-            context: Of this system.
-            name: As in `dae.parameters`.
-            value: Shape (k,), or a number for all entries.
+            context: The context of this system.
+            name: The name of the parameter in `dae.parameters`.
+            value: The new value, shape (k,), or a number for all entries.
 
         Raises:
-            ModelError: No parameter has that name, or a value that does not fit.
+            ModelError: No parameter has that name, or the value does not fit.
         """
         values = context.get_numeric_parameter(0).CopyToVector()
         place = self.dae.parameter_slice(name)

@@ -24,24 +24,26 @@ class TrackingController(ParameterizedSystem):
     Input ports:
         estimated_state: x, shape (n,).
         reference: R, output-major, r_i, ..., r_i^(mu_i); shape (sum (mu_i + 1),).
-        measured_force: Constraint force from a sensor, shape (m,); if the law takes it.
+        measured_force: The constraint force from a sensor, shape (m,); if the law takes it.
 
     Output ports:
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, shape (p,).
 
-    Both outputs feed through from all inputs. The context holds the model's parameters and then
-    the gains as one numeric parameter; see `set_parameter` and `set_gains`. Converts to AutoDiffXd.
+    Both output ports have direct feedthrough from all input ports. The context holds the model's
+    parameters and then the gains as one numeric parameter; see `set_parameter` and `set_gains`.
+    The block converts to AutoDiffXd.
 
     Args:
         law: The law.
-        outputs: At which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
+        outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
-        SingularityError, NonFiniteError: During a simulation, with time and state.
+        SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
+        NonFiniteError: A value is not finite on the way, likewise.
     """
 
     def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
@@ -69,11 +71,11 @@ class TrackingController(ParameterizedSystem):
         """Changes the gains in a context.
 
         Args:
-            context: Of this system.
+            context: The context of this system.
             gains: A design such as `poles(-8.0)`, or finished gains.
 
         Raises:
-            GainError: Gains that do not fit, are not Hurwitz, or couple outputs that the law does
+            GainError: The gains do not fit, are not Hurwitz, or couple outputs that the law does
                 not.
         """
         values = self.law.all_parameters(self.parameters(context), gains)

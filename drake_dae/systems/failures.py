@@ -1,4 +1,4 @@
-"""What is said in a simulation of a function that has no value."""
+"""How a simulation tells that a function has no value."""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,9 +17,9 @@ def simulation_error(
     """The exception for a function that has no value in a simulation.
 
     Args:
-        failure: What was wrong.
-        time: When, in s.
-        state: Where, shape (n,).
+        failure: What was wrong with the values.
+        time: The time, in s.
+        state: The state, shape (n,).
         signals: Name of an input -> names of its entries; the name of the input serves otherwise.
     """
     where = f"at t = {time:.6g} s, state {show(state)}"

@@ -45,18 +45,21 @@ class DaePlant(ParameterizedSystem):
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
     The default state is the consistent one next to `system.nominal_state`.
 
-    Converts to AutoDiffXd, for Drake's Linearize and DirectCollocation; without the projection.
+    The block converts to AutoDiffXd, for Drake's Linearize and DirectCollocation; it then has no
+    projection.
 
     Args:
-        system: (1)-(3).
-        structure: If it is known already; found otherwise.
+        system: The system (1)-(3).
+        structure: The structure of the system; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
-        ModelError: No system, or the structure of another one.
-        InconsistentStateError: At the start of a simulation, for a start state that is off N*.
-        SingularityError, NonFiniteError: During a simulation, with time and state.
+        ModelError: This is no system, or the structure is that of another one.
+        InconsistentStateError: A simulation starts from a state that is off N*.
+        SingularityError: A(x) is singular on the way; the exception has time and state.
+        NonFiniteError: A value is not finite on the way, likewise.
+        SimulationError: The state cannot be projected onto N* on the way, likewise.
     """
 
     def __init__(
@@ -106,14 +109,14 @@ class DaePlant(ParameterizedSystem):
             self.DeclarePerStepUnrestrictedUpdateEvent(self._project)
 
     def state(self, context: Context) -> FloatArray:
-        """x, shape (n,)."""
+        """The state x in a context, shape (n,)."""
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets x as given, shape (n,); a run from there is refused if it is off N*.
 
         Raises:
-            ModelError: A wrong shape.
+            ModelError: The shape is wrong.
         """
         context.SetContinuousState(self.dae.state_vector(state))
 
@@ -121,7 +124,7 @@ class DaePlant(ParameterizedSystem):
         """Sets the state on N* next to a guess, shape (n,), and returns it.
 
         Raises:
-            InconsistentStateError: None found near the guess.
+            InconsistentStateError: None is found near the guess.
         """
         state = self.structure.manifold.project(guess, self.parameters(context))
         self.set_state(context, state)

@@ -1,4 +1,4 @@
-"""The state realization of a DaeSystem as a LeafSystem of minimal dimension.        (23)-(27)"""
+"""The state realization of a DaeSystem as a LeafSystem of minimal dimension.        (25)-(27)"""
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ class StateRealization(ParameterizedSystem):
     with x = Phi^-1(0, zeta, xi). It has n - sum r_i states, as few as the motion allows, and no
     constraint to keep: x is on N* to round-off at every instant, without a projection. The price
     is the inverse of Phi, by Newton's method, in every evaluation, and that Phi must stay
-    regular along the motion. `DaePlant` needs neither.
+    regular along the motion. `DaePlant` needs neither of them.
 
     Input port:
         control: u, shape (p,).
@@ -45,10 +45,11 @@ class StateRealization(ParameterizedSystem):
         normal_form: The coordinates, `NormalForm(system)`.
 
     Raises:
-        ModelError: No normal form.
-        SimulationError: During a simulation, with time and last state: there is no x, since the
-            motion came to an end of the coordinates.
-        SingularityError, NonFiniteError: During a simulation, with time and state.
+        ModelError: This is no normal form.
+        SimulationError: There is no x on the way, since the motion left the domain of the
+            coordinates; the exception has the time and the last state.
+        SingularityError: A(x) is singular on the way; the exception has time and state.
+        NonFiniteError: A value is not finite on the way, likewise.
     """
 
     def __init__(self, normal_form: NormalForm) -> None:
@@ -105,7 +106,7 @@ class StateRealization(ParameterizedSystem):
         )
 
     def state(self, context: Context) -> FloatArray:
-        """x = Phi^-1(0, zeta, xi), shape (n,)."""
+        """The state x = Phi^-1(0, zeta, xi) in a context, shape (n,)."""
         return self._state_entry.Eval(context).copy()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -113,15 +114,15 @@ class StateRealization(ParameterizedSystem):
 
         Raises:
             InconsistentStateError: The state is off N*; `manifold.project` finds one that is not.
-            ModelError: A wrong shape.
+            ModelError: The shape is wrong.
         """
         x, p = self.dae.state_vector(state), self.parameters(context)
         manifold = self.normal_form.structure.manifold
         if not manifold.is_consistent(x, p):
             residual = manifold.residual(x, p)
             raise InconsistentStateError(
-                f"{self.dae.name}: the state is not on the constraint: the largest of its "
-                f"residuals is {np.max(np.abs(residual)):.3g}. Start from "
+                f"{self.dae.name}: the state is not on the constraint: its largest constraint "
+                f"residual is {np.max(np.abs(residual)):.3g}. Start from "
                 "structure.manifold.project(guess)",
                 residual,
             )
@@ -162,7 +163,7 @@ class StateRealization(ParameterizedSystem):
             value.set_value(self.normal_form.state(wanted, None, p))
         except InconsistentStateError:
             raise SimulationError(
-                f"the motion came to an end of its coordinates at t = {context.get_time():.6g} s, "
+                f"the motion left the domain of its coordinates at t = {context.get_time():.6g} s, "
                 f"last state {show(last)}: {reason}. DaePlant needs no coordinates",
                 context.get_time(),
                 last,

@@ -1,4 +1,4 @@
-"""References as a LeafSystem, and Drake's trajectories as references."""
+"""References as a LeafSystem, and Drake's trajectories as references.                (28)"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,15 +17,16 @@ from drake_dae.systems.block import DifferentiableSystem, Formula
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryReference(Reference):
-    """A Drake Trajectory, with the derivatives that it provides itself.
+    """A reference that is a Drake Trajectory, with the derivatives that it provides itself.
 
     Attributes:
         trajectory: Any column-valued Trajectory, shape (k, 1).
 
     Raises:
-        ReferenceSignalError: A Trajectory that is no column. At preparation: no derivatives, or,
-            for a PiecewisePolynomial, a derivative below the highest one that jumps at a break.
-            During a simulation: a time outside the trajectory, which Drake would silently clip.
+        ReferenceSignalError: The Trajectory is no column; when `derivatives` is called, it has no
+            derivatives, or is a PiecewisePolynomial of which a derivative below the highest one
+            jumps at a break; or, on the way, the time is outside of it, which Drake would silently
+            clip.
     """
 
     trajectory: Trajectory
@@ -98,15 +99,16 @@ class ReferenceGenerator(DifferentiableSystem):
             (sum (mu_i + 1),).
 
     Args:
-        references: One below the other; together they cover all outputs.
-        degrees: mu_1, ..., mu_p, as `TrackingLaw.degrees`.
+        references: The references, in the order of the outputs; together they cover all of them.
+        degrees: The degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
 
-    Converts to AutoDiffXd. A time that has derivatives itself asks each reference for one more.
+    The block converts to AutoDiffXd. A time that has derivatives itself asks each reference for
+    one more.
 
     Raises:
-        ReferenceSignalError: References that cover too few or too many outputs, or that are not
-            smooth enough.
-        NonFiniteError: During a simulation.
+        ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
+            enough.
+        NonFiniteError: A reference is not finite on the way; the exception has the time.
     """
 
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:

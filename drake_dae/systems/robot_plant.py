@@ -21,12 +21,12 @@ class RobotPlant(DaePlant):
     A stage of actuation shows its state at ports of its own, which its class names: `motor_state`
     of `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
 
-    `constraint_force` is lambda of (37), in N for contacts. With rigid joints it feeds through from
-    `control`; with any stage it is a function of the state alone.
+    `constraint_force` is lambda of (37), in N for contacts. With rigid joints it has direct
+    feedthrough from `control`; with any stage it is a function of the state alone.
 
     Args:
         model: The robot.
-        structure: Of `model.dae`, if it is known already.
+        structure: The structure of `model.dae`; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
     """
 

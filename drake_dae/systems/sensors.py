@@ -1,4 +1,4 @@
-"""Measured contact forces."""
+"""Sensors of constraint forces, for laws with measured force.              (59), (71), (81)"""
 
 import casadi as ca
 import numpy as np
@@ -21,22 +21,22 @@ class ForceSensor(DifferentiableSystem):
     an algebraic loop. Without sampling it converts to AutoDiffXd.
 
     Input ports:
-        force: Shape (m,), N (N m).
-        noise: Shape (m,), of deviation 1, for example from Drake's RandomSource; only with a
+        force: The constraint force in N (N m), shape (m,).
+        noise: Noise of deviation 1, shape (m,), for example from Drake's RandomSource; only with a
             noise_deviation.
 
     Output port:
-        measured_force: Shape (m,); no direct feedthrough from `force`.
+        measured_force: The measured force, shape (m,); no direct feedthrough from `force`.
 
     Args:
-        size: m.
-        time_constant: Of the lag in s; 0 for none, then it must sample.
-        sample_period: s; 0 for none, then it must lag.
-        bias: Constant error in N, a number or shape (m,).
-        noise_deviation: Standard deviation in N, a number or shape (m,).
+        size: The number of forces, m.
+        time_constant: The time constant of the lag in s; 0 for none, then it must sample.
+        sample_period: The time between samples in s; 0 for none, then it must lag.
+        bias: A constant error in N, a number or shape (m,).
+        noise_deviation: The standard deviation of the noise in N, a number or shape (m,).
 
     Raises:
-        ModelError: Negative numbers, or neither lag nor sampling.
+        ModelError: A number is negative, or there is neither lag nor sampling.
     """
 
     def __init__(
@@ -96,10 +96,10 @@ class ForceSensor(DifferentiableSystem):
             context.SetDiscreteState(self._held, value + self._bias)
 
     def largest_stable_gain(self) -> float:
-        """Largest gain Gbar of (59) for which a rigid robot's force error decays.
+        """The largest gain Gbar of (59) for which a rigid robot's force error decays.
 
-        With the lag alone it is infinite: the error decays at (1 + G) / time_constant. A sampled
-        sensor multiplies the error by a - (1 - a) G a step, a = exp(-period / time_constant).
+        With the lag alone it is infinite: the error decays at (1 + Gbar) / time_constant. A sampled
+        sensor multiplies it by a - (1 - a) Gbar a step, a = exp(-sample_period / time_constant).
         """
         if not self.sample_period:
             return np.inf

@@ -32,8 +32,8 @@ class Failure:
     Attributes:
         function: The function's name.
         fault: What is wrong.
-        inputs: Name of an input -> its entries that are not finite; empty unless these are it.
-        singular: What is singular, if something is.
+        inputs: Name of an input -> its entries that are not finite; empty unless `fault` is INPUT.
+        singular: The matrix that must be regular, which is singular if `fault` is SINGULAR.
     """
 
     function: str
@@ -46,7 +46,7 @@ class InvalidValueError(DrakeDaeError):
     """Values of a function that are of no use.
 
     Attributes:
-        failure: Why.
+        failure: What is wrong with them.
     """
 
     def __init__(self, failure: Failure) -> None:
@@ -62,17 +62,17 @@ class TracedFunction:
     `evaluate`.
 
     Args:
-        name: For messages.
+        name: What messages call the function.
         inputs: Name -> symbol column, in the order of the call's arguments.
         outputs: Name -> expression; a column becomes an array of shape (k,), anything else an
             array of its own shape.
         pivot: A scalar that is 0 where a matrix that must be regular is singular, such as
             `Factorization.pivot`; None if there is no such matrix.
-        regular: What that matrix is, for messages.
+        regular: What messages call that matrix.
         often: Whether it is called often enough for common subexpressions to be worth removing.
 
     Attributes:
-        num_operations: Scalar operations of one call.
+        num_operations: How many scalar operations one call takes.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class TracedFunction:
         """Calls the function without allocation.
 
         Args:
-            arguments: Arrays of the inputs' sizes, in order.
+            arguments: Arrays of the sizes of the inputs, in their order.
 
         Returns:
             The outputs. The arrays are overwritten by the next call: copy what must last.
@@ -191,7 +191,7 @@ class TracedFunction:
         """Calls the function and returns fresh arrays.
 
         Raises:
-            ModelError: A wrong number of arguments, or one of a wrong size.
+            ModelError: The number of arguments is wrong, or one has a wrong size.
         """
         if len(arguments) != len(self._inputs):
             raise ModelError(

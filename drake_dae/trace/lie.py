@@ -12,7 +12,7 @@ def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
         state: x, shape (n, 1).
 
     Returns:
-        Shape (a, 1).
+        L_f k, shape (a, 1).
     """
     return ca.jtimes(expression, state, ca.densify(field))
 
@@ -34,7 +34,7 @@ def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.S
         state: x, shape (n, 1).
 
     Returns:
-        Shape (a, m), sparse.
+        The derivatives, shape (a, m), sparse.
     """
     return ca.sparsify(ca.mtimes(ca.jacobian(expression, state), fields))
 

@@ -12,13 +12,11 @@ from drake_dae.arrays import FloatArray
 ROUND_OFF = 1e-12
 """A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
 
-
 DEPENDENT = 1e-9
 """Gradients of length one whose smallest singular value is below this depend on each other."""
 
 CONVERGED = 1e-8
 """A Newton step of this size, relative to the state, that does not get smaller is round-off."""
-
 
 PRECISION = 1e-16
 """The error, relative to the state, that a search leaves."""
@@ -26,8 +24,10 @@ PRECISION = 1e-16
 ROUNDING = 1e-15
 """After a Newton step of this size, relative to the state, only rounding is left."""
 
+ITERATIONS = 200
+"""After so many steps a search ends; quadratic convergence takes a handful."""
 
-LENGTHS = tuple(0.5**k for k in range(10))
+LENGTHS = tuple(0.5**k for k in range(30))
 """The parts of a Newton step that are tried."""
 
 
@@ -36,12 +36,15 @@ class Linearization(NamedTuple):
 
     Attributes:
         step: x -> the Newton step from x by the matrix of the iterate, shape (n,).
-        is_regular: Whether that matrix is regular, so that a solution near it is isolated, or as
-            isolated as the equations are many.
+        is_regular: Whether that matrix has full rank, so that near a solution there are no others
+            but those that the number of equations leaves.
+        measure: What a step must make smaller, x -> a number that is not negative; if None the
+            length of the next step.
     """
 
     step: Callable[[FloatArray], FloatArray]
     is_regular: bool
+    measure: Callable[[FloatArray], float] | None = None
 
 
 @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
@@ -51,7 +54,8 @@ def newton(
     """Damped Newton's method; a step must make the next one, by the same matrix, shorter.
 
     That test does not depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
-    are measured relative to the start, or to 1 where that is larger.
+    are measured relative to the start, or to 1 where that is larger; what that calls a solution is
+    polished as long as steps get shorter, which depends on no units.
 
     Args:
         start: The first iterate, shape (n,).
@@ -66,28 +70,46 @@ def newton(
         relative = step / unit
         return sqrt(relative @ relative)
 
-    for _ in range(50):
+    for _ in range(ITERATIONS):
         linearization = linearize(x)
         if linearization is None:
             break
-        step_from, regular = linearization
+        step_from, regular, measure = linearization
         step = step_from(x)
         size = length_of(step)
         if size <= ROUNDING:
-            return x + step, regular
+            return _polished(x, step, step_from), regular
+        value = size if measure is None else measure(x)
         for length in LENGTHS:
             trial = x + length * step
-            following = step_from(trial)
-            left = length_of(following)
-            if left * left <= PRECISION * size:
-                # The step after that would be left / size times as long.
-                return trial + following, regular
-            if left <= (1.0 - 0.25 * length) * size:
+            if measure is None:
+                following = step_from(trial)
+                left = length_of(following)
+                if left * left <= PRECISION * size:
+                    # The step after that would be left / size times as long.
+                    return _polished(trial, following, step_from), regular
+            else:
+                left = measure(trial)
+            if left <= (1.0 - 0.25 * length) * value:
                 break
         else:
             return x, regular and bool(size <= CONVERGED)
         x = trial
     return x, False
+
+
+def _polished(
+    state: FloatArray, step: FloatArray, step_from: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Where a state comes by a step and by all that follow it, until they are round-off."""
+    length = step @ step
+    while length > 0.0:
+        state = state + step
+        step = step_from(state)
+        if not step @ step < 0.25 * length:
+            break
+        length = step @ step
+    return state
 
 
 def shortest_steps(
@@ -100,7 +122,7 @@ def shortest_steps(
 
     Args:
         gradients: C, shape (k, n).
-        residual: x -> shape (k,).
+        residual: A function x -> residual of shape (k,).
     """
     if not np.all(np.isfinite(gradients)):
         return None

@@ -20,8 +20,8 @@ def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:
     """A product in which entries that are nothing but round-off are zero.
 
     Args:
-        left: Shape (a, k).
-        right: Shape (k, b).
+        left: The left factor, shape (a, k).
+        right: The right factor, shape (k, b).
         scale: Units in which the columns of `left` and the rows of `right` compare, shape (k,).
     """
     value, size = right
@@ -38,8 +38,8 @@ def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
     """A sum of products in which entries that are nothing but round-off are zero.
 
     Args:
-        value: Shape (a, b).
-        size: The sums of the sizes of the terms, likewise.
+        value: The sum, shape (a, b).
+        size: The sum of the sizes of its terms, shape (a, b).
     """
     return np.where(np.abs(value) > ZERO * size, value, 0.0), size
 
@@ -50,7 +50,7 @@ def positive(sizes: FloatArray) -> FloatArray:
 
 
 def smallest_singular_value(matrix: FloatArray) -> float:
-    """Of a matrix with no more rows than columns."""
+    """The smallest singular value of a matrix with no more rows than columns."""
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 

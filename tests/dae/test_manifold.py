@@ -204,3 +204,33 @@ def test_a_constraint_that_no_state_changes_is_never_met():
     assert not manifold.is_consistent([0.0, 0.0])
     with pytest.raises(InconsistentStateError):
         manifold.project([0.0, 0.0])
+
+
+@pytest.mark.parametrize("length", [1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9])
+def test_projection_does_not_depend_on_the_unit_of_length(length):
+    """A circle in metres, or in any other unit, from starts off it by 10%: to round-off of it."""
+    manifold = circle(radius=length)
+    for angle in np.linspace(0.1, 6.2, 20):
+        point = length * np.array([np.cos(angle), np.sin(angle)])
+        state = manifold.project(1.1 * point)
+        np.testing.assert_allclose(np.hypot(*state), length, rtol=1e-15)
+        # The nearest one, which is on the same ray.
+        np.testing.assert_allclose(state, point, rtol=0, atol=1e-14 * length)
+
+
+def test_projection_in_mixed_units_reaches_the_manifold():
+    """Sizes of 1e-5, 40 and 6e5 in one state: the steps of least norm move the smallest alone."""
+    sizes, random = np.array([1e-5, 37.0, 6e5]), np.random.default_rng(0)
+    C = np.array([[1.0, 0.5, -0.7], [-0.4, 1.2, 0.9]])
+
+    def k(x):
+        z = x / ca.DM(sizes)
+        return ca.mtimes(ca.DM(C), z) + 0.3 * ca.sin(z[0])
+
+    manifold = manifold_of(k, 3)
+    for size in (0.1, 1.0, 10.0):
+        for _ in range(50):
+            start = size * sizes * random.standard_normal(3)
+            left = manifold.residual(manifold.project(start))
+            # CONSISTENT, where the search ends without another proof.
+            np.testing.assert_allclose(left, 0.0, atol=1e-8)

@@ -68,9 +68,10 @@ class Links:
 def explicit_flexible(name, x, reference, gains, force_gains):
     """(69)-(71) with f_1, ..., f_4, B_1, B_2, A_1, A_2 of the appendix.
 
-    f_3 has Jdot qd, see paper-notes. f = (f_1; f_3), g = (f_2; f_4), B = (B_1; B_2), A = (A_1;
-    A_2) stand below each other: the appendix treats both alike. In the velocities all of it is a
-    polynomial of at most third degree, in q_2 linear, which differences get exactly.
+    The term of f_3 is Jdot qd, where the appendix prints Jdot_1. f = (f_1; f_3), g = (f_2; f_4),
+    B = (B_1; B_2), A = (A_1; A_2) stand below each other: the appendix treats both alike. In the
+    velocities all of it is a polynomial of at most third degree, in q_2 linear, which differences
+    get exactly.
     """
     d = drive(name, "flexible")
     k_2, (q_1, v_1, q_2, v_2) = d.stiffness, x.reshape(4, -1)
@@ -111,9 +112,10 @@ def explicit_flexible(name, x, reference, gains, force_gains):
 
 
 def explicit_actuator(name, kind, x, reference, gains, force_gains):
-    """(79)-(81) with f_5, f_6, B_3, B_4, A_3, A_4 of the appendix, B_3 as in paper-notes.
+    """(79)-(81) with f_5, f_6, B_3, B_4, A_3, A_4 of the appendix.
 
-    For servos G(q) stands for N K_m, K_h^-1 for L and G_p for R.
+    B_3 is P M^-1 (J^T B_4 + N K_m); the appendix prints P N K_m without M^-1. For servos G(q)
+    stands for N K_m, K_h^-1 for L and G_p for R.
     """
     d = drive(name, kind)
     q, v, s = x.reshape(3, -1)

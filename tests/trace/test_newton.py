@@ -94,12 +94,12 @@ def test_steps_are_the_shortest():
         random.normal(size=3),
         random.normal(size=6),
     )
-    step, regular = shortest_steps(gradients, lambda at: residual)
+    step, regular, _ = shortest_steps(gradients, lambda at: residual)
     assert regular
     expected = -np.linalg.pinv(gradients) @ residual
     # Numbers of order 1, well conditioned.
     np.testing.assert_allclose(step(x), expected, atol=1e-14)
-    step, regular = shortest_steps(np.zeros((0, 6)), lambda at: np.zeros(0))
+    step, regular, _ = shortest_steps(np.zeros((0, 6)), lambda at: np.zeros(0))
     np.testing.assert_array_equal(step(x), np.zeros(6))
     assert regular
 
@@ -111,7 +111,7 @@ def test_steps_of_dependent_gradients_are_those_of_least_squares(rows):
     gradients /= np.linalg.norm(gradients, axis=1)[:, None]
     gradients[-1] = gradients[0]
     residual = np.arange(1.0, rows + 1.0)
-    step, regular = shortest_steps(gradients, lambda at: residual)
+    step, regular, _ = shortest_steps(gradients, lambda at: residual)
     assert not regular
     expected = np.linalg.lstsq(gradients, -residual)[0]
     np.testing.assert_allclose(step(np.zeros(4)), expected, atol=1e-13)

@@ -50,12 +50,12 @@ def dynamic_extension(
     the way; see `extend`.
 
     Args:
-        system: (1)-(3).
+        system: The system (1)-(3).
         nominal_control: Values of the controls at the nominal state, for the integrators that hold
             them; zero where not given.
         max_integrators: How many may be needed in all; n if None.
-        spread: Of the states at which numbers decide, as in `find_structure`. That of a control is
-            0.1 of its nominal value; 0.1 if that is zero.
+        spread: The standard deviation of the states at which numbers decide, as in
+            `find_structure`. That of a control is 0.1 of its nominal value; 0.1 if that is zero.
 
     Returns:
         The extended system; the original one if its B(x) is regular.
@@ -63,7 +63,7 @@ def dynamic_extension(
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
             isolated states only, or more than max_integrators are needed.
-        ModelError, InconsistentStateError: As `find_structure`.
+        ModelError, InconsistentStateError: There is no structure to find; see `find_structure`.
     """
     check_is_system(system, "dynamic_extension")
     limit = system.num_states if max_integrators is None else max_integrators
@@ -103,11 +103,11 @@ class _Chain:
     Args:
         system: The original one.
         nominal: Values of its controls at the nominal state, shape (p,).
-        spread: Of its states.
+        spread: The standard deviation of its states, as in `find_structure`.
 
     Attributes:
-        system: With the integrators up to now.
-        spread: Of its states.
+        system: The system with the integrators so far.
+        spread: The standard deviation of its states, shape (n,).
         integrators: How many stand before which control.
         offset, matrix: u of the original system is offset(x) + matrix(x) w.
     """
@@ -132,10 +132,10 @@ class _Chain:
         return replace(self.system, nominal_state=self.system.nominal_state + step)
 
     def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
-        """One integrator before each of some controls.
+        """Puts one integrator before each of some controls.
 
         Args:
-            columns: Of the controls.
+            columns: The columns of these controls.
             mixing: b(x) of u_i* = u_i + sum_j b_ij(x) u_j, which takes the place of u_i first;
                 j are the other controls. Shape (len(columns), p - len(columns)).
         """
@@ -270,10 +270,10 @@ def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
 
 
 def _structure_at_nominal(chain: _Chain) -> Structure:
-    """Of the extended system, which is regular nearly everywhere.
+    """The structure of the extended system, which is regular nearly everywhere.
 
     Raises:
-        AssumptionError: But not at the nominal state, or near it.
+        AssumptionError: B(x) is singular at the nominal state or near it.
     """
     try:
         return find_structure(chain.system, spread=chain.spread)

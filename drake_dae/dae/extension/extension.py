@@ -26,11 +26,11 @@ class Extension:
     Attributes:
         original: The system without integrators.
         system: The extended one. The first n states are those of the original.
-        structure: Of the extended system.
+        structure: The structure of the extended system.
         integrators: How many integrators stand before which of the original controls. Where others
             are mixed in first, the new state bears a star: "u1*" is u1 + sum_j b_j(x) u_j.
-        control_offset: Shape (p, 1), an expression of `system.state`.
-        control_matrix: Shape (p, p).
+        control_offset: offset(x_e) as an expression of `system.state`, shape (p, 1).
+        control_matrix: matrix(x_e) likewise, shape (p, p).
     """
 
     original: DaeSystem
@@ -46,10 +46,10 @@ class Extension:
     def original_control(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """u of the original system, shape (p,).
+        """The control u of the original system, shape (p,).
 
         Args:
-            state: x_e of the extended system.
+            state: x_e, the state of the extended system.
             control: w of the extended system, shape (p,).
             parameters: Values of all parameters; the defaults if None.
         """
@@ -81,7 +81,7 @@ def extend(
     constraint input does, integrators repair it: the constraint then binds u_i as a state.
 
     Args:
-        system: (1)-(3).
+        system: The system (1)-(3).
         integrators: Name of a control -> how many; or names, for one each.
         nominal_control: Values of controls at the nominal state, for the integrators that hold
             them; zero where not given. B(x) is often singular at zero.
@@ -92,7 +92,7 @@ def extend(
         The system with the states (x, u_i, u_j, ..., u_i', ...).
 
     Raises:
-        ModelError: An unknown control, or a number of integrators below 1.
+        ModelError: A control is unknown, or a number of integrators is below 1.
     """
     check_is_system(system, "extend")
     if isinstance(integrators, str) or not isinstance(integrators, Mapping | Sequence):
@@ -128,14 +128,14 @@ def integrated(
     nominal: FloatArray,
     mixing: ca.SX | None = None,
 ) -> DaeSystem:
-    """One integrator before each of some controls, after u_i = x_i - sum_j b_ij(x) u_j.
+    """Puts one integrator before each of some controls, where u_i = x_i - sum_j b_ij(x) u_j.
 
     Args:
-        system: (1)-(3).
-        columns: Of the q controls.
+        system: The system (1)-(3).
+        columns: The columns of the q controls.
         held, following: Names of the new states and controls.
         nominal: Values of the new states, shape (q,).
-        mixing: b(x), shape (q, p - q).
+        mixing: The matrix b(x), shape (q, p - q); zero if None.
     """
     q, n, p = len(columns), system.num_states, system.num_controls
     others = [j for j in range(p) if j not in columns]
@@ -166,7 +166,7 @@ def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> F
     """Values of the controls at the nominal state by their names, 0 where not given, shape (p,).
 
     Raises:
-        ModelError: A name that no control has, or a value that is not finite.
+        ModelError: A name is that of no control, or a value is not finite.
     """
     values = values or {}
     _check_names(system, values, "nominal_control")

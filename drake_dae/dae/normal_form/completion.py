@@ -24,16 +24,16 @@ Completion = tuple[ca.SX, tuple[Signal, ...], Margin]
 def check_completion(
     structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
 ) -> Completion:
-    """A completion that somebody chose.
+    """The completion that a user chose, with its signals and its margin.
 
     Args:
-        structure: Of the system.
-        chains: y and zeta of (20), (21).
-        samples: Where the Jacobian of Phi must be regular.
+        structure: The structure of the system.
+        chains: The constraint and output chains y and zeta of (20), (21).
+        samples: The states at which the Jacobian of Phi must be regular.
         xi: The completion, shape (d, 1).
 
     Raises:
-        ModelError: Why it is none.
+        ModelError: It has a wrong shape, is not smooth, or does not complete the chains.
     """
     system, count = structure.system, structure.zero_dynamics_dimension
     if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
@@ -70,7 +70,8 @@ def check_completion(
     if not count:
         raise ModelError(
             f"{system.name}: the differentials of the chains are dependent to round-off at x = "
-            f"{show(margin.state)}: A(x) of (2) or B(x) of (16) is close to singular there"
+            f"{show(margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to singular "
+            "there"
         )
     function = system.trace("coordinates", {"gradient": gradient}, often=False)
     (matrix,) = function(margin.state, system.parameter_values)
@@ -93,7 +94,7 @@ def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> 
     The arguments are those of `check_completion`.
 
     Raises:
-        ModelError: Nothing linear completes the chains at all samples.
+        ModelError: No linear combinations complete the chains at all samples.
     """
     system, count = structure.system, structure.zero_dynamics_dimension
     if not count:
@@ -142,7 +143,7 @@ def _pivots(spaces: FloatArray) -> list[int]:
 
 
 def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
-    """Named as it reads: "x0 - 0.5 x1"."""
+    """A signal that is named as the combination reads: "x0 - 0.5 x1"."""
     terms = [(c, signal) for c, signal in zip(factors, signals, strict=True) if c]
     units = {signal.unit for _, signal in terms}
     sign = {1.0: "", -1.0: "-"}

@@ -1,4 +1,4 @@
-"""The normal form: constraint chains, output chains, and what completes them.       (20)-(27)"""
+"""The normal form: constraint chains, output chains, and what completes them.       (20)-(24)"""
 
 from collections.abc import Callable
 
@@ -31,14 +31,14 @@ class NormalForm:
     The paper allows any completion; L_h* xi = 0 is not required.
 
     Args:
-        system: (1)-(3).
+        system: The system (1)-(3).
         completion: xi as expressions of the state (and parameters), shape (d, 1) with
             d = n - sum r_i - sum mu_i. Chosen if None: states that complete the chains well at
             all of `structure.states`; if none do, linear combinations of states.
-        structure: If it is known already; found otherwise.
+        structure: The structure of the system; found if None.
 
     Attributes:
-        structure: What is assumed of the system.
+        structure: The structure of the system.
         completion: xi, shape (d, 1).
         completion_signals: Names and units of xi. A chosen one is its own name: "x3", or
             "x0 - 0.5 x1".
@@ -46,8 +46,8 @@ class NormalForm:
         margin: How far the Jacobian of Phi is from singular over `structure.states`.
 
     Raises:
-        ModelError: A completion that does not fit, or whose differentials are not independent of
-            each other and of the chains; or B(x) is singular.
+        ModelError: The completion does not fit, or its differentials are not independent of each
+            other and of the chains; or B(x) is singular.
     """
 
     def __init__(
@@ -95,12 +95,12 @@ class NormalForm:
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            Shape (n,), as `coordinate_signals`.
+            (y, zeta, xi), shape (n,), named by `coordinate_signals`.
         """
         return self._coordinates(state, self.system.parameter_vector(parameters))[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """dPhi/dx, shape (n, n); singular where Phi is no coordinate change, see the class.
+        """dPhi/dx, shape (n, n); singular where Phi is no change of coordinates, see the class.
 
         Args:
             state: x, shape (n,).
@@ -127,12 +127,12 @@ class NormalForm:
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            Shape (n,).
+            x, shape (n,).
 
         Raises:
             InconsistentStateError: There is no such state, or no way to it from the guess. Its
                 residual is what is left in the coordinates, shape (n,).
-            ModelError: Shapes that do not fit, or numbers that are not finite.
+            ModelError: Shapes do not fit, or numbers are not finite.
         """
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
@@ -203,8 +203,8 @@ class NormalForm:
         before = np.linalg.svd(first * columns / rows[:, None], compute_uv=False)
         if sizes[-1] < 0.1 * before[-1]:
             message += (
-                "The coordinates (20)-(22) become dependent there: A(x) of (2) or B(x) of (16) "
-                "loses its rank (Theorem 2.1)"
+                "The coordinates (20)-(22) become dependent there: A(x) of Assumption (2) or B(x) "
+                "of (16) loses its rank (Theorem 2.1)"
             )
             if self.completion_signals:
                 message += (
@@ -216,7 +216,7 @@ class NormalForm:
         return InconsistentStateError(message, left)
 
     def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Phi and its Jacobian."""
+        """Phi and its Jacobian at a state."""
         values, jacobian = self._map(state, parameters)
         return values, jacobian.reshape(values.size, -1)
 

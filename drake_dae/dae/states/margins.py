@@ -23,8 +23,8 @@ class Margin:
 
     Attributes:
         singular_value: The smallest singular value over all examined states.
-        relative: The same after rows and columns are scaled to about length one, by factors that
-            are common to all states, so that units do not matter.
+        relative: The smallest one after rows and columns are scaled to about length one, by factors
+            that are common to all states, so that units do not matter.
         state: Where `relative` is smallest, shape (n,).
         vanishing_row: The row that is zero there; None if none is.
     """
@@ -50,7 +50,7 @@ def find_margin(
 
     Args:
         samples: The states.
-        matrix: Shape (k, l), k <= l.
+        matrix: An expression of the state, shape (k, l), k <= l.
         round_off: Which entries are taken as zero; none if None.
         search: Also go downhill from the worst states, in the box that the states span and the
             region.

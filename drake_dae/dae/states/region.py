@@ -23,8 +23,8 @@ class Region:
     """The states low <= x <= high.
 
     Attributes:
-        low: Shape (n,); -inf where there is no bound.
-        high: Shape (n,), not below `low`.
+        low: The lower bounds, shape (n,); -inf where there is none.
+        high: The upper bounds, shape (n,), not below `low`; inf where there is none.
     """
 
     low: FloatArray
@@ -42,7 +42,7 @@ class ConsistentRegion:
 
     Args:
         manifold: N*, or what is known of it.
-        region: None is the whole of N*.
+        region: The region; None for the whole of N*.
     """
 
     def __init__(self, manifold: Manifold, region: Region | None) -> None:
@@ -53,7 +53,7 @@ class ConsistentRegion:
         """A consistent state in the region, near a guess.
 
         Raises:
-            InconsistentStateError: None found.
+            InconsistentStateError: No consistent state is found in the region.
         """
         region = self.region
         if region is None:
@@ -78,7 +78,7 @@ class ConsistentRegion:
         So random values in the bounds cover them, whatever the constraints move.
 
         Raises:
-            InconsistentStateError: No consistent state in the region.
+            InconsistentStateError: No consistent state is found in the region.
         """
         region = self.region
         if region is None:
@@ -161,7 +161,7 @@ class ConsistentRegion:
             return float(np.min((edge - state)[moving] / step[moving], initial=np.inf))
 
     def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
-        """Where Newton's method for the constraints ends that does not leave the box."""
+        """Where Newton's method for the constraints ends, with steps that do not leave the box."""
 
         def linearize(state: FloatArray) -> Linearization | None:
             gradient = self.manifold.gradients(state)

@@ -26,7 +26,7 @@ class Samples:
         region: Where the states must be; None for anywhere.
 
     Attributes:
-        states: Shape (samples, n).
+        states: The consistent states, shape (samples, n).
         fields: f, g, h, l and m of the system with E = 1 at each state, by letter.
         scale: How large each state is over all of them and the guesses, shape (n,).
 
@@ -69,7 +69,7 @@ class Samples:
         """Expressions of the state, as matrices, at each state.
 
         Raises:
-            ModelError: One is not finite.
+            ModelError: An expression is not finite at a state.
         """
         function = self.system.trace("sample", expressions, often=False)
         result = []
@@ -85,7 +85,7 @@ class Samples:
         return result
 
     def field(self, key: str) -> list[Sized]:
-        """g or h at each state, with the sizes of its entries."""
+        """The field g or h at each state, with the sizes of its entries."""
         return [(values[key], np.abs(values[key])) for values in self.fields]
 
     def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
@@ -93,11 +93,11 @@ class Samples:
 
         Args:
             rows: The derivatives, shape (a, k), whose structure may decide.
-            functions: Shape (a, 1).
-            field: Shape (n, k), at each state.
+            functions: The functions, shape (a, 1).
+            field: The fields at each state, shape (n, k).
 
         Returns:
-            Shape (samples, a, k).
+            The derivatives, shape (samples, a, k).
         """
         if not rows.nnz():
             return np.zeros((len(self.states), *rows.shape))
@@ -126,10 +126,10 @@ def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> 
     """The nominal state, and random ones around it, shape (count + 1, n); none is consistent yet.
 
     Args:
-        system: (1)-(3).
-        spread: Their standard deviation; as in `spread_of`.
-        count: How many.
-        seed: Starts the random numbers.
+        system: The system (1)-(3).
+        spread: Their standard deviation, as in `spread_of`.
+        count: How many random states are drawn.
+        seed: The seed of the random numbers.
     """
     random = np.random.default_rng(seed)
     normal = np.vstack(
@@ -142,7 +142,7 @@ def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
     """A spread as shape (n,): one that is given, a number for all, or the system's own if None.
 
     Raises:
-        ModelError: A wrong shape, or a number that is not finite.
+        ModelError: The shape is wrong, or a number is not finite.
     """
     if spread is None:
         return system.nominal_spread

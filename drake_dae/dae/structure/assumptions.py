@@ -22,11 +22,11 @@ class Cause(Enum):
         "The constraint then binds the control instead of the state. Take that control out, or add "
         "an actuator state in front of it"
     )
-    NO_FORCE = "It is redundant, or no force keeps it"
+    NO_FORCE = "It is redundant, or no constraint input keeps it"
     NO_CONTROL = "Choose another output"
     CONSTRAINT_RANK = (
-        "The constraints are redundant or their forces cannot act independently. Remove a "
-        "redundant constraint, or keep away from this state"
+        "The constraints are redundant, or their constraint inputs cannot act independently. "
+        "Remove a redundant constraint, or keep away from this state"
     )
     CONTROL_RANK = (
         "An output may repeat a constraint or another output; choose other outputs, keep away from "
@@ -41,12 +41,12 @@ class Violation:
     Attributes:
         assumption: Its number in the paper.
         cause: What is wrong.
-        names: The constraints or outputs that it is about.
+        names: The names of the constraints or outputs that it is about.
         order: The order of the derivative of a constraint or output that it is about, if any.
         state: A consistent state where the assumption fails, shape (n,); None if it fails
             everywhere.
-        singular_value: The smallest one there of A(x) or B(x), rows and columns scaled, if the
-            rank is lost.
+        singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
+            if the rank is lost.
     """
 
     assumption: int
@@ -91,8 +91,8 @@ class Violation:
                 )
             case Cause.NO_FORCE:
                 return (
-                    f"no constraint input ever acts on constraint {names}: no force reaches it, or "
-                    "its derivatives repeat each other or fill the state"
+                    f"no constraint input ever acts on constraint {names}: none reaches it, or its "
+                    "derivatives repeat each other or fill the state"
                 )
             case Cause.NO_CONTROL:
                 return (
@@ -102,8 +102,8 @@ class Violation:
                 )
             case Cause.CONSTRAINT_RANK:
                 return (
-                    f"A(x) of (2) loses rank{where}: smallest singular value {value} (rows and "
-                    "columns scaled)"
+                    f"A(x) loses rank{where}: smallest singular value {value} (rows and columns "
+                    "scaled)"
                 )
             case Cause.CONTROL_RANK:
                 return (
@@ -129,7 +129,7 @@ def rank_violation(
         vanishing, dependent: The number of the assumption, and the cause.
 
     Returns:
-        None if the matrix is regular.
+        The violation; None if the matrix is regular.
     """
     if margin is None or not margin.is_singular:
         return None

@@ -21,14 +21,14 @@ from drake_dae.errors import ModelError
 
 @dataclass(frozen=True, eq=False)
 class Constrained:
-    """What the constraints alone decide, by Assumptions (1) and (3).
+    """What the constraints alone decide of a system, by Assumptions (1) and (3).
 
     Attributes:
         degrees: r_1, ..., r_m.
         samples: The consistent states at which numbers are decided.
-        derivatives: Time derivatives along the motion on N*.
-        elimination: (9)-(14); not finite where A(x) is singular.
-        margin: Margin of A(x); None without constraints.
+        derivatives: The time derivatives along the motion on N*.
+        elimination: Equations (9)-(14) as expressions; not finite where A(x) is singular.
+        margin: The margin of A(x); None without constraints.
     """
 
     degrees: tuple[int, ...]
@@ -44,14 +44,15 @@ def examine_constraints(
     """Finds r_1, ..., r_m and A(x) of a system that `check_system` takes.
 
     Args:
-        system: (1)-(3).
-        guesses: States near which consistent ones are looked for, shape (count, n).
-        region: Where these must be.
+        system: The system (1)-(3).
+        guesses: States near which consistent ones are sought, shape (count, n).
+        region: Where the consistent states must be; None for anywhere.
 
     Raises:
-        AssumptionError: (1), (3), or a constraint that no constraint input acts on. A singular A(x)
-            is left to `constraint_violation`.
-        InconsistentStateError, ModelError: As `find_structure`.
+        AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
+            constraint. A singular A(x) is left to `constraint_violation`.
+        InconsistentStateError: There is no consistent state near a guess.
+        ModelError: A function is not finite, or the mass matrix is none.
     """
     chains = constraint_chains(system, guesses, region)
     samples = Samples(Manifold(system, chains), guesses, region)
@@ -64,11 +65,12 @@ def examine_constraints(
 
 
 def check_system(system: DaeSystem) -> None:
-    """Refuses what there is nothing to examine of.
+    """Refuses a system in which there is nothing to steer, or too much to keep.
 
     Raises:
-        AssumptionError: More constraints than states.
-        ModelError: No control input, or a mass matrix that is not symmetric and positive definite.
+        AssumptionError: There are more constraints than states.
+        ModelError: There is no control input, or the mass matrix is not symmetric and positive
+            definite.
     """
     if system.num_controls == 0:
         raise ModelError(f"{system.name}: no control inputs, so there is nothing to steer")
@@ -87,7 +89,7 @@ def constraint_violation(
 
 
 def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Its factorization LDL^T reads one triangle, and would not notice.
+    """Refuses what is no mass matrix: its factorization LDL^T reads one triangle alone.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.

@@ -21,7 +21,7 @@ from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized
 
 MANY = 10
-"""So many random states have no zero in common of a function that is not zero."""
+"""A function that is zero at this many random states is zero."""
 
 
 def constraint_chains(
@@ -30,13 +30,13 @@ def constraint_chains(
     """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3).
 
     Args:
-        system: (1)-(3).
-        guesses: States near which consistent ones are looked for, shape (count, n).
-        region: Where these must be; None for anywhere.
+        system: The system (1)-(3).
+        guesses: States near which consistent ones are sought, shape (count, n).
+        region: Where the consistent states must be; None for anywhere.
 
     Raises:
-        AssumptionError: A violation of (1) or (3), or a constraint that no constraint input acts
-            on.
+        AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
+            constraint.
     """
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
@@ -76,7 +76,7 @@ def constraint_chains(
 
 
 class OutputChains(NamedTuple):
-    """What Assumption (4) decides of the outputs; the attributes are those of `Structure`."""
+    """What Assumption (4) decides of the outputs, as `Structure` explains its fields."""
 
     chains: tuple[tuple[ca.SX, ...], ...]
     drift: ca.SX
@@ -92,12 +92,12 @@ def output_chains(
     """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x).
 
     Args:
-        derivatives: Time derivatives along the constrained motion.
-        elimination: (9)-(14).
+        derivatives: The time derivatives along the motion on N*.
+        elimination: Equations (9)-(14) as expressions.
         samples: The consistent states at which numbers decide.
 
     Raises:
-        AssumptionError: A violation of (4), or an output that no control acts on.
+        AssumptionError: Assumption (4) is violated, or no control acts on an output.
     """
     system, control = derivatives.system, derivatives.control
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star

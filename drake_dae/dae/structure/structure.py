@@ -37,18 +37,18 @@ class Structure:
         output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
             enters the output at once (the paper's outputs s + 1, ..., p).
         manifold: N* (4).
-        derivatives: Time derivatives along the motion on N*.
-        elimination: (9)-(14).
-        output_chains: Per output l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i.
+        derivatives: The time derivatives along the motion on N*.
+        elimination: Equations (9)-(14) as expressions.
+        output_chains: The chain l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output.
         highest_derivatives: z_i^(mu_i) in terms of the unknowns of `derivatives`, shape (p, 1).
-        drift: a_1(x), a_2(x) of (28): L_f*^mu_i l*_i, shape (p, 1).
+        drift: a(x) of (28), L_f*^mu_i l*_i in the order of the outputs, shape (p, 1).
         control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p).
         chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
         round_off: Which entries of B(x) are zero but for round-off at all of many states, shape
             (p, p). A column of nothing else would be scaled up to the size of the others.
         states: The consistent states at which numbers were decided, shape (samples, n).
-        constraint_margin: Margin of A(x), Assumption (2); None without constraints.
-        control_margin: Margin of B(x), Assumption (5).
+        constraint_margin: The margin of A(x), Assumption (2); None without constraints.
+        control_margin: The margin of B(x), Assumption (5).
     """
 
     system: DaeSystem
@@ -88,12 +88,12 @@ class Structure:
 
     @property
     def num_dynamic_outputs(self) -> int:
-        """s of (15)."""
+        """s of (15), the number of outputs with mu_i >= 1."""
         return len(self.layout.dynamic)
 
     @property
     def zero_dynamics_dimension(self) -> int:
-        """dim xi of (22): n - sum r_i - sum mu_i."""
+        """The dimension of xi in (22), n - sum r_i - sum mu_i."""
         return self.manifold.dimension - self.layout.chain_size
 
     @property
@@ -124,7 +124,7 @@ class Structure:
 
         Args:
             name: What it is, for messages.
-            value: Of the state and of the control `derivatives.control`.
+            value: An expression of the state and of the control `derivatives.control`.
             needs_control: Whether the function takes the control; without one it is put to 0.
 
         Returns:
@@ -147,17 +147,17 @@ def find_structure(
     consistent states drawn around `system.nominal_state`, with the default parameters.
 
     Args:
-        system: (1)-(3).
-        spread: Standard deviation of the drawn states around the nominal one, a number for all
-            or shape (n,); see `DaeSystem.nominal_spread` if None.
+        system: The system (1)-(3).
+        spread: The standard deviation of the drawn states around the nominal one, a number for all
+            or shape (n,); `DaeSystem.nominal_spread` if None.
         count: How many states are drawn, at least 1.
-        seed: Of the random numbers.
+        seed: The seed of the random numbers.
 
     Raises:
-        AssumptionError: An assumption that is violated, with the state where.
-        InconsistentStateError: No consistent state near the nominal one.
-        ModelError: No control input, a function that is not finite at the nominal state, a mass
-            matrix that is not symmetric and positive definite, or a count or spread without sense.
+        AssumptionError: An assumption is violated; the exception has the state where.
+        InconsistentStateError: There is no consistent state near the nominal one.
+        ModelError: There is no control input, a function is not finite at the nominal state, the
+            mass matrix is not symmetric and positive definite, or count or spread make no sense.
     """
     structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
     if violation:
@@ -166,16 +166,16 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """The structure of a system: as given, or found where it is not known yet.
+    """The structure of a system, as given, or found where it is not known yet.
 
     Args:
         owner: Who needs it, for messages.
-        system: (1)-(3).
-        structure: What is known, or None.
+        system: The system (1)-(3).
+        structure: The structure, or None to find it.
 
     Raises:
-        AssumptionError, InconsistentStateError: As `find_structure`.
-        ModelError: No system, or the structure of another system.
+        AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
+        ModelError: This is no system, or the structure is that of another one.
     """
     check_is_system(system, owner)
     if structure is None:
@@ -191,15 +191,15 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
 def examine_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> tuple[Structure, Violation | None]:
-    """As `find_structure`, but complete also where B(x) is singular.
+    """Finds the structure as `find_structure` does, but also where B(x) is singular.
 
     Returns:
         The structure, and how B(x) violates Assumption (4) or (5); None if it does not.
 
     Raises:
-        AssumptionError: A violation before there is a B(x): of Assumptions (1)-(3), or by an
-            output that has no degree.
-        InconsistentStateError, ModelError: As `find_structure`.
+        AssumptionError: There is no B(x), since one of Assumptions (1)-(3) is violated or an
+            output has no degree.
+        InconsistentStateError, ModelError: There is no structure to find; see `find_structure`.
     """
     check_is_system(system, "find_structure")
     check_system(system)
@@ -218,9 +218,9 @@ def examine_outputs(constrained: Constrained) -> Structure:
     """Finds mu_1, ..., mu_p and B(x), where A(x) is regular.
 
     Raises:
-        AssumptionError: (4), or an output that no control acts on. A singular B(x) is left to
-            `control_violation`.
-        ModelError: A function that is not finite.
+        AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
+            B(x) is left to `control_violation`.
+        ModelError: A function is not finite.
     """
     samples, elimination = constrained.samples, constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)

@@ -12,7 +12,7 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
 
 AT_REST = 1e-8
-"""A state is at rest if its forces balance to this, relative to their sizes."""
+"""A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Unrest:
 
     Attributes:
         regularity: Whether the motion is determined there.
-        moving: If it is, the state that moves most, relative to the forces that it balances.
-        rate: Its time derivative.
+        moving: If it is, the state that moves most, relative to the terms that cancel in its rate.
+        rate: The time derivative of this state.
     """
 
     regularity: Regularity
@@ -49,7 +49,7 @@ class Equilibria:
         self.sizes = np.maximum(examined, pinned.system.nominal_spread)
 
     def held_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """R of constant outputs as they are at a state.
+        """R with constant outputs, as they are at a state.
 
         The state does not tell outputs of degree 0; they are as brings it nearest to rest.
         """
@@ -80,17 +80,16 @@ class Equilibria:
             slopes, _ = pinned.slopes(x, reference, parameters)
             if onto is None or not np.all(np.isfinite(slopes)):
                 return None
-            step_onto, regular = onto
             tangent = scipy.linalg.null_space(gradients)
             along = tangent.T @ slopes @ tangent
             noise = ROUND_OFF * balanced_norm(slopes) / (np.linalg.norm(along) or 1.0)
             inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
 
             def step(x: FloatArray) -> FloatArray:
-                across = step_onto(x)
+                across = onto.step(x)
                 return across - inner @ (pinned.rate(x, reference, parameters) + slopes @ across)
 
-            return Linearization(step, regular)
+            return Linearization(step, onto.is_regular)
 
         start = pinned.state(reference, guess, parameters)
         state, converged = newton(start, linearize)
@@ -106,7 +105,7 @@ class Equilibria:
         )
 
     def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
-        """What moves at a point, or is singular, if anything is.
+        """What moves at a point, or that it is singular; None at a regular equilibrium.
 
         Neither moves what a tiny change of the state brings to rest, as in a fast system.
         """

@@ -27,10 +27,10 @@ class Ending:
     """Up to where there is a motion with pinned outputs, and why not further.
 
     Attributes:
-        cause: Why.
-        time: Up to where, in s.
+        cause: Why the motion ends.
+        time: Up to when there is a motion, in s.
         state: The last state, shape (n,); None if there is none.
-        matrix: "A" or "B", of which the rank is lost; empty if it is not.
+        matrix: The matrix that loses its rank, "A" or "B"; empty if none does.
         text: All of this in a sentence.
     """
 
@@ -49,10 +49,10 @@ class PinnedMotion:
     """The motion with the outputs on a reference, as far as there is one.
 
     Attributes:
-        times: In s, those of the wanted times that were reached, shape (k,).
-        states: x, shape (k, n).
-        controls: u, shape (k, p).
-        constraint_inputs: v, shape (k, m).
+        times: The wanted times that were reached, in s, shape (k,).
+        states: x at these times, shape (k, n).
+        controls: u at these times, shape (k, p).
+        constraint_inputs: v at these times, shape (k, m).
         constraint_margins: The smallest singular value of A(x), shape (k,); infinite if m = 0.
         control_margins: The smallest singular value of B(x), shape (k,).
         ending: Why the last time was not reached; None if it was.

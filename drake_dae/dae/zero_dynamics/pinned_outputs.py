@@ -24,7 +24,7 @@ from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
 VANISHED = 1e-9
-"""Below this part of its usual margin A or B counts as singular, also where it is one number."""
+"""A or B counts as singular below this part of its usual margin, also where it is one number."""
 
 
 class Regularity(Enum):
@@ -46,7 +46,7 @@ class Point:
         control: u, shape (p,).
         constraint_input: v, shape (m,).
         A, B: The matrices of Assumptions (2) and (5).
-        pivot: 0 exactly where one of them is singular, shape (1,).
+        pivot: A number that is 0 exactly where one of them is singular, shape (1,).
         unrest: |E x'| relative to the sizes of the terms that cancel in it at rest, shape (n,).
     """
 
@@ -74,7 +74,7 @@ class PinnedOutputs:
     """Z(R) and the motion on it; all arguments are arrays of the right sizes.
 
     Args:
-        structure: What is assumed of the system.
+        structure: The structure of the system.
 
     Attributes:
         layout: How R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) is stacked.
@@ -96,7 +96,7 @@ class PinnedOutputs:
         derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
         factors = Factorization(structure.control_matrix)
         control = factors.solve(highest - structure.drift)
-        self._rate, force = (
+        self._rate, constraint_input = (
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
         )
@@ -105,18 +105,18 @@ class PinnedOutputs:
         self._gradient = system.trace(
             "gradient of the pinned outputs",
             {"gradient": ca.jacobian(ca.cse(residual), system.state)},
-            often=False,  # It shares what the residual does; to find more takes long.
+            often=False,  # Those of the residual are removed above; finding more takes long.
         )
         # E x' = f + g v + h u, and the sizes of what cancels in it at rest.
         mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
         sizes = ca.mtimes(mass, ca.fmax(1.0, ca.fabs(system.state))) + ca.fabs(system.f)
-        sizes += ca.mtimes(g, ca.fabs(force)) + ca.mtimes(h, ca.fabs(control))
+        sizes += ca.mtimes(g, ca.fabs(constraint_input)) + ca.mtimes(h, ca.fabs(control))
         self._motion = system.trace(
             "pinned motion",
             {
                 "rate": self._rate,
                 "control": control,
-                "constraint_input": force,
+                "constraint_input": constraint_input,
                 "constraint_matrix": structure.elimination.constraint_matrix,
                 "control_matrix": structure.control_matrix,
                 "pivot": ca.fmin(factors.pivot, structure.elimination.pivot),
@@ -126,7 +126,11 @@ class PinnedOutputs:
         )
 
     def state(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """A state on Z(R), to round-off; raises InconsistentStateError if none is found."""
+        """A state on Z(R), to round-off.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
         name, outputs = self.system.name, self.describe(reference)
         found, converged = self.project(guess, reference, parameters)
         if converged:
@@ -175,7 +179,7 @@ class PinnedOutputs:
     def residual(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """What is zero on Z(R), as `residual_signals`."""
+        """What is zero on Z(R), named by `residual_signals`, shape (k,)."""
         return self._residual.evaluate(state, reference, parameters)[0].copy()
 
     def gradients(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -240,7 +244,7 @@ class PinnedOutputs:
         )
 
     def point(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> Point:
-        """What belongs to a state on Z(R)."""
+        """A state on Z(R) with its rate, inputs and matrices."""
         values = self._motion.evaluate(state, reference, parameters)
         return Point(state, *(value.copy() for value in values))
 
@@ -266,7 +270,7 @@ class PinnedOutputs:
 
 
 def _square(matrix: FloatArray) -> FloatArray:
-    """A square matrix, which came as a vector if it has one column."""
+    """A square matrix; one with one column comes as a vector."""
     return matrix.reshape(round(matrix.size**0.5), round(matrix.size**0.5))
 
 

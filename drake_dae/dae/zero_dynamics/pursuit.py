@@ -11,7 +11,7 @@ from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point, Reg
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 
 TOLERANCE = 1e-6
-"""Of an integration step, relative to the state; the method's estimate is two orders too high."""
+"""The error of an integration step by the method's estimate, which is two orders too high."""
 
 
 SHORTEST = 1e-6
@@ -27,7 +27,7 @@ STEPS = 20_000
 
 
 GROWN = 1e8
-"""By this factor a state grows only without bound."""
+"""A state that has grown by this factor grows without bound."""
 
 
 LOST = 1e-2
@@ -35,7 +35,7 @@ LOST = 1e-2
 
 
 Reference = Callable[[float], FloatArray]
-"""t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape (sum (mu_i + 1),)."""
+"""A function t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape (sum (mu_i + 1),)."""
 
 
 def follow(
@@ -75,7 +75,7 @@ def follow(
 
 
 class _MotionEnd(Exception):
-    """A motion does not go on."""
+    """A motion with pinned outputs does not go on."""
 
     def __init__(self, ending: Ending) -> None:
         super().__init__(str(ending))
@@ -116,13 +116,13 @@ class _Pursuit:
         self._largest = self._last.margins
 
     def points(self) -> Iterator[Point]:
-        """One for each time."""
+        """The points of the motion, one for each time."""
         yield self._last
         has_dynamics = self._pinned.structure.zero_dynamics_dimension > 0
         yield from self._integrate() if has_dynamics else self._continue()
 
     def _continue(self) -> Iterator[Point]:
-        """Without zero dynamics: predictor and Newton's method."""
+        """Goes on without zero dynamics, by a predictor and Newton's method."""
         step, change = np.inf, np.zeros(self._last.state.size)
         for end in self._times[1:]:
             interval = end - self._time
@@ -141,7 +141,7 @@ class _Pursuit:
             yield self._last
 
     def _integrate(self) -> Iterator[Point]:
-        """With zero dynamics: an implicit integrator, since they may be stiff."""
+        """Goes on with zero dynamics, by an implicit integrator, since they may be stiff."""
         bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state))))
         integrator = None
         for end in self._times[1:]:
@@ -169,7 +169,7 @@ class _Pursuit:
             yield self._last
 
     def _integrator(self, end: float, step: float | None = None) -> scipy.integrate.Radau:
-        """Of x' = f* + h* u from the last point."""
+        """An integrator of x' = f* + h* u from the last point."""
 
         def rate(time: float, state: FloatArray) -> FloatArray:
             return self._pinned.rate(state, self._goal(time), self._parameters)
@@ -192,7 +192,7 @@ class _Pursuit:
         )
 
     def _goal(self, time: float) -> FloatArray:
-        """R(t)."""
+        """R at a time, shape (sum (mu_i + 1),); the motion ends where it is not finite."""
         layout = self._pinned.layout
         try:
             goal = np.asarray(self._reference(time), dtype=float).reshape(-1)
@@ -265,5 +265,5 @@ class _Pursuit:
         return self._stop(Cause.OUT_OF_REACH, text, matrix)
 
     def _stop(self, cause: Cause, text: str, matrix: str = "") -> _MotionEnd:
-        """An end at the last point."""
+        """The end of the motion at the last point."""
         return _MotionEnd(Ending(cause, self._time, text, self._last.state, matrix))

@@ -1,4 +1,4 @@
-"""Stability of the zero dynamics at an equilibrium, by linearization.                 (36)"""
+"""Stability of the zero dynamics at an equilibrium, by linearization.            (35)-(36)"""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -37,10 +37,10 @@ class Stability:
         verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
             one; undecided if one is on the imaginary axis up to round-off, or if no equilibrium is
             found. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
-        eigenvalues: Of the zero dynamics in 1/s, largest real part first, shape (dimension,);
-            empty if no equilibrium is found.
+        eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
+            (dimension,); empty if no equilibrium is found.
         state: The equilibrium, shape (n,); None if none is needed, or found.
-        reason: A sentence.
+        reason: What decided, in words.
     """
 
     verdict: Verdict
@@ -69,7 +69,7 @@ def linearized_eigenvalues(
         parameters: Values of all parameters.
 
     Returns:
-        In 1/s, largest real part first, each of shape (dimension,).
+        Both in 1/s, largest real part first, shape (dimension,) each.
     """
     slopes, _ = pinned.slopes(state, reference, parameters)
     tangent = scipy.linalg.null_space(pinned.gradients(state, parameters))
@@ -109,7 +109,7 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
     """What the eigenvalues at an equilibrium say.
 
     Args:
-        values, errors: As from `linearized_eigenvalues`; at least one.
+        values, errors: What `linearized_eigenvalues` returns; at least one eigenvalue.
         state: The equilibrium, shape (n,).
         place: The equilibrium in words.
     """

@@ -33,8 +33,8 @@ class ZeroDynamics:
     None; and `parameters` are the values of all parameters, the defaults if None.
 
     Args:
-        system: (1)-(3).
-        structure: If it is known already; found otherwise.
+        system: The system (1)-(3).
+        structure: The structure of the system; found if None.
 
     Attributes:
         dimension: dim xi = n - sum r_i - sum mu_i.
@@ -59,11 +59,11 @@ class ZeroDynamics:
         """A state on Z(R), to round-off, by Newton's method with shortest steps from a guess.
 
         Returns:
-            Shape (n,).
+            x, shape (n,).
 
         Raises:
             InconsistentStateError: Newton's method does not reach Z(R) from there.
-            ModelError: A wrong shape, or a number that is not finite.
+            ModelError: A shape is wrong, or a number is not finite.
         """
         goal = self._vector("reference", reference, self._pinned.layout.reference_size)
         return self._pinned.state(
@@ -83,13 +83,13 @@ class ZeroDynamics:
         x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step.
 
         Args:
-            reference: t -> R(t); it is also asked between the times.
-            times: In s, increasing, shape (k,).
-            guess: For the first state; decides which of several solutions is followed.
+            reference: The function t -> R(t); it is also asked between the times.
+            times: Times in s, increasing, shape (k,).
+            guess: A state near the first one; it decides which of several solutions is followed.
             parameters: Values of all parameters.
 
         Raises:
-            ModelError: A wrong shape, or times that do not increase. Any other failure is told by
+            ModelError: A shape is wrong, or the times do not increase. Any other failure is told by
                 the motion that comes back; see `PinnedMotion.ending`.
         """
         grid = self._vector("times", times)
@@ -114,12 +114,12 @@ class ZeroDynamics:
             parameters: Values of all parameters.
 
         Returns:
-            Shape (n,).
+            x, shape (n,).
 
         Raises:
-            InconsistentStateError: No state near the guess has these outputs; or such states, but
-                none at rest: `residual` is then x', shape (n,).
-            ModelError: A wrong shape, or a number that is not finite.
+            InconsistentStateError: No state near the guess has these outputs; or there are such
+                states, but none at rest: `residual` is then x', shape (n,).
+            ModelError: A shape is wrong, or a number is not finite.
         """
         goal = self._constant(outputs)
         return self._equilibria.find(
@@ -132,11 +132,11 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> ComplexArray:
-        """Of the zero dynamics, linearized at an equilibrium whose outputs are held.
+        """The eigenvalues of the zero dynamics, linearized at an equilibrium of held outputs.
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
-        eigenvalues there. In closed loop they stand beside the roots of (32). Of a linear system
-        they are the invariant zeros.
+        eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
+        system are its invariant zeros.
 
         Args:
             state: x, shape (n,).
@@ -146,7 +146,7 @@ class ZeroDynamics:
                 values do, such as the force on a surface that nothing else moves.
 
         Returns:
-            In 1/s, largest real part first, shape (dimension,).
+            The eigenvalues in 1/s, largest real part first, shape (dimension,).
 
         Raises:
             ModelError: The state is not an equilibrium on N*.
@@ -180,12 +180,12 @@ class ZeroDynamics:
 
         Raises:
             InconsistentStateError: The state is not near N*.
-            ModelError: A wrong shape, or a number that is not finite.
+            ModelError: A shape is wrong, or a number is not finite.
         """
         nothing = np.zeros(0, dtype=complex)
         if self.dimension == 0:
             margins = {
-                "A(x) of (2)": self.structure.constraint_margin,
+                "A(x) of Assumption (2)": self.structure.constraint_margin,
                 "B(x) of (16)": self.structure.control_margin,
             }
             for matrix, margin in margins.items():
@@ -219,12 +219,12 @@ class ZeroDynamics:
     def _goal(
         self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
     ) -> FloatArray:
-        """R of constant outputs: those given, or those of a state."""
+        """R with constant outputs: those given, or those of a state."""
         if outputs is None:
             return self._equilibria.held_outputs(state, parameters)
         return self._constant(outputs)
 
     def _constant(self, outputs: ArrayLike) -> FloatArray:
-        """R of outputs that stay as they are."""
+        """R with outputs that stay at given values."""
         values = self._vector("outputs", outputs, self.system.num_controls)
         return self._pinned.layout.constant(values)

@@ -18,13 +18,13 @@ class ActuationChain:
 
     Attributes:
         stages: The stages from the joints toward the motor; none for rigid joints.
-        joint_force: tau(q, v, s), what the joints get from the stages, shape (p, 1); 0 for rigid
+        joint_force: tau(q, v, s), the forces of the stages on the joints, shape (p, 1); 0 for rigid
             joints.
-        direct: What the joints get from u at once, shape (p, p): 1 for rigid joints, otherwise 0.
-        state: All stages' states, shape (k, 1).
+        direct: How u acts on the joints at once, shape (p, p): 1 for rigid joints, otherwise 0.
+        state: The states of all stages, shape (k, 1).
         mass, drift, drive: E s' = drift + drive u, shapes (k, k), (k, 1), (k, p).
         control_signals: Names and units of u.
-        parameters: Numbers of all stages.
+        parameters: The parameters of all stages.
     """
 
     stages: tuple[AttachedStage, ...]
@@ -56,8 +56,8 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         links: The robot.
 
     Raises:
-        ModelError: A stage stands behind one that nothing can drive, or two carry the rotors; or
-            the actuators do not drive derivatives of positions, each its own.
+        ModelError: A stage stands behind one that nothing can drive, or two stages carry the
+            rotors; or the actuators do not drive derivatives of positions, each its own.
     """
     for stage in stages if isinstance(stages, Sequence) else [None]:
         if not isinstance(stage, Stage):
@@ -97,7 +97,7 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
 
 
 def _rigid_joints(links: Links) -> ActuationChain:
-    """No stage: the control is the joint force."""
+    """The chain without a stage: the control is the joint force."""
     p, none = len(links.actuator_signals), ca.SX(0, 1)
     return ActuationChain(
         stages=(),
@@ -131,7 +131,7 @@ def _actuated(links: Links) -> tuple[ca.SX, ca.SX]:
 
 
 def _check_rotors(names: Sequence[str], attached: Sequence[AttachedStage]) -> None:
-    """The rotors turn with one stage: two springs in a row would count them twice."""
+    """Refuses rotors that turn with more than one stage: they would count twice."""
     carriers = [n for n, own in zip(names, attached, strict=True) if own.carries_rotors]
     if len(carriers) > 1:
         raise ModelError(

@@ -30,7 +30,7 @@ class FlexibleJoints(Stage):
     Attributes:
         stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite.
         inertia: M_2 in kg m^2 (kg), likewise; what the URDF declares if None.
-        damping: D in N m s/rad (N s/m), likewise, positive definite; 0 for none.
+        damping: D in N m s/rad (N s/m), likewise positive definite; 0 for none.
     """
 
     stiffness: ArrayLike

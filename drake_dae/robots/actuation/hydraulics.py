@@ -1,4 +1,4 @@
-"""Electrohydraulic servos."""
+"""Electrohydraulic servos.                                         (the end of section 3.3)"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

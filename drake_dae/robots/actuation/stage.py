@@ -1,4 +1,4 @@
-"""What stands between the control and the joints: a chain of stages toward the motor.
+"""What a stage of actuation, between the control and the joints, says of itself.
 
 No stage is rigid joints (37), where the control is the joint torque. A stage delivers a force to
 its load, the joints or the shaft of the stage before it, and is driven by the stage after it or by
@@ -24,10 +24,10 @@ class AttachedStage:
         state_signals: Names and units of s.
         mass: E, shape (k, k), symmetric positive definite.
         drift: Takes the load's position and velocity, each of shape (p, 1); returns shape (k, 1).
-        drive_matrix: What the drive does, shape (k, p).
+        drive_matrix: How the drive acts on s, shape (k, p).
         drive_signals: Names and units of the drive, p of them.
         force: Takes the load's position and velocity; returns what the load gets, shape (p, 1).
-        parameters: Numbers of these expressions.
+        parameters: The parameters of these expressions.
         ports: Output port of the plant -> the entries of s that it shows.
         shaft: Position and velocity of what a next stage drives; None if nothing can drive it.
         carries_rotors: Whether the rotors that the plant declares turn with it, not with the
@@ -68,5 +68,5 @@ class Stage(ABC):
         """The equations at the actuators of these links.
 
         Raises:
-            ModelError: A value that does not fit.
+            ModelError: A value does not fit.
         """

@@ -16,12 +16,12 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 class Application:
     """Where constraint forces act: F = force_axes @ lambda and M = moment_axes @ lambda.
 
-    All in the world. Whatever the robot touches gets the opposite.
+    All vectors are in the world. Whatever the robot touches gets the opposite.
 
     Attributes:
         point: Where F acts, in m, shape (3, 1).
         force_axes: The force in N for a unit of each constraint force, shape (3, m).
-        moment_axes: Likewise the moment in N m, shape (3, m).
+        moment_axes: The moment in N m for a unit of each constraint force, shape (3, m).
     """
 
     point: ca.SX
@@ -51,7 +51,7 @@ class Constraint(ABC):
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
-        parameters: Numbers of it that change without tracing again.
+        parameters: Its numbers that change without tracing again.
     """
 
     name: str
@@ -97,7 +97,7 @@ class Constraint(ABC):
         """Coordinates along what the constraint leaves free, shape (k, 1).
 
         Raises:
-            ModelError: It has none.
+            ModelError: The constraint has none.
         """
         raise ModelError(
             f"'{self.name}' has no coordinates along it; use PointCoordinates or an expression"
@@ -107,7 +107,7 @@ class Constraint(ABC):
         """What is to be seen where the robot touches, or None.
 
         Args:
-            values: Numbers of its parameters, below each other.
+            values: The values of its parameters, below each other.
             point: Where its forces act now, in m, shape (3,).
             size: How large a piece is of interest, m.
         """

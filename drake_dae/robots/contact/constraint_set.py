@@ -16,7 +16,7 @@ class ConstraintSet:
     """The constraints of a robot, one below the other.
 
     Attributes:
-        constraints: In the order of their constraint forces.
+        constraints: The constraints, in the order of their constraint forces.
     """
 
     constraints: Sequence[Constraint]
@@ -38,7 +38,7 @@ class ConstraintSet:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Numbers of all constraints."""
+        """The parameters of all constraints."""
         return tuple(p for c in self.constraints for p in c.parameters)
 
     def parts(self) -> Iterator[tuple[Constraint, slice]]:
@@ -66,7 +66,7 @@ class ConstraintSet:
         return kinematics.value(ca.vertcat(*rows))
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
-        """What the constraint forces do to the robot."""
+        """The forces that the constraint forces, shape (m, 1), make on the robot."""
         total = Reaction(ca.SX(kinematics.v.numel(), 1))
         for constraint, part in self.parts():
             total += constraint.reaction(kinematics, constraint_force[part])

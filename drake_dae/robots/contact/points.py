@@ -84,7 +84,7 @@ class CoincidentPoints(Constraint):
         point_a: The point in frame A, m, shape (3,).
         frame_b: Name of frame B, on another body.
         point_b: The point in frame B, m, shape (3,).
-        axes: In which of the world's axes "xyz" they coincide, for example "xz".
+        axes: The axes of the world along which they coincide, for example "xz".
         name: The name of the constraint, before those of its forces.
     """
 

@@ -18,7 +18,7 @@ from drake_dae.trace.newton import Linearization, newton, shortest_steps
 Vector = tuple[float, float, float]
 
 CELLS = 24
-"""How many cells of a mesh stand side by side."""
+"""How many cells a mesh has along each side."""
 
 
 class Surface(ABC):
@@ -57,7 +57,7 @@ class Surface(ABC):
         """Coordinates along the surface of such a point, shape (2, 1).
 
         Raises:
-            ModelError: It has none.
+            ModelError: The surface has none.
         """
         raise ModelError(
             f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "

@@ -1,4 +1,4 @@
-"""Surfaces that are known: planes, spheres, cylinders, ellipsoids, tori, and any F(p) = 0."""
+"""The surfaces: planes, spheres, cylinders, ellipsoids, tori, and any F(p) = 0."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from drake_dae.robots.contact.surface import Surface, Vector, axes_along, tangen
 
 @dataclass(frozen=True)
 class Plane(Surface):
-    """phi = n . (p - point).
+    """A plane: phi = n . (p - point). Its coordinates are along `tangents(n)`, in m.
 
     Attributes:
         point: A point of the plane, m, shape (3,).
-        normal: Toward the free side, any length, shape (3,). Coordinates: along `tangents(n)`, m.
+        normal: The direction n toward the free side, of any length, shape (3,).
     """
 
     point: Vector
@@ -54,12 +54,14 @@ class Plane(Surface):
 
 @dataclass(frozen=True)
 class Sphere(Surface):
-    """phi = |p - center| - radius; its negative inside.
+    """A sphere: phi = |p - center| - radius; its negative if `inside`.
+
+    Its coordinates are longitude and latitude about the axis in rad, singular on it.
 
     Attributes:
-        center: m, shape (3,).
-        radius: m.
-        axis: The axis of longitude and latitude, which are singular on it, shape (3,).
+        center: Its center, m, shape (3,).
+        radius: Its radius, m.
+        axis: The axis of longitude and latitude, of any length, shape (3,).
         inside: Whether the free side is the inside.
     """
 
@@ -91,12 +93,14 @@ class Sphere(Surface):
 
 @dataclass(frozen=True)
 class Cylinder(Surface):
-    """phi = distance from the axis - radius; its negative inside. It has no ends.
+    """A cylinder without ends: phi = distance from the axis - radius; its negative if `inside`.
+
+    Its coordinates are the angle about the axis in rad, and the distance along it in m.
 
     Attributes:
         point: A point of the axis, m, shape (3,).
-        axis: Direction, any length, shape (3,).
-        radius: m. Coordinates: angle about the axis in rad, distance along it in m.
+        axis: The direction of the axis, of any length, shape (3,).
+        radius: Its radius, m.
         inside: Whether the free side is the inside.
     """
 
@@ -131,12 +135,14 @@ class Cylinder(Surface):
 
 @dataclass(frozen=True)
 class Ellipsoid(Surface):
-    """phi = F / |grad F| with F = (x/a)^2 + (y/b)^2 + (z/c)^2 - 1: the distance to first order.
+    """An ellipsoid: phi = F / |grad F| with F = (x/a)^2 + (y/b)^2 + (z/c)^2 - 1.
+
+    This is the distance to first order; its negative if `inside`. The coordinates are longitude and
+    latitude of the scaled sphere in rad, singular on the z axis.
 
     Attributes:
-        center: m, shape (3,).
-        semi_axes: a, b, c in m along the world's axes, shape (3,). Coordinates: longitude and
-            latitude of the scaled sphere, rad, singular on the z axis.
+        center: Its center, m, shape (3,).
+        semi_axes: a, b, c along the world's axes, m, shape (3,).
         inside: Whether the free side is the inside.
     """
 
@@ -170,15 +176,16 @@ class Ellipsoid(Surface):
 
 @dataclass(frozen=True)
 class Torus(Surface):
-    """phi = distance from the ring - minor radius; its negative inside the tube.
+    """A torus: phi = distance from the ring - minor radius; its negative if `inside`.
+
+    Its coordinates are the angle along the ring and the angle around the tube (0 outermost) in rad.
 
     Attributes:
-        center: m, shape (3,).
-        axis: The axis of the ring, any length, shape (3,).
+        center: Its center, m, shape (3,).
+        axis: The axis of the ring, of any length, shape (3,).
         major_radius: The radius of the ring, m.
         minor_radius: The radius of the tube, m, less than the major one.
-        inside: Whether the free side is inside the tube. Coordinates: angle along the ring and
-            angle around the tube (0 outermost), rad.
+        inside: Whether the free side is inside the tube.
     """
 
     center: Vector
@@ -221,7 +228,7 @@ class Torus(Surface):
 
 @dataclass(frozen=True)
 class ImplicitSurface(Surface):
-    """phi = F / |grad F| for any smooth F(p) that is zero on the surface: the distance near it.
+    """Any smooth surface F(p) = 0: phi = F / |grad F|, the distance to first order.
 
     The gradient has length one on the surface itself.
 

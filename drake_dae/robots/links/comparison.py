@@ -1,4 +1,4 @@
-"""The equations of motion compared with the numbers of the MultibodyPlant that they are of."""
+"""The equations of motion, compared with the MultibodyPlant that they are read from."""
 
 from collections.abc import Mapping, Sequence
 
@@ -34,7 +34,7 @@ def compare_with_plant(
         terms: Expressions under the names in `_plant_terms`.
 
     Raises:
-        ModelError: A term differs, or the plant's own is not finite.
+        ModelError: A term differs, or the plant's own value is not finite.
     """
     symbols = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters])
     values = np.concatenate([np.zeros(0), *[p.value for p in parameters]])
@@ -62,7 +62,7 @@ def compare_with_plant(
 
 
 def _plant_terms(plant: MultibodyPlant, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-    """What the plant says itself."""
+    """The plant's own value of each term at positions and velocities."""
     context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
     plant.SetPositions(context, q)
     plant.SetVelocities(context, v)

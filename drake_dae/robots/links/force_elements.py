@@ -1,7 +1,6 @@
 """The springs and dampers of a MultibodyPlant.
 
-Each makes a generalized force and has an energy; what a new kind of force element does is said
-here alone.
+Each makes a generalized force and has an energy. A new kind of force element is added here alone.
 """
 
 from functools import cached_property
@@ -56,7 +55,7 @@ class Springs:
 
     Args:
         plant: One that `check_force_elements` accepts.
-        joints: Those that move, in the order of q and v.
+        joints: The joints that move, in the order of q and v.
         frames: The plant's frames.
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
         velocity_map: N, shape (nq, nv).

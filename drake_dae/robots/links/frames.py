@@ -42,7 +42,7 @@ class PlantFrames:
         """A frame of the plant by its name; "instance::name" if several have that name.
 
         Raises:
-            ModelError: No frame, or more than one, has that name; or a frame of another plant.
+            ModelError: No frame, or more than one, has that name; or it belongs to another plant.
         """
         found = self._by_name(frame) if isinstance(frame, str) else frame
         if found.GetParentPlant() is not self._plant:
@@ -65,7 +65,7 @@ class PlantFrames:
 
     @cached_property
     def link_poses(self) -> list[tuple[ca.SX, ca.SX]]:
-        """R_WL and p_WL of every link."""
+        """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
         return link_poses(self._links)
 
     def _by_name(self, name: str) -> Frame:

@@ -39,8 +39,8 @@ class ElementaryJoints:
     """A joint as elementary ones, from its inboard to its outboard frame.
 
     Attributes:
-        sequence: From inboard to outboard; empty for a weld.
-        rotation: Shape (3, 3), the constant R such that X_FM(q) = R (sequence) R^T: it turns an
+        sequence: The elementary joints from inboard to outboard; empty for a weld.
+        rotation: The constant R, shape (3, 3), such that X_FM(q) = R (sequence) R^T: it turns an
             oblique joint axis into a coordinate axis, which saves operations.
     """
 
@@ -77,8 +77,9 @@ def elementary_joints(
     Args:
         plant: The finalized plant of the joint.
         joint: One that `check_joint` accepts.
-        reverse: From the frame on the child to the frame on the parent; Drake allows it for
-            revolute, prismatic and weld joints, where the inverse has the opposite axis.
+        reverse: Whether it leads from the frame on the child to the frame on the parent; Drake
+            allows it for revolute, prismatic and weld joints, where the inverse has the opposite
+            axis.
     """
     sign = -1.0 if reverse else 1.0
     i, j = joint.position_start(), joint.velocity_start()

@@ -19,7 +19,8 @@ class Frames(Protocol):
     """
 
     @property
-    def q(self) -> ca.SX: ...
+    def q(self) -> ca.SX:
+        """Generalized positions, symbols, shape (nq, 1)."""
 
     def rotation(self, frame: Any) -> ca.SX:
         """R_WF, shape (3, 3): the orientation of a frame in the world."""
@@ -37,7 +38,7 @@ class Reaction:
         wrenches: Frame -> the force in N and the moment in N m on it, both in the world, the
             force at the frame's origin, shapes (3, k).
 
-    One reaction has k = 1 column; with k columns it is k reactions.
+    A single reaction has k = 1 column; k columns are k reactions.
     """
 
     generalized: ca.SX
@@ -51,7 +52,7 @@ class Reaction:
         return Reaction(self.generalized + other.generalized, wrenches)
 
     def map(self, function: Callable[[ca.SX], ca.SX]) -> "Reaction":
-        """The same function of every expression in it."""
+        """The reaction with a function applied to every expression in it."""
         wrenches = {frame: (function(f), function(m)) for frame, (f, m) in self.wrenches.items()}
         return Reaction(function(self.generalized), wrenches)
 
@@ -109,13 +110,13 @@ class Kinematics(ABC):
     def push(
         self, frame: Any, force: ca.SX, point: ArrayLike = ORIGIN, moment: ca.SX | None = None
     ) -> Reaction:
-        """A force at a point of a frame, and a moment, which may depend on velocities.
+        """The reaction of a force at a point of a frame and of a moment; both may depend on v.
 
         Args:
-            frame: Which frame.
-            force: In the world in N, shape (3, 1).
+            frame: The frame.
+            force: The force in the world, N, shape (3, 1).
             point: The point, fixed in the frame, in m, shape (3,).
-            moment: In the world in N m, shape (3, 1); none if None.
+            moment: The moment in the world, N m, shape (3, 1); none if None.
         """
         pushing = ca.SX.sym("force", 3)
         acting, given = pushing, force

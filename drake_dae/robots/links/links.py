@@ -102,7 +102,7 @@ class Links(Frames, Protocol):
         """Points of the robot that show where it is, in m, shape (3, k): for a view of it."""
 
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
-        """The frames in motion.
+        """The frames in motion, in which constraints are written.
 
         Args:
             acceleration: v', shape (nv, 1); a symbol of its own if None.

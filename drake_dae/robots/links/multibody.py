@@ -64,7 +64,7 @@ class MultibodyExpressions:
             to them; these equations do not.
         reflected_inertia: What of M the rotors are, in kg m^2 (kg), shape (nu,).
         gear_ratios: Motor turns per joint turn, shape (nu,).
-        position_limits, velocity_limits: Lower and upper limits, shapes (nq,) and (nv,).
+        position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,).
         default_positions: The plant's default configuration, shape (nq,).
 
     Raises:
@@ -115,11 +115,11 @@ class MultibodyExpressions:
         """p_W in m, shape (3, 1): where a point fixed in a frame is in the world.
 
         Args:
-            frame: As for `rotation`.
-            point: Shape (3,), in m, in the frame.
+            frame: A frame of the plant, or its name; "instance::name" if several have that name.
+            point: The point in the frame, m, shape (3,).
 
         Raises:
-            ModelError: No frame, or more than one, has that name; or a point that is not finite.
+            ModelError: No frame, or more than one, has that name; or the point is not finite.
         """
         return position_of(self._frames.pose(self._frames.find(frame)), point)
 
@@ -181,8 +181,6 @@ class MultibodyExpressions:
             first = link.inertia.first - link.weightless.first
             energy -= ca.dot(gravity, mass * origin + rotation @ first)
         return energy
-
-    # What is read from the plant.
 
     def _read_signals(self) -> None:
         positions, velocities = [], []
@@ -263,7 +261,7 @@ class MultibodyExpressions:
 
 
 def _check_support(plant: MultibodyPlant) -> None:
-    """Refuses what has no equations here."""
+    """Refuses a plant that has no equations here."""
     if not isinstance(plant, MultibodyPlant) or not plant.is_finalized():
         raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
     if plant.num_constraints() > 0:

@@ -46,16 +46,16 @@ def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
 
 
 def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) -> ca.SX:
-    """Velocity in m/s and angular velocity of a frame for a unit of each entry of v, in the world.
+    """How a frame moves in the world for a unit of each entry of v.
 
     Args:
         links: The tree, parents before children; the world is link 0.
-        index: Which link carries the frame.
+        index: The index of the link that carries the frame.
         origin: Where the frame's origin is, p_W in m, shape (3, 1).
-        size: nv.
+        size: The number of velocities, nv.
 
     Returns:
-        Shape (6, nv): the velocity of the origin above the angular velocity.
+        The velocity of the origin in m/s above the angular velocity in rad/s, shape (6, nv).
     """
     poses, result = link_poses(links), ca.SX(6, size)
     while index > 0:
@@ -71,11 +71,11 @@ def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) 
 
 @dataclass(frozen=True, eq=False)
 class LinkKinematics:
-    """How a link moves, in its own axes; each of shape (3, 1), except as noted.
+    """How a link moves, in its own axes; vectors have shape (3, 1).
 
     Attributes:
-        spin: Angular velocity in rad/s.
-        spin_rate: Its derivative in rad/s^2.
+        spin: The angular velocity in rad/s.
+        spin_rate: The derivative of the spin in rad/s^2.
         velocity: How fast the origin moves, in m/s.
         acceleration: The acceleration of the origin less gravity, in m/s^2: the world is
             accelerated upward, which pulls every body down.
@@ -99,7 +99,7 @@ def link_kinematics(
         links: The tree, parents before children; the world is link 0.
         v: Velocities, shape (nv, 1).
         acceleration: v', shape (nv, 1).
-        gravity: In the world, shape (3,), in m/s^2.
+        gravity: Gravity in the world, m/s^2, shape (3,).
     """
     result = [LinkKinematics(zeros(3), zeros(3), zeros(3), ca.SX(-gravity), zeros(3, 3))]
     for link in links[1:]:
@@ -139,8 +139,8 @@ def inverse_dynamics(
     Args:
         links: The tree, parents before children; the world is link 0.
         moving: How each link moves.
-        gravity: In the world, shape (3,), in m/s^2.
-        size: nv.
+        gravity: Gravity in the world, m/s^2, shape (3,).
+        size: The number of velocities, nv.
         wrenches: Index of a link -> moment about its origin in N m and force in N that act on it,
             in the link's axes, each of shape (3, 1).
     """

@@ -26,16 +26,17 @@ class LinkExpressions:
         frames: Name -> position p_W(q) in m, shape (3, 1), or (rotation R_WF(q), position).
         velocity_map: N(q) of q' = N(q) v, shape (nq, nv); the identity if None.
         actuation_matrix: B of M v' + H = B u, shape (nv, nu); the identity if None.
-        parameters: Parameters of the expressions.
+        parameters: The parameters of the expressions.
         position_signals, velocity_signals, actuator_signals: Names and units; made up if empty.
-        effort_limits: Largest |u|, shape (nu,); infinite if None.
+        effort_limits: The largest |u|, shape (nu,); infinite if None.
         reflected_inertia: What of M(q) is rotors, kg m^2 (kg), shape (nu,); 0 if None.
         gear_ratios: Motor turns per joint turn, shape (nu,); 1 if None.
         default_positions: A usual configuration, shape (nq,); zero if None.
-        position_limits, velocity_limits: Lower and upper, shapes (nq,) and (nv,); none if None.
+        position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,); none
+            if None.
 
     Raises:
-        ModelError: A shape that does not fit.
+        ModelError: A shape does not fit.
     """
 
     q: ca.SX
@@ -93,10 +94,10 @@ class LinkExpressions:
                 raise ModelError(f"{key} has shape {found}, expected {shape}")
 
     def rotation(self, frame: str) -> ca.SX:
-        """R_WF(q), shape (3, 3).
+        """R_WF(q), shape (3, 3): the orientation of a frame in the world.
 
         Raises:
-            ModelError: An unknown frame, or one given without a rotation.
+            ModelError: The frame is unknown, or was given without a rotation.
         """
         if frame == "world":
             return ca.SX.eye(3)
@@ -109,7 +110,7 @@ class LinkExpressions:
         """p_W(q) in m of a point that is fixed in a frame, shape (3, 1).
 
         Raises:
-            ModelError: An unknown frame, or a point off the origin of one without rotation.
+            ModelError: The frame is unknown, or has no rotation and the point is off its origin.
         """
         offset = numbers("point", point)
         if frame == "world":

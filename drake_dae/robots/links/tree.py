@@ -61,7 +61,7 @@ class Inertia:
 
     @classmethod
     def of_mass(cls, mass: ca.SX, centre: FloatArray, second: FloatArray) -> "Inertia":
-        """From a mass symbol, the centre of mass in m and the second moment per mass in m^2."""
+        """The inertia of a mass symbol with its centre in m and second moment per mass in m^2."""
         return cls(mass, mass * ca.SX(centre), mass * ca.SX(second))
 
     def __add__(self, other: "Inertia") -> "Inertia":
@@ -73,14 +73,14 @@ class Link:
     """A frame that one elementary joint moves, with the inertia of the bodies fixed to it.
 
     Attributes:
-        parent: Index of its parent; -1 for the world, which is link 0.
-        fixed: Constant R_PF, shape (3, 3), where the joint starts.
+        parent: The index of its parent; -1 for the world, which is link 0.
+        fixed: The constant R_PF, shape (3, 3), where the joint starts.
         axis: The coordinate axis of the turn, 0, 1 or 2; None for a shift.
         turn: R_FL(q), shape (3, 3).
         offset: p_PL in m, expressed in P, shape (3, 1).
         turning: Index in v -> angular velocity in L for a unit of it, shape (3, 1).
         shifting: Index in v -> velocity of L's origin in P for a unit of it, shape (3, 1).
-        inertia: About L's origin.
+        inertia: The inertia about L's origin.
         weightless: The part of `inertia` that gravity does not act on.
     """
 

@@ -39,13 +39,13 @@ class TreeKinematics(Kinematics):
 
     Args:
         frames: The plant's frames.
-        q, v, acceleration: As in `Kinematics`.
+        q, v, acceleration: The symbols and expressions of `Kinematics`.
         velocity_map: N, shape (nq, nv).
         moving: How each link moves, with gravity in its acceleration.
-        gravity: In the world, shape (3,), in m/s^2.
+        gravity: Gravity in the world, m/s^2, shape (3,).
 
     Attributes:
-        moving: As given.
+        moving: How each link moves, with gravity in its acceleration.
     """
 
     def __init__(
