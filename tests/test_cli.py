@@ -21,6 +21,7 @@ from drake_dae import Record, cli, load_scenario
 from drake_dae.cli import FILES, main
 from drake_dae.diagrams.scenario import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
+from drake_dae.simulation import view
 from drake_dae.simulation.plots import PLOTS
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
@@ -347,6 +348,19 @@ def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monke
     assert main([*arguments, *QUICK, "--meshcat"]) == 0
     assert len(seen[3] - seen[0]) == 1
     capsys.readouterr()
+
+
+def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch, capsys):
+    def full(parameters):
+        raise RuntimeError("Meshcat failed to open a websocket port.")
+
+    monkeypatch.setattr(view, "Meshcat", full)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, "--set", "write.plots=false"]) == 1
+    reason = "no port for Meshcat: Meshcat failed to open a websocket port."
+    assert error_line(capsys) == f"error: {tmp_path}/animation.html: {reason}"
+    left = ["record.npz", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
 # Ctrl-C.

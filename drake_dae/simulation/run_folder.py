@@ -55,7 +55,7 @@ def run_folder(folder: Path) -> Iterator[None]:
 def _prepare(folder: Path) -> int:
     """The open file with the lock."""
     folder.mkdir(parents=True, exist_ok=True)
-    _check(folder, "")
+    _check(folder, None)
     lock = os.open(folder / SCENARIO, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:
         _lock(lock, folder)
@@ -78,10 +78,11 @@ def _present(folder: Path) -> list[Path]:
     return [folder / name for name in (*FILES, PART) if os.path.lexists(folder / name)]
 
 
-def _check(folder: Path, text: str) -> None:
-    """Refuses the files of others; the text is that of the scenario, or not yet read."""
+def _check(folder: Path, text: str | None) -> None:
+    """Refuses the files of others; the text is that of the scenario, None if not yet read."""
     present, scenario = _present(folder), folder / SCENARIO
-    own = text.startswith(MARK) or not text
+    # Empty: just made, or by a run that was killed in its first moment.
+    own = text is None or text.startswith(MARK) or (not text and len(present) == 1)
     if present and (present[0] != scenario or scenario.is_symlink() or not own):
         found = ", ".join(file.name for file in present)
         raise ModelError(

@@ -1,5 +1,7 @@
 """A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
 
+import errno
+
 import numpy as np
 from pydrake.geometry import (
     Meshcat,
@@ -33,8 +35,15 @@ _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 
 def start_meshcat(host: str = "localhost") -> Meshcat:
-    """A Meshcat server that only this machine reaches, unless told otherwise."""
-    meshcat = Meshcat(MeshcatParams(host=host))
+    """A Meshcat server that only this machine reaches, unless told otherwise.
+
+    Raises:
+        OSError: No port is left for it.
+    """
+    try:
+        meshcat = Meshcat(MeshcatParams(host=host))
+    except RuntimeError as error:
+        raise OSError(errno.EADDRINUSE, f"no port for Meshcat: {error}") from None
     meshcat.SetProperty("/Background", "visible", False)
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)

@@ -54,6 +54,17 @@ def test_nothing_is_written_through_a_link(name, tmp_path):
     assert (folder / name).is_symlink()
 
 
+def test_an_empty_scenario_is_no_proof_of_an_earlier_run(tmp_path):
+    (tmp_path / SCENARIO).touch()
+    with run_folder(tmp_path):
+        pass
+    (tmp_path / "controls.png").write_text("mine")
+    refused = pytest.raises(ModelError, match=r"holds scenario\.yaml, controls\.png, not from")
+    with refused, run_folder(tmp_path):
+        pass
+    assert (tmp_path / "controls.png").read_text() == "mine"
+
+
 def test_a_link_beside_an_earlier_run_is_removed_and_its_target_stays(earlier):
     (earlier / "notes.txt").write_text("mine")
     (earlier / "summary.txt").symlink_to(earlier / "notes.txt")
