@@ -60,10 +60,15 @@ $(BIN)/python:
 		{ echo 'No usable Python >= 3.11: make ... PYTHON=/path/to/python' >&2; exit 1; }
 	"$(PYTHON)" -m venv --clear $(VENV)
 
+# An environment that was interrupted while it was made has a python and no pip.
+WHOLE := @$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv --clear $(VENV)
+
 $(VENV)/installed: pyproject.toml | $(BIN)/python
+	$(WHOLE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
 $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
+	$(WHOLE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $(VENV)/installed $@

@@ -32,14 +32,13 @@ from drake_dae.systems.robot_plant import RobotPlant
 
 
 def build_scenario(
-    scenario: Scenario, meshcat: Meshcat | None = None, live: bool = True
+    scenario: Scenario, meshcat: Meshcat | None = None
 ) -> tuple[ClosedLoop, Context]:
     """The closed loop of a scenario, and its context at the start.
 
     Args:
         scenario: What `load_scenario` returns.
-        meshcat: Where to draw; None draws nothing.
-        live: Whether to draw while simulating; see `make_closed_loop`.
+        meshcat: Where to draw while the run goes on; None draws nothing.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -51,7 +50,7 @@ def build_scenario(
     except AssumptionError as error:
         key = "constraints" if error.assumption <= 3 else "outputs"
         raise ScenarioError((key, str(error))) from error
-    return wire_scenario(scenario, model, structure, scene_graph, meshcat, live)
+    return wire_scenario(scenario, model, structure, scene_graph, meshcat)
 
 
 def wire_scenario(
@@ -60,7 +59,6 @@ def wire_scenario(
     structure: Structure,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
-    live: bool = True,
 ) -> tuple[ClosedLoop, Context]:
     """The closed loop of a scenario's robot, and its context at the start.
 
@@ -69,8 +67,7 @@ def wire_scenario(
         model: The scenario's robot, by `scenario_model`.
         structure: The structure of the model's system.
         scene_graph: Where the robot's geometry is registered; needed to draw it.
-        meshcat: Where to draw; None draws nothing.
-        live: Whether to draw while simulating; see `make_closed_loop`.
+        meshcat: Where to draw while the run goes on; None draws nothing.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -99,7 +96,6 @@ def wire_scenario(
             sensor=sensor,
             scene_graph=scene_graph,
             meshcat=meshcat,
-            live=live,
             start_time=scenario.integrator.start_time,
         )
 

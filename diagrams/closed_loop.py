@@ -15,7 +15,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
-from drake_dae.simulation.view import View, add_view
+from drake_dae.simulation.view import add_live_view
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
@@ -33,7 +33,7 @@ class ClosedLoop:
             `tracking_error`; `link_state` for a robot.
         plant, controller, reference: The systems in it.
         loggers: Port name -> (sink, names and units), one sample per step.
-        view: The blocks that draw the robot, or None.
+        scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
     """
@@ -43,7 +43,7 @@ class ClosedLoop:
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
-    view: View | None
+    scene_graph: SceneGraph | None
     sensor: ForceSensor | None
     noise: RandomSource | None
 
@@ -61,13 +61,14 @@ class ClosedLoop:
             own = self.noise.GetMyMutableContextFromRoot(context)
             self.noise.SetRandomContext(own, RandomGenerator(seed))
 
-    def record(self, context: Context) -> Record:
+    def record(self, context: Context, after: float = -np.inf) -> Record:
         """What was logged up to now, with `desired_output` r and `tracking_error` z - r (29).
 
         Args:
             context: The diagram's context.
+            after: Only what was logged later than this time, in s.
         """
-        record = Record.from_logs(self.loggers, context)
+        record = Record.from_logs(self.loggers, context, after)
         desired = record["reference"][:, self.controller.law.layout.lowest]
         outputs = record.signals["controlled_output"]
         derived = {
@@ -91,7 +92,6 @@ def make_closed_loop(
     sensor: ForceSensor | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
-    live: bool = True,
     start_time: float = 0.0,
 ) -> ClosedLoop:
     """Wires plant, reference generator and controller, with loggers and a view.
@@ -105,9 +105,8 @@ def make_closed_loop(
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
             its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
-            scene_graph; None draws nothing.
-        live: Draw while simulating, `FRAME_RATE` times a second; this shortens the integrator's
-            steps. False draws only in `make_animation`.
+            scene_graph, while it runs: `FRAME_RATE` times a second, which shortens the
+            integrator's steps. None draws nothing; `make_animation` needs none.
         start_time: When a run begins, in s: the zero dynamics are judged at the references then.
 
     A loop that draws nothing and samples nothing converts to AutoDiffXd, for Drake's Linearize.
@@ -164,15 +163,14 @@ def make_closed_loop(
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
-    view = None
     if isinstance(plant, RobotPlant):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
         if meshcat is not None:
-            view = add_view(builder, plant, scene_graph, meshcat, live)
+            add_live_view(builder, plant, scene_graph, meshcat)
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")
-    return ClosedLoop(diagram, plant, controller, reference, loggers, view, sensor, noise)
+    return ClosedLoop(diagram, plant, controller, reference, loggers, scene_graph, sensor, noise)
 
 
 def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:

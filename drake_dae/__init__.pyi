@@ -51,6 +51,7 @@ from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
 from .simulation.animation import make_animation as make_animation
 from .simulation.record import Record as Record
+from .simulation.record_writer import RecordWriter as RecordWriter
 from .simulation.simulate import simulate as simulate
 from .simulation.view import start_meshcat as start_meshcat
 from .symbolic import from_symbolic as from_symbolic

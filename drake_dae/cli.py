@@ -4,14 +4,16 @@ import argparse
 import json
 import logging
 import os
+import signal
 import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
+from io import TextIOWrapper
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import TextIO
 
 from pydrake.systems.framework import Context
 
@@ -27,26 +29,24 @@ from drake_dae.diagrams.scenario import (
     save_scenario,
     shipped_scenarios,
 )
-from drake_dae.errors import DrakeDaeError, NonMinimumPhaseWarning, ScenarioError
+from drake_dae.errors import DrakeDaeError, ModelError, NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation.animation import make_animation
+from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.plots import PLOTS, save_plots
+from drake_dae.simulation.record import Record
+from drake_dae.simulation.record_writer import RecordWriter
+from drake_dae.simulation.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 from drake_dae.simulation.view import start_meshcat
 from drake_dae.systems.robot_plant import RobotPlant
 
-FILES = ("scenario.yaml", "summary.txt", "record.npz", *PLOTS, "animation.html")
-"""What a run leaves in its folder."""
-
-_MARK = "# Scenario as run by drake-dae"
-"""Begins the scenario in a run's folder: only such a folder is written to again."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
-    0, or 1 for an error, 2 for a problem that `analyze` found (as for wrong usage), 130 after
-    Ctrl-C.
+    0, or 1 for an error, 2 for a problem that `analyze` found (as for wrong usage), 128 + signal
+    after Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
     """
     parser = argparse.ArgumentParser(
         prog="drake-dae",
@@ -92,6 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
     options = parser.parse_args(arguments)
+    if isinstance(sys.stdout, TextIOWrapper):
+        # Names may have letters that the terminal does not.
+        sys.stdout.reconfigure(errors="backslashreplace")
     # Drake tells where each Meshcat listens, also the one that only records.
     logging.getLogger("drake").setLevel(logging.WARNING)
     try:
@@ -114,11 +117,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
+        print(f"error: {_of(error)}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
-        return 130
+        return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
 def _list() -> int:
@@ -154,57 +157,55 @@ def _simulate(options: argparse.Namespace) -> int:
     scenario = load_scenario(path, options.settings)
     if options.meshcat:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
-    meshcat = start_meshcat() if options.meshcat or scenario.write.animation else None
+    meshcat = start_meshcat() if options.meshcat else None
     began = time.perf_counter()
-    loop, context = build_scenario(scenario, meshcat, live=options.meshcat)
+    loop, context = build_scenario(scenario, meshcat)
     print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
-    folder = _prepare(options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"))
-    save_scenario(scenario, folder / "scenario.yaml", f"{_MARK} {drake_dae.__version__}")
-    if options.meshcat and meshcat is not None:
-        print(f"watch at {meshcat.web_url()}", flush=True)
-    run, failure = None, ""
-    try:
-        run = simulate(loop.diagram, context, scenario.duration, scenario.integrator, progress=True)
-    except DrakeDaeError as error:
-        failure = str(error)
-        raise
-    except KeyboardInterrupt:
-        failure = "interrupted in the middle of a step"
-        raise
-    finally:
-        # Also when the run fails or is interrupted: what was recorded is kept.
-        _write(loop, context, scenario, folder, run, failure)
-    return 130 if run.interrupted else 0
+    folder = options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
+    with ending_signals(end_at_once), run_folder(folder):
+        save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
+        if meshcat is not None:
+            print(f"watch at {meshcat.web_url()}", flush=True)
+        return _run(loop, context, scenario, folder)
 
 
 def _unused(name: str) -> Path:
-    """A folder below runs/ that is not there yet."""
-    folder, number = Path("runs") / name, 1
-    while folder.exists():
-        number += 1
-        folder = Path("runs") / f"{name}-{number}"
-    return folder
+    """A folder below runs/ that was not there before."""
+    runs, number = Path("runs"), 1
+    runs.mkdir(exist_ok=True)
+    while True:
+        folder = runs / (name if number == 1 else f"{name}-{number}")
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            number += 1
 
 
-def _prepare(folder: Path) -> Path:
-    """Makes the folder of a run; the files of an earlier one are removed, others never."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        present = [folder / name for name in FILES if (folder / name).exists()]
-        if present:
-            scenario = folder / FILES[0]
-            if not (scenario.exists() and scenario.read_text("utf-8").startswith(_MARK)):
-                found = ", ".join(file.name for file in present)
-                text = f"'{folder}' holds {found}, not from an earlier run; choose another folder"
-                raise ScenarioError(("--out", text))
-        for file in present:
-            file.unlink()
-        # A folder that cannot be written to is found now, not at the end of the run.
-        (folder / FILES[0]).touch()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ScenarioError(("--out", f"cannot write to '{folder}': {reason}")) from None
-    return folder
+def _run(loop: ClosedLoop, context: Context, scenario: Scenario, folder: Path) -> int:
+    """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
+    run, failure, pictures = None, "", True
+    with RecordWriter(folder / PART, loop.record) as writer:
+        try:
+            run = simulate(
+                loop.diagram,
+                context,
+                scenario.duration,
+                scenario.integrator,
+                progress=True,
+                after_step=writer.update if scenario.write.record else None,
+            )
+        except DrakeDaeError as error:
+            failure = str(error)
+            raise
+        except KeyboardInterrupt:
+            failure, pictures = "interrupted in the middle of a step", False
+            raise
+        finally:
+            complete = _write(loop, context, scenario, folder, run, failure, pictures, writer)
+    if run.interrupted:
+        return 128 + run.interrupted
+    return 0 if complete else 1
 
 
 def _write(
@@ -214,33 +215,74 @@ def _write(
     folder: Path,
     run: RunStatistics | None,
     failure: str,
-) -> None:
-    record = loop.record(context)
-    if record.time.size == 0:
-        return
-    predicted = loop.predicted_error(record)
-    limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
-    text = summary(record, predicted, limits, run, failure)
-    with _stage(folder) as stage:
-        (stage / "summary.txt").write_text(text + "\n", encoding="utf-8")
+    pictures: bool,
+    writer: RecordWriter,
+) -> bool:
+    """Writes the files, prints the summary, and says whether all files are complete."""
+    problems: list[str] = []
+    # A signal that comes now does not stop before the record is written, but before the pictures.
+    with ending_signals(ending := Ending()):
+        record = loop.record(context)
+        if record.time.size == 0:
+            return True
+        predicted = loop.predicted_error(record)
+        limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
+        text = summary(record, predicted, limits, run, failure)
         if scenario.write.record:
-            record.save(stage / "record.npz")
-    if scenario.write.plots:
-        with _stage(folder) as stage:
-            save_plots(record, predicted, limits.control, stage)
-    if scenario.write.animation:
-        with _stage(folder) as stage:
-            page = make_animation(loop, record, context)
-            (stage / "animation.html").write_text(page, encoding="utf-8")
-    files = [name for name in FILES if (folder / name).exists()]
-    print(text)
-    print(f"written to {folder}/: {', '.join(files)}")
+            with _collected(problems):
+                _write_record(record, context, folder, writer)
+        with _collected(problems), stage(folder, "summary.txt") as place:
+            (place / "summary.txt").write_text(text + "\n", encoding="utf-8")
+    try:
+        if ending.signal is not None:
+            end_at_once(ending.signal)
+        if scenario.write.plots and pictures:
+            with _collected(problems), stage(folder, *PLOTS) as place:
+                save_plots(record, predicted, limits.control, place)
+        if scenario.write.animation and pictures:
+            with _collected(problems), stage(folder, "animation.html") as place:
+                page = make_animation(loop, record, context)
+                (place / "animation.html").write_text(page, encoding="utf-8")
+    finally:
+        files = [name for name in (*FILES, PART) if (folder / name).exists()]
+        with _collected(problems):
+            _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
+        with suppress(OSError):
+            _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
+    return not problems
+
+
+def _write_record(record: Record, context: Context, folder: Path, writer: RecordWriter) -> None:
+    try:
+        with stage(folder, "record.npz") as place:
+            record.save(place / "record.npz")
+    except OSError as error:
+        with suppress(OSError):
+            writer.finish(context)  # Rows that fit are kept.
+        with suppress(OSError, ModelError, IndexError):
+            kept = Record.load(writer.path).time[-1]
+            error.strerror = f"{error.strerror or error}; {PART} has the record up to {kept:.6g} s"
+        raise
+    writer.path.unlink(missing_ok=True)
+
+
+def _print(text: str, file: TextIO) -> None:
+    """Prints now; what is closed, as a terminal after SIGHUP, gets no second try on exit."""
+    try:
+        print(text, end="\n" if text and text[-1] != "\n" else "", file=file, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
+        raise
 
 
 @contextmanager
-def _stage(folder: Path) -> Iterator[Path]:
-    """A place to write files, which appear in the folder when they are complete."""
-    with TemporaryDirectory(prefix=".unfinished-", dir=folder) as stage:
-        yield Path(stage)
-        for file in Path(stage).iterdir():
-            file.replace(folder / file.name)
+def _collected(problems: list[str]) -> Iterator[None]:
+    """Keeps what is wrong with a file for later: the other files are written, and the summary."""
+    try:
+        yield
+    except OSError as error:
+        problems.append(_of(error))
+
+
+def _of(error: OSError) -> str:
+    return f"{error.filename or 'output'}: {error.strerror or error}"

@@ -1,5 +1,6 @@
 """The command: what it prints, what it leaves, and how it ends."""
 
+import gc
 import os
 import pty
 import re
@@ -8,9 +9,11 @@ import subprocess
 import sys
 import time
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from recordings import animation
 
 import drake_dae
@@ -18,6 +21,7 @@ from drake_dae import Record, cli, load_scenario
 from drake_dae.cli import FILES, main
 from drake_dae.diagrams.scenario import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
+from drake_dae.simulation import view
 from drake_dae.simulation.plots import PLOTS
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
@@ -172,7 +176,7 @@ def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path, capsys):
 def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
     (tmp_path / name).write_text("mine")
     assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *BARE]) == 1
-    assert re.search(rf"error: --out: .*{name}, not from an earlier run", error_line(capsys))
+    assert re.search(rf"error: .*{name}, not from an earlier run", error_line(capsys))
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "mine"
 
@@ -182,7 +186,7 @@ def test_a_scenario_is_not_overwritten_by_its_own_run(tmp_path, capsys):
     text = find_scenario("two_link_wall").read_text()
     path.write_text(f"# My wall.\n{text}")
     assert main(["simulate", str(path), "--out", str(tmp_path), *SHORT, *BARE]) == 1
-    assert "--out: " in error_line(capsys)
+    assert "not from an earlier run" in error_line(capsys)
     assert path.read_text() == f"# My wall.\n{text}"
 
 
@@ -190,7 +194,7 @@ def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         assert main(["simulate", "two_link_wall", "--out", str(folder), *SHORT, *BARE]) == 1
-        assert f"error: --out: cannot write to '{folder}': " in error_line(capsys)
+        assert f"error: cannot write to '{folder}': " in error_line(capsys)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -251,9 +255,112 @@ def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(Record, "save", fill)
     assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *QUICK]) == 1
-    assert re.match(r"error: .*record\.npz: No space left on device$", error_line(capsys))
-    # Nothing unfinished stays.
-    assert [path.name for path in tmp_path.iterdir()] == ["scenario.yaml"]
+    reason = "No space left on device; record.part has the record up to 0.2 s"
+    assert error_line(capsys) == f"error: {tmp_path}/record.npz: {reason}"
+    # The record is there in its other form, and nothing unfinished stays.
+    left = ["record.part", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    assert Record.load(tmp_path / "record.part").time[-1] == 0.2
+
+
+@pytest.mark.parametrize("room", [0, 5000])
+def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monkeypatch, capsys):
+    """Room for so many bytes, and nowhere a file that is cut off."""
+
+    def fill(*_arguments, **_options):
+        raise OSError(28, "No space left on device")
+
+    def write(file, data, at):
+        if at >= room:
+            fill()
+        return pwrite(file, data[: room - at], at)
+
+    pwrite = os.pwrite
+    monkeypatch.setattr(os, "pwrite", write)
+    monkeypatch.setattr(np, "savez_compressed", fill)
+    monkeypatch.setattr(Figure, "savefig", fill)
+    monkeypatch.setattr(cli, "make_animation", fill)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
+    assert main(arguments) == 1
+    out, err = capsys.readouterr()
+    assert "simulated            5 s in" in out
+    lines = err.splitlines()
+    reason = "No space left on device"
+    kept = "; record.part has the record up to " if room else ""
+    assert lines[0].startswith(f"error: {tmp_path}/record.npz: {reason}{kept}")
+    rest = [f"error: {tmp_path}/{name}: {reason}" for name in (PLOTS[0], "animation.html")]
+    assert lines[1:] == rest
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left >= {"scenario.yaml", "summary.txt"}
+    if room:
+        record = Record.load(tmp_path / "record.part")
+        assert 0.1 < record.time[-1] < 5.0
+        assert lines[0].endswith(f" {record.time[-1]:.6g} s")
+
+
+def test_the_reason_of_a_failure_is_printed_too_when_files_fail(tmp_path, monkeypatch, capsys):
+    def fill(self, path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Record, "save", fill)
+    move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
+    assert main([*arguments, "--set", move, *QUICK]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert "record.npz: No space left on device; record.part has the record up to 0.1" in first
+    assert "cannot go on at t = 0.1" in second
+
+
+@pytest.mark.slow
+def test_a_terminal_without_letters_of_a_name(tmp_path):
+    out = tmp_path / "größe \N{SNOWMAN}"
+    process = command(
+        *("simulate", "two_link_wall", "--out", out, *SHORT, *BARE),
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+    )
+    printed, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert r"gr\xf6\xdfe \u2603/: scenario.yaml, summary.txt" in printed
+    assert (out / "summary.txt").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux which ports listen")
+def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monkeypatch, capsys):
+    def listening():
+        """Inodes of the sockets of this process that listen."""
+        gc.collect()  # The systems of an earlier animation hold its server.
+        own = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.exists()}
+        rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
+        return {row[9] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
+
+    def watched(*arguments, **options):
+        seen.append(listening())
+        result = drake_dae.simulate(*arguments, **options)
+        seen.append(listening())
+        return result
+
+    seen = [listening()]
+    monkeypatch.setattr(cli, "simulate", watched)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, "--set", "write.plots=false"]) == 0
+    assert (tmp_path / "animation.html").exists()
+    assert seen[1:] == [seen[0], seen[0]]
+    assert main([*arguments, *QUICK, "--meshcat"]) == 0
+    assert len(seen[3] - seen[0]) == 1
+    capsys.readouterr()
+
+
+def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch, capsys):
+    def full(parameters):
+        raise RuntimeError("Meshcat failed to open a websocket port.")
+
+    monkeypatch.setattr(view, "Meshcat", full)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, "--set", "write.plots=false"]) == 1
+    reason = "no port for Meshcat: Meshcat failed to open a websocket port."
+    assert error_line(capsys) == f"error: {tmp_path}/animation.html: {reason}"
+    left = ["record.npz", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
 # Ctrl-C.

@@ -3,7 +3,7 @@
 from typing import Protocol
 
 import numpy as np
-from pydrake.geometry import Meshcat, Rgba
+from pydrake.geometry import Meshcat, Rgba, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
@@ -11,24 +11,36 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import ConstraintLoads
 from drake_dae.simulation.record import Record
-from drake_dae.simulation.view import FRAME_RATE, View, draw_surroundings
+from drake_dae.simulation.view import (
+    FRAME_RATE,
+    draw_scene,
+    draw_surroundings,
+    start_meshcat,
+    view_of_links,
+)
+from drake_dae.systems.plant import DaePlant
+from drake_dae.systems.robot_plant import RobotPlant
 
 _DESIRED, _ACTUAL = Rgba(0.1, 0.6, 0.2, 1.0), Rgba(0.1, 0.2, 0.8, 1.0)
 
 
-class Viewed(Protocol):
-    """A diagram that may have a view of a robot, as a `ClosedLoop`."""
+class Loop(Protocol):
+    """A diagram with a plant and its geometry, as a `ClosedLoop`."""
 
     @property
-    def view(self) -> View | None:
-        """The blocks that draw, or None."""
+    def plant(self) -> DaePlant:
+        """What was simulated."""
+
+    @property
+    def scene_graph(self) -> SceneGraph | None:
+        """The geometry of a robot, or None."""
 
 
-def make_animation(loop: Viewed, record: Record, context: Context) -> str:
+def make_animation(loop: Loop, record: Record, context: Context) -> str:
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
 
     Args:
-        loop: A loop of a `RobotPlant`, made with a meshcat.
+        loop: A loop of a `RobotPlant`.
         record: The record of a run of this loop.
         context: The context of its diagram, for the parameters; not changed.
 
@@ -36,12 +48,15 @@ def make_animation(loop: Viewed, record: Record, context: Context) -> str:
         One HTML page that holds the scene and the animation.
 
     Raises:
-        ModelError: There is no meshcat or no robot.
+        ModelError: There is no robot.
     """
-    view = loop.view
-    if view is None:
-        raise ModelError("an animation needs a closed loop of a RobotPlant, made with a meshcat")
-    meshcat, plant, model = view.meshcat, view.plant, view.plant.model
+    plant = loop.plant
+    if not isinstance(plant, RobotPlant):
+        raise ModelError("an animation needs a closed loop of a RobotPlant")
+    # A server of its own, made only now: a run that nobody watches opens no port.
+    meshcat, model = start_meshcat(), plant.model
+    arrows = draw_scene(plant, meshcat)
+    links = view_of_links(plant, loop.scene_graph, meshcat)
     parameters = plant.parameters(plant.GetMyContextFromRoot(context))
     loads = ConstraintLoads(model, parameters)
 
@@ -50,7 +65,7 @@ def make_animation(loop: Viewed, record: Record, context: Context) -> str:
     forces = _interpolated(record, "constraint_force", times)
     desired = _interpolated(record, "desired_output", times)
     course = [loads(state, force) for state, force in zip(states, forces, strict=True)]
-    view.forces.measure(course)
+    arrows.measure(course)
 
     # What stands still: what it touches, where it went, and where the reference wanted it.
     draw_surroundings(meshcat, model, loads, states[0], parameters)
@@ -62,15 +77,15 @@ def make_animation(loop: Viewed, record: Record, context: Context) -> str:
         _draw_paths(meshcat, loads, points, "desired")
 
     # What moves: the links and the arrows, frame by frame.
-    replay = context.Clone()
-    replayed = plant.GetMyMutableContextFromRoot(replay)
+    replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
     for time, state, load in zip(times, states, course, strict=True):
-        replay.SetTime(time)
-        plant.set_state(replayed, state)
-        if view.links is not None:
-            view.links.ForcedPublish(view.links.GetMyContextFromRoot(replay))
-        view.forces.draw(load, time)
+        if links is not None and replay is not None:
+            replay.SetTime(time)
+            link_state = links.get_input_port()
+            link_state.FixValue(replay, state[: link_state.size()])
+            links.ForcedPublish(replay)
+        arrows.draw(load, time)
     meshcat.StopRecording()
     meshcat.PublishRecording()
     return meshcat.StaticHtml()

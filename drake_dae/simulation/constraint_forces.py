@@ -91,45 +91,30 @@ class ConstraintLoads:
         return Loads(*(columns.reshape(3, -1, order="F").T for columns in found))
 
 
-class ConstraintForceVisualizer(LeafSystem):
-    """Draws what each constraint does to the robot: an arrow that ends where its force acts.
+class ForceArrows:
+    """Draws what each constraint does to a robot: an arrow that ends where its force acts.
 
     It points as the constraint pushes. A moment has an arrow of its own, with two heads, along its
     axis. An arrow is as long as its force is large beside the largest one drawn so far.
 
-    Input ports:
-        link_state: (q, v).
-        constraint_force: lambda, shape (m,).
-
     Args:
         meshcat: Where to draw.
         model: The robot.
-        period: Time between pictures in s; None draws only when told to.
         length: The length of the longest arrow, m.
 
     Attributes:
         largest_force, largest_moment: What gets the longest arrow, N and N m.
     """
 
-    def __init__(
-        self, meshcat: Meshcat, model: RobotModel, period: float | None, length: float = 0.25
-    ) -> None:
-        super().__init__()
-        self.set_name("constraint_force_visualizer")
+    def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
         self.largest_force = self.largest_moment = 1e-6
         self._meshcat = meshcat
         self._loads = ConstraintLoads(model)
-        size = model.links.q.numel() + model.links.v.numel()
-        self._link_state = self.DeclareVectorInputPort("link_state", size)
-        self._force = self.DeclareVectorInputPort("constraint_force", model.dae.num_constraints)
         pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
         for constraint, with_moment in pairs:
             _add_arrow(meshcat, path_of(constraint, "force"), length, 1, _FORCE_COLOR)
             if with_moment:
                 _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, _MOMENT_COLOR)
-        if period is not None:
-            self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
-        self.DeclareForcedPublishEvent(self._publish)
 
     def draw(self, loads: Loads, time: float) -> None:
         """Draws the arrows.
@@ -165,9 +150,33 @@ class ConstraintForceVisualizer(LeafSystem):
         scale = max(size, LEAST_SCALE)
         self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
 
+
+class ConstraintForceVisualizer(LeafSystem):
+    """Draws the constraint forces of a robot while it runs.
+
+    Input ports:
+        link_state: (q, v).
+        constraint_force: lambda, shape (m,).
+
+    Args:
+        arrows: What draws them.
+        model: The robot.
+        period: Time between pictures in s.
+    """
+
+    def __init__(self, arrows: ForceArrows, model: RobotModel, period: float) -> None:
+        super().__init__()
+        self.set_name("constraint_force_visualizer")
+        self._arrows, self._loads = arrows, ConstraintLoads(model)
+        size = model.links.q.numel() + model.links.v.numel()
+        self._link_state = self.DeclareVectorInputPort("link_state", size)
+        self._force = self.DeclareVectorInputPort("constraint_force", model.dae.num_constraints)
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+        self.DeclareForcedPublishEvent(self._publish)
+
     def _publish(self, context: Context) -> EventStatus:
         state, force = self._link_state.Eval(context), self._force.Eval(context)
-        self.draw(self._loads(state, force), context.get_time())
+        self._arrows.draw(self._loads(state, force), context.get_time())
         return EventStatus.Succeeded()
 
 

@@ -1,9 +1,10 @@
 """What a run leaves: every signal over time, with names and units."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 from zipfile import BadZipFile
 
 import numpy as np
@@ -55,25 +56,31 @@ class Record:
 
     @classmethod
     def from_logs(
-        cls, loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]], context: Context
+        cls,
+        loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]],
+        context: Context,
+        after: float = -np.inf,
     ) -> Self:
         """Collects per-step logs, whatever they hold up to now.
 
         Args:
             loggers: Name -> (sink, names and units of its input).
             context: The context of the diagram.
+            after: Only what was logged later than this time is collected, in s.
         """
         logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
         times = [log.sample_times() for log in logs.values()]
         # A run that failed in the middle of a step may have logged some of the signals only.
         count = min((len(t) for t in times), default=0)
         time = times[0][:count] if times else np.zeros(0)
+        first = int(np.searchsorted(time, after, side="right"))
+        time = time[first:]
         # The last sample of a moment is the one after the projection.
-        last = np.append(np.diff(time) > 0.0, True)[:count]
+        last = np.append(np.diff(time) > 0.0, True)[: time.size]
         return cls(
             time[last].copy(),
             {
-                name: Recorded(log.data()[:, :count].T[last].copy(), tuple(loggers[name][1]))
+                name: Recorded(log.data()[:, first:count].T[last].copy(), tuple(loggers[name][1]))
                 for name, log in logs.items()
             },
         )
@@ -89,18 +96,38 @@ class Record:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what `save` wrote.
+        """Reads what `save` or a `RecordWriter` wrote, the latter as far as it came.
 
         Raises:
             ModelError: The file holds something else.
         """
         try:
+            with open(path, "rb") as rows:
+                if rows.read(1) == b"{":
+                    rows.seek(0)
+                    return cls(*_read_rows(rows))
             with np.load(path, allow_pickle=False) as file:
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
                 return cls(file["time"], signals)
-        except (AttributeError, KeyError, TypeError, ValueError, BadZipFile) as error:
+        except (AttributeError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
             raise ModelError(f"{path} is not a record of a run: {error}") from None
+
+
+def _read_rows(file: BinaryIO) -> tuple[FloatArray, dict[str, Recorded]]:
+    """What a `RecordWriter` appended; bytes after the last whole row are left out."""
+    labels = json.loads(file.readline())["signals"]
+    named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
+    stops = np.cumsum([1, *map(len, named.values())])
+    data = file.read()
+    width = int(stops[-1])
+    count = len(data) // (8 * width)
+    rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
+    # A machine that lost its power may leave zeros where nothing was synced.
+    whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
+    time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
+    pairs = zip(named.items(), columns, strict=True)
+    return time[:, 0], {name: Recorded(values, signals) for (name, signals), values in pairs}
 
 
 def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:

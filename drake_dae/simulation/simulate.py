@@ -3,10 +3,10 @@
 import os
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from math import isfinite
@@ -25,9 +25,16 @@ from pydrake.systems.primitives import Integrator
 from tqdm import tqdm
 
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.simulation.interruption import Ending, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines where it has no terminal, in s."""
+
+MANY_STEPS = 1e7
+"""More than these take over an hour, and gigabytes for their log: hardly anyone wants them."""
+
+TYPICAL_STEP = 5e-4
+"""What a step of a robot with seven joints takes, in s: five evaluations of its closed loop."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +45,13 @@ class RunStatistics:
         simulated_time: How far it came, in s.
         wall_time: How long it took, in s.
         steps: How many steps the integrator took.
-        interrupted: Whether Ctrl-C ended it early.
+        interrupted: The signal that ended it early, SIGINT for Ctrl-C; None if none did.
     """
 
     simulated_time: float
     wall_time: float
     steps: int
-    interrupted: bool
+    interrupted: signal.Signals | None
 
     @property
     def times_real_time(self) -> float:
@@ -58,11 +65,12 @@ def simulate(
     duration: float,
     config: SimulatorConfig,
     progress: bool = False,
+    after_step: Callable[[Context], None] | None = None,
 ) -> RunStatistics:
     """Runs a diagram from a context; the context is the end state afterwards, on the manifold.
 
-    Ctrl-C ends the run after the current step; logs keep what they have, as they do when the run
-    fails with an exception.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the current step, a second one at once with a
+    KeyboardInterrupt. Logs keep what they have, as they do when the run fails with an exception.
 
     Args:
         diagram: The system.
@@ -70,6 +78,10 @@ def simulate(
         duration: How long to simulate, in s.
         config: Drake's integrator settings. The run begins at its start_time.
         progress: Shows simulated time and speed on stderr.
+        after_step: Called with the context after each step, such as `RecordWriter.update`.
+
+    Warns:
+        UserWarning: The largest step allowed is so small that the run takes hours.
 
     Raises:
         ModelError: The duration or the settings make no sense.
@@ -78,18 +90,22 @@ def simulate(
     """
     check_duration(duration)
     check_config(config)
+    _warn_of_many_steps(duration, config.max_step_size)
     simulator = Simulator(diagram, context)
     ApplySimulatorConfig(config, simulator)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start = context.get_time()
-    with _interrupt_flag() as interrupted, _Progress(duration, progress) as shown:
-        pace = _Pace(start, duration)
+    ending = Ending()
+    with ending_signals(ending), _Progress(duration, progress) as shown:
+        pace = _Pace(start, duration, config.max_step_size)
 
         def monitor(current: Context) -> EventStatus:
             shown.update(current.get_time() - start)
+            if after_step is not None:
+                after_step(current)
             pace.check(current)
-            if interrupted.is_set():
+            if ending.signal is not None:
                 return EventStatus.ReachedTermination(diagram, "interrupted")
             return EventStatus.DidNothing()
 
@@ -116,7 +132,19 @@ def simulate(
                 state,
             ) from error
         shown.finish(context.get_time() - start)
-        return RunStatistics(context.get_time() - start, elapsed, steps, interrupted.is_set())
+        return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
+
+
+def _warn_of_many_steps(duration: float, max_step_size: float) -> None:
+    least = duration / max_step_size
+    if least > MANY_STEPS:
+        hours = least * TYPICAL_STEP / 3600.0
+        warnings.warn(
+            f"max_step_size {max_step_size:g} s takes at least {least:.2g} steps for {duration:g} "
+            f"s, about {hours:.2g} hours if a step takes {1e3 * TYPICAL_STEP:g} ms, and each is "
+            "kept in memory; Ctrl-C ends the run and keeps its record",
+            stacklevel=3,
+        )
 
 
 def check_duration(duration: float) -> None:
@@ -173,10 +201,11 @@ class _Pace:
 
     STEPS = 1000
     SLOWEST = 1e-7
-    """The least part of the duration that so many steps must simulate."""
+    """Of the duration that so many steps must simulate, or a tenth of what the longest would."""
 
-    def __init__(self, start: float, duration: float) -> None:
-        self._steps, self._time, self._least = 0, start, self.SLOWEST * duration
+    def __init__(self, start: float, duration: float, max_step_size: float) -> None:
+        self._steps, self._time = 0, start
+        self._least = min(self.SLOWEST * duration, 0.1 * self.STEPS * max_step_size)
 
     def check(self, context: Context) -> None:
         """Counts a step, and looks at the pace now and then.
@@ -227,7 +256,8 @@ class _Progress:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._bar.close()
+        with suppress(OSError):
+            self._bar.close()
 
     def update(self, simulated: float) -> None:
         """Shows the simulated time in s, if it is time to."""
@@ -242,13 +272,15 @@ class _Progress:
     def _show(self, simulated: float) -> None:
         self._shown = time.perf_counter()
         speed = f"{simulated / (self._shown - self._began):.1f} x real time"
-        if self._terminal:
-            self._bar.set_postfix_str(speed, refresh=False)
-            self._bar.n = min(simulated, self._duration)
-            self._bar.refresh()
-        elif self._enabled:
-            text = f"{simulated:.2f}/{self._duration:.2f} s, {speed}"
-            print(text, file=sys.stderr, flush=True)
+        # A terminal that is closed, or a reader that has enough, ends no run.
+        with suppress(OSError):
+            if self._terminal:
+                self._bar.set_postfix_str(speed, refresh=False)
+                self._bar.n = min(simulated, self._duration)
+                self._bar.refresh()
+            elif self._enabled:
+                text = f"{simulated:.2f}/{self._duration:.2f} s, {speed}"
+                print(text, file=sys.stderr, flush=True)
 
 
 def _default_size() -> dict[str, int]:
@@ -258,27 +290,3 @@ def _default_size() -> dict[str, int]:
     except OSError:
         known = False
     return {} if known else {"ncols": 79, "nrows": 24}
-
-
-@contextmanager
-def _interrupt_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, instead of an exception in the middle of a step.
-
-    A second Ctrl-C raises KeyboardInterrupt as usual.
-    """
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-
-    def handle(number: int, frame: object) -> None:
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    previous = signal.signal(signal.SIGINT, handle)
-    try:
-        yield event
-    finally:
-        # None: the handler before was not Python's.
-        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)

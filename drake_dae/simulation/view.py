@@ -1,6 +1,6 @@
 """A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
 
-from dataclasses import dataclass
+import errno
 
 import numpy as np
 from pydrake.geometry import (
@@ -11,7 +11,7 @@ from pydrake.geometry import (
     Rgba,
     SceneGraph,
 )
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arrays import FloatArray
@@ -19,6 +19,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import (
     ConstraintForceVisualizer,
     ConstraintLoads,
+    ForceArrows,
     path_of,
 )
 from drake_dae.systems.robot_plant import RobotPlant
@@ -34,81 +35,88 @@ _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 
 def start_meshcat(host: str = "localhost") -> Meshcat:
-    """A Meshcat server that only this machine reaches, unless told otherwise."""
-    meshcat = Meshcat(MeshcatParams(host=host))
+    """A Meshcat server that only this machine reaches, unless told otherwise.
+
+    Raises:
+        OSError: No port is left for it.
+    """
+    try:
+        meshcat = Meshcat(MeshcatParams(host=host))
+    except RuntimeError as error:
+        raise OSError(errno.EADDRINUSE, f"no port for Meshcat: {error}") from None
     meshcat.SetProperty("/Background", "visible", False)
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     return meshcat
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """The blocks of a diagram that draw a robot.
-
-    Attributes:
-        meshcat: Where they draw.
-        plant: The robot.
-        links: Drake's picture of the links; None if they have no geometry.
-        forces: The arrows.
-    """
-
-    meshcat: Meshcat
-    plant: RobotPlant
-    links: MeshcatVisualizer | None
-    forces: ConstraintForceVisualizer
-
-
-def add_view(
-    builder: DiagramBuilder,
-    plant: RobotPlant,
-    scene_graph: SceneGraph | None,
-    meshcat: Meshcat,
-    live: bool,
-) -> View:
-    """Adds the blocks that draw a robot of a diagram, and draws what does not move.
+def add_live_view(
+    builder: DiagramBuilder, plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat
+) -> None:
+    """Adds what draws a robot `FRAME_RATE` times a second while its diagram runs.
 
     Args:
         builder: The builder of the diagram, with the plant in it.
         plant: The robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
         meshcat: Where to draw.
-        live: Whether to draw while the diagram runs; if not, only when told to.
+    """
+    period = 1.0 / FRAME_RATE
+    arrows = draw_scene(plant, meshcat)
+    forces = builder.AddSystem(ConstraintForceVisualizer(arrows, plant.model, period))
+    for name in ("link_state", "constraint_force"):
+        builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
+    links = view_of_links(plant, scene_graph, meshcat, period)
+    if links is not None:
+        builder.AddSystem(links)
+        builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
+
+
+def draw_scene(plant: RobotPlant, meshcat: Meshcat) -> ForceArrows:
+    """Draws what does not move, and returns what draws the constraint forces.
+
+    Args:
+        plant: The robot.
+        meshcat: Where to draw.
     """
     model, dae = plant.model, plant.dae
-    links = None if scene_graph is None else _add_links(builder, plant, scene_graph, meshcat, live)
     state = plant.structure.manifold.project(dae.nominal_state)
     loads = ConstraintLoads(model)
     draw_surroundings(meshcat, model, loads, state, dae.parameter_values)
     # From behind, the side and a little above.
     middle, size = scene_extent(model, loads, state)
     meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
-    period = 1.0 / FRAME_RATE if live else None
-    forces = builder.AddSystem(ConstraintForceVisualizer(meshcat, model, period, 0.2 * size))
-    for name in ("link_state", "constraint_force"):
-        builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
-    return View(meshcat, plant, links, forces)
+    return ForceArrows(meshcat, model, 0.2 * size)
 
 
-def _add_links(
-    builder: DiagramBuilder,
-    plant: RobotPlant,
-    scene_graph: SceneGraph,
-    meshcat: Meshcat,
-    live: bool,
-) -> MeshcatVisualizer | None:
-    """Drake's own picture of the robot, posed by our link state; its plant is not simulated."""
+def view_of_links(
+    plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
+) -> Diagram | None:
+    """Drake's own picture of a robot, posed by our link state; its plant is not simulated.
+
+    Args:
+        plant: The robot.
+        scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
+            has a copy of it.
+        meshcat: Where to draw.
+        period: Time between pictures in s; without one they are drawn when asked for.
+
+    Returns:
+        A diagram with (q, v) as its input, or None if the links have no geometry.
+    """
     drawn = plant.model.links.plant
-    if drawn is None or drawn.get_source_id() is None:
+    if scene_graph is None or drawn is None or drawn.get_source_id() is None:
         return None
-    builder.AddSystem(scene_graph)
+    builder = DiagramBuilder()
+    scene = builder.AddSystem(scene_graph.Clone())
     pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
-    builder.Connect(plant.GetOutputPort("link_state"), pose.get_input_port())
-    builder.Connect(pose.get_output_port(), scene_graph.get_source_pose_port(drawn.get_source_id()))
-    period = 1.0 / FRAME_RATE if live else _ON_REQUEST
-    return MeshcatVisualizer.AddToBuilder(
-        builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
-    )
+    builder.ExportInput(pose.get_input_port(), "link_state")
+    builder.Connect(pose.get_output_port(), scene.get_source_pose_port(drawn.get_source_id()))
+    parameters = MeshcatVisualizerParams(publish_period=period)
+    MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
+    diagram = builder.Build()
+    diagram.set_name("view_of_links")
+    return diagram
 
 
 def draw_surroundings(

@@ -6,7 +6,7 @@ from urllib.parse import urlparse
 import casadi as ca
 import numpy as np
 import pytest
-from arms import arm, fixed_step, law, parse
+from arms import arm, fixed_step, parse
 from members import Coupler, Saddle
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
@@ -38,9 +38,9 @@ from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact import surfaces
 from drake_dae.simulation.animation import frame_times
-from drake_dae.simulation.constraint_forces import ConstraintForceVisualizer, ConstraintLoads
+from drake_dae.simulation.constraint_forces import ConstraintLoads, ForceArrows
 from drake_dae.simulation.record import Recorded
-from drake_dae.simulation.view import FRAME_RATE, scene_extent
+from drake_dae.simulation.view import FRAME_RATE, draw_scene, scene_extent
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 
@@ -48,7 +48,7 @@ NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 def recorded(name, *settings):
     """A run of a scenario, and the page of its animation."""
     scenario = load_scenario(find_scenario(name), settings)
-    loop, context = build_scenario(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     return loop, record, make_animation(loop, record, context)
@@ -188,7 +188,7 @@ def test_a_run_that_begins_later_is_shown_from_its_start():
 def test_a_parameter_moves_the_surface():
     """The wall stands where the context of the run has it, not where the scenario put it."""
     scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25", "start.errors={}"])
-    loop, context = build_scenario(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     loop.plant.set_parameter(own, "wall.position", [1.1, 0.0, 0.0])
@@ -205,7 +205,7 @@ def test_a_parameter_moves_the_surface():
 def test_a_parameter_turns_the_arrow():
     """Of the normal of a dome that stands elsewhere."""
     scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])
-    loop, context = build_scenario(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     center = np.array([0.45, 0.02, 0.2])
@@ -234,7 +234,7 @@ def test_one_moment_is_an_animation_too():
 
 def test_an_animation_changes_nothing():
     scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25"])
-    loop, context = build_scenario(scenario, start_meshcat(), live=False)
+    loop, context = build_scenario(scenario)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     record = loop.record(context)
     state = context.get_continuous_state_vector().CopyToVector()
@@ -258,7 +258,7 @@ def test_frames():
 def test_live_view_draws_while_it_runs():
     meshcat = start_meshcat()
     scenario = load_scenario(find_scenario("two_link_wall"))
-    loop, context = build_scenario(scenario, meshcat, live=True)
+    loop, context = build_scenario(scenario, meshcat)
     simulator = Simulator(loop.diagram, context)
     simulator.AdvanceTo(0.5)
     page = meshcat.StaticHtml()
@@ -278,15 +278,18 @@ def test_live_view_draws_while_it_runs():
 
 
 def test_without_live_view_the_steps_are_those_without_any():
-    """Drawing ends a step every 1/32 s; a recording must not change the run."""
+    """Drawing ends a step every 1/32 s; a recording is made after the run and changes nothing."""
     times = []
-    for meshcat, live in ((None, True), (start_meshcat(), False), (start_meshcat(), True)):
+    for meshcat in (None, start_meshcat()):
         scenario = load_scenario(find_scenario("two_link_wall"), ["duration=1"])
-        loop, context = build_scenario(scenario, meshcat, live)
+        loop, context = build_scenario(scenario, meshcat)
         simulate(loop.diagram, context, 1.0, scenario.integrator)
-        times.append(loop.record(context).time)
-    np.testing.assert_array_equal(times[0], times[1])
-    assert set(frame_times(1.0)) <= set(times[2])
+        record = loop.record(context)
+        times.append(record.time)
+        assert "/contact/wall/force" in {
+            path for path, _ in animation(make_animation(loop, record, context))
+        }
+    assert set(frame_times(1.0)) <= set(times[1])
     assert not set(frame_times(1.0)) <= set(times[0])
 
 
@@ -307,13 +310,13 @@ def test_only_this_machine_reaches_meshcat():
 def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     model = arm("two_link").model
     meshcat = start_meshcat()
-    visualizer = ConstraintForceVisualizer(meshcat, model, None, length=0.3)
+    arrows = ForceArrows(meshcat, model, length=0.3)
     loads = ConstraintLoads(model)
     state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
     seen = {}
     for force in (0.0, 10.0, -20.0):
         meshcat.StartRecording()
-        visualizer.draw(loads(state, [force]), 0.0)
+        arrows.draw(loads(state, [force]), 0.0)
         meshcat.StopRecording()
         meshcat.PublishRecording()
         tracks = animation(meshcat.StaticHtml())
@@ -323,21 +326,18 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     # The wall's normal is -x; the largest force so far has the full length.
     assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
     assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
-    assert visualizer.largest_force == 20.0
+    assert arrows.largest_force == 20.0
 
 
 def shown_at_rest(model, forces):
     """The page of a robot that holds still with given constraint forces."""
     meshcat = start_meshcat()
     plant = RobotPlant(model)
-    law = TrackingLaw(model.dae, poles(-4.0), structure=plant.structure)
     state = plant.structure.manifold.project(model.dae.nominal_state)
-    names = [signal.name for signal in model.position_signals]
-    wanted = ConstantReference(np.concatenate([np.zeros(len(names)), forces]))
-    loop = make_closed_loop(plant, law, [wanted], meshcat=meshcat, live=False)
+    arrows = draw_scene(plant, meshcat)
     loads = ConstraintLoads(model)(state, forces)
     meshcat.StartRecording()
-    loop.view.forces.draw(loads, 0.0)
+    arrows.draw(loads, 0.0)
     meshcat.StopRecording()
     meshcat.PublishRecording()
     return state, meshcat.StaticHtml()
@@ -416,10 +416,7 @@ def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
     outputs = [JointPositions(["joint1", "joint2"][len(constraints) :])]
     model = RobotModel.from_multibody(plant, constraints, outputs, [1.2, -1.6])
     controls = TrackingLaw(model.dae, poles(-4.0))
-    meshcat = start_meshcat()
-    loop = make_closed_loop(
-        RobotPlant(model), controls, [ConstantReference([0.3, 0.4])], meshcat=meshcat, live=False
-    )
+    loop = make_closed_loop(RobotPlant(model), controls, [ConstantReference([0.3, 0.4])])
     context = loop.diagram.CreateDefaultContext()
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_consistent_state(own, loop.plant.state(own))
@@ -431,14 +428,7 @@ def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
 # Without a picture.
 
 
-def test_an_animation_needs_a_meshcat_and_a_robot():
-    robot = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
-    references = [ConstantReference([0.3]), ConstantReference([20.0])]
-    loop = make_closed_loop(robot, law("two_link"), references)
-    context = loop.diagram.CreateDefaultContext()
-    simulate(loop.diagram, context, 0.01, fixed_step())
-    with pytest.raises(ModelError, match="made with a meshcat"):
-        make_animation(loop, loop.record(context), context)
+def test_an_animation_needs_a_robot():
     system = DaeSystem.from_functions(1, f=lambda x: [0.0], h=lambda x: [1.0], l=lambda x: [x[0]])
     plain = TrackingLaw(system, poles(-1.0))
     loop = make_closed_loop(

@@ -1,6 +1,7 @@
 """Running a diagram: settings, statistics, progress, interruption, failure."""
 
 import io
+import itertools
 import os
 import signal
 import sys
@@ -18,6 +19,7 @@ from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
 from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation import simulate as module
+from drake_dae.simulation.interruption import ENDING_SIGNALS
 from drake_dae.simulation.simulate import check_config, check_duration, simulate
 
 
@@ -52,7 +54,7 @@ def fixed(step=0.125):
 def test_statistics_and_end_state():
     diagram, context, logger = ramp()
     run = simulate(diagram, context, 2.0, fixed())
-    assert (run.simulated_time, run.steps, run.interrupted) == (2.0, 16, False)
+    assert (run.simulated_time, run.steps, run.interrupted) == (2.0, 16, None)
     assert run.times_real_time == pytest.approx(2.0 / run.wall_time)
     assert context.get_time() == 2.0
     assert context.get_continuous_state_vector()[0] == pytest.approx(2.0, abs=1e-14)
@@ -117,42 +119,89 @@ def test_every_other_scheme_passes():
         check_config(SimulatorConfig(integration_scheme=scheme, use_error_control=False))
 
 
+def test_endless_by_request():
+    """Ten billion steps, of which this takes some: neither silent nor a state without bound."""
+    count = itertools.count(1)
+
+    def enough(context):
+        if next(count) == 2500:
+            raise StopIteration
+
+    diagram, context, _ = ramp()
+    warned = pytest.warns(UserWarning, match=r"max_step_size 1e-09 s takes at least 1e\+10 steps")
+    with warned, pytest.raises(StopIteration):
+        simulate(diagram, context, 10.0, fixed(1e-9), after_step=enough)
+    assert context.get_time() == pytest.approx(2500e-9)
+
+
+def test_two_million_steps_are_no_reason_to_warn():
+    def stop(context):
+        raise StopIteration
+
+    with pytest.raises(StopIteration):
+        simulate(*ramp()[:2], 2000.0, fixed(1e-3), after_step=stop)
+
+
+def test_after_each_step():
+    times = []
+    diagram, context, _ = ramp()
+    simulate(diagram, context, 1.0, fixed(), after_step=lambda c: times.append(c.get_time()))
+    # And after the events that were due at the end.
+    np.testing.assert_array_equal(times, [*np.arange(1, 9) / 8, 1.0])
+
+
 # Interruption, by a real signal.
 
 
-def test_ctrl_c_ends_the_run_after_its_step():
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", ENDING_SIGNALS)
+def test_a_signal_ends_the_run_after_its_step(number):
+    before = signal.getsignal(number)
     sent = []
 
     def press():
         if not sent:
             sent.append(True)
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
     diagram, context, logger = ramp(0.5, press)
     run = simulate(diagram, context, 2.0, fixed())
     assert sent
-    assert run.interrupted
+    assert run.interrupted == number
     # The signal comes in the step from 0.5 to 0.625, at one of its stages.
     assert run.simulated_time == context.get_time() == 0.625
     assert run.steps == 5
     logged = logger.FindLog(context).data()[0]
     np.testing.assert_allclose(logged, [*np.arange(6) / 8, 0.625], atol=1e-14)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
 
 
-def test_a_second_ctrl_c_is_an_exception_and_the_log_is_kept():
+def test_under_nohup_a_terminal_that_is_closed_ends_nothing():
+    def close():
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    diagram, context, _ = ramp(0.5, close)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert simulate(diagram, context, 1.0, fixed()).interrupted is None
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("second", ENDING_SIGNALS)
+def test_a_second_signal_is_an_exception_and_the_log_is_kept(second):
     before = signal.getsignal(signal.SIGINT)
 
     def press_twice():
-        for _ in range(2):
-            os.kill(os.getpid(), signal.SIGINT)
+        for number in (signal.SIGTERM, second):
+            os.kill(os.getpid(), number)
             # Python runs the handler between two of its instructions.
             sum(range(1000))
 
     diagram, context, logger = ramp(0.5, press_twice)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as caught:
         simulate(diagram, context, 2.0, fixed())
+    assert caught.value.args == (second,)
     assert logger.FindLog(context).sample_times()[-1] == 0.5
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -1,5 +1,7 @@
 """The table of a run."""
 
+import signal
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -47,7 +49,7 @@ def table(text, head):
 
 
 def test_every_figure():
-    run = RunStatistics(simulated_time=1.0, wall_time=0.25, steps=123, interrupted=False)
+    run = RunStatistics(simulated_time=1.0, wall_time=0.25, steps=123, interrupted=None)
     text = summary(record(), PREDICTED, Limits(np.array([10.0, np.inf])), run)
     assert table(text, "tracking error  unit") == [
         ["tool.z", "m", "0.05", "0.0625", "0.001", "0.00025"],
@@ -91,7 +93,7 @@ def test_what_a_reader_must_not_miss():
 
 
 def test_interrupted_and_failed():
-    run = RunStatistics(simulated_time=1.0, wall_time=0.5, steps=12, interrupted=True)
+    run = RunStatistics(simulated_time=1.0, wall_time=0.5, steps=12, interrupted=signal.SIGINT)
     assert "interrupted          the record ends there" in summary(record(), PREDICTED, run=run)
     text = summary(record(), PREDICTED, failure="singular there")
     assert "failed               the record ends at 1 s: singular there" in text
