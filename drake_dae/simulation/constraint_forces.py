@@ -16,6 +16,7 @@ from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.surface import axes_along
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.lifetime import Collectable, weakly
 from drake_dae.trace.functions import TracedFunction
 
 _FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
@@ -92,7 +93,7 @@ class ConstraintLoads:
         return Loads(*(columns.reshape(3, -1, order="F").T for columns in found))
 
 
-class ConstraintForceVisualizer(LeafSystem):
+class ConstraintForceVisualizer(LeafSystem, metaclass=Collectable):
     """Draws what each constraint does to the robot: an arrow that ends where its force acts.
 
     It points as the constraint pushes. A moment has an arrow of its own, with two heads, along its
@@ -129,8 +130,8 @@ class ConstraintForceVisualizer(LeafSystem):
             if with_moment:
                 _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, _MOMENT_COLOR)
         if period is not None:
-            self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
-        self.DeclareForcedPublishEvent(self._publish)
+            self.DeclarePeriodicPublishEvent(period, 0.0, weakly(self._publish))
+        self.DeclareForcedPublishEvent(weakly(self._publish))
 
     def draw(self, loads: Loads, time: float) -> None:
         """Draws the arrows.
