@@ -116,7 +116,8 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
         folders = [FOLDER / "models", *map(Path, robot.packages.values())]
         check_resources(scene_graph, [package_folder(Path(model)), *folders])
         plant.Finalize()
-    except (RuntimeError, ValueError) as error:  # Drake has both for a model that it cannot read.
+    except (RuntimeError, ValueError, SystemExit) as error:
+        # Drake has all of them: SystemExit for what an assertion of its own finds.
         raise ModelError(str(error)) from None
     return plant
 
