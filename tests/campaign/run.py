@@ -85,7 +85,9 @@ class _Worker:
 
 
 def _serve(pipe: Connection) -> None:
-    logging.getLogger("drake").setLevel(logging.CRITICAL)
+    # Not its level: what Drake only warns of may be refused.
+    log = logging.getLogger("drake")
+    log.handlers, log.propagate = [logging.NullHandler()], False
     os.environ["OMP_NUM_THREADS"] = "1"
     while True:
         kind, seed = pipe.recv()
