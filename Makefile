@@ -10,6 +10,7 @@ PYTHON ?= $(shell for python in python3.11 python3.12 python3.13 python3; do \
 PYTHON := $(PYTHON)
 
 SCENARIO ?= seven_joint_wall
+SEED ?= 0
 VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
 VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
@@ -18,7 +19,7 @@ HOUSE := examples/pictures/house.png
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark house clean lint
+.PHONY: help demo check test benchmark campaign house clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -27,6 +28,7 @@ help:
 	@echo 'make check       lint, types and the quick tests: the daily round, below 90 s'
 	@echo 'make test        lint, types and all tests'
 	@echo 'make benchmark   speed, with ratios'
+	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
@@ -47,6 +49,10 @@ test: lint
 
 benchmark: $(VENV)/installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -q
+
+campaign: $(VENV)/installed-dev
+	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --seed $(SEED)
+	$(BIN)/python tests/campaign/memory.py
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)

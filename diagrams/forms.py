@@ -7,7 +7,7 @@ that is no data is `written` as another one; a member of a family is chosen by a
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
-from math import isfinite
+from sys import float_info
 from types import UnionType
 from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -140,7 +140,7 @@ def _numbers(value: Any) -> Any:
     is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
     entries = [entry for row in rows for entry in row] if is_matrix else rows
     for entry in entries:
-        if type(entry) not in (int, float) or not isfinite(float(entry)):
+        if type(entry) not in (int, float) or not abs(entry) <= float_info.max:
             wanted = "a number, a list of numbers, or a matrix as a list of rows"
             raise ValueError(f"expected {wanted}, got {_show(entry)}")
     if is_matrix and len({len(row) for row in rows}) > 1:

@@ -12,6 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.diagrams.resources import check_resources, package_folder
 from drake_dae.diagrams.scenario import FOLDER, Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
@@ -111,8 +112,12 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
             parser.AddModelsFromUrl(robot.file)
         else:
             parser.AddModels(robot.file)
+        model = parser.package_map().ResolveUrl(robot.file) if is_url else robot.file
+        folders = [FOLDER / "models", *map(Path, robot.packages.values())]
+        check_resources(scene_graph, [package_folder(Path(model)), *folders])
         plant.Finalize()
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, SystemExit) as error:
+        # Drake has all of them: SystemExit for what an assertion of its own finds.
         raise ModelError(str(error)) from None
     return plant
 

@@ -222,6 +222,11 @@ class RobotModel:
         def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
             acceleration = rate[nq : nq + nv]
             inertial, constraint_rate = bound.implicit(links, acceleration, constraint_force)
+            slip = ca.sparsify(rate[:nq] - velocity)
+            if slip.nnz():  # q' is an unknown of its own where N is not the identity.
+                kinematics = links.kinematics()
+                motion = kinematics.value(bound.rate(kinematics))
+                constraint_rate += ca.jtimes(motion, links.q, slip)
             balance = inertial - ca.mtimes(rotors, acceleration) - torque
             stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
             return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate

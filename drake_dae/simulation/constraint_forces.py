@@ -16,6 +16,7 @@ from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.surface import axes_along
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.lifetime import Collectable, weakly
 from drake_dae.trace.functions import TracedFunction
 
 _FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
@@ -151,7 +152,7 @@ class ForceArrows:
         self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
 
 
-class ConstraintForceVisualizer(LeafSystem):
+class ConstraintForceVisualizer(LeafSystem, metaclass=Collectable):
     """Draws the constraint forces of a robot while it runs.
 
     Input ports:
@@ -171,8 +172,8 @@ class ConstraintForceVisualizer(LeafSystem):
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
         self._force = self.DeclareVectorInputPort("constraint_force", model.dae.num_constraints)
-        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
-        self.DeclareForcedPublishEvent(self._publish)
+        self.DeclarePeriodicPublishEvent(period, 0.0, weakly(self._publish))
+        self.DeclareForcedPublishEvent(weakly(self._publish))
 
     def _publish(self, context: Context) -> EventStatus:
         state, force = self._link_state.Eval(context), self._force.Eval(context)

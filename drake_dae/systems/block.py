@@ -7,7 +7,7 @@ gradients of its inputs, state and parameters.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,6 +28,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.systems.failures import simulation_error
+from drake_dae.systems.lifetime import Collectable, weakly
 from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 STATES = ("state", "estimated_state")
@@ -96,7 +97,7 @@ class TracedFormula:
             raise simulation_error(error.failure, time, state, self._signals) from None
 
 
-class DifferentiableSystem(LeafSystem):
+class DifferentiableSystem(LeafSystem, metaclass=Collectable):
     """A LeafSystem with vector ports that converts to AutoDiffXd, alone or in a diagram.
 
     The converted system has the same ports, continuous state and numeric parameters, and exact
@@ -203,7 +204,7 @@ class ParameterizedSystem(DifferentiableSystem):
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
 
-class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
+class _AutoDiffSystem(LeafSystem_[AutoDiffXd], metaclass=Collectable):
     """A DifferentiableSystem on AutoDiffXd."""
 
     def __init__(self, original: DifferentiableSystem) -> None:
@@ -238,7 +239,7 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             self.DeclareVectorOutputPort(
                 name,
                 port.size(),
-                partial(self._calc_output, formulas[name]),
+                weakly(self._calc_output, formulas[name]),
                 {tickets[source] for source in formulas[name].sources},
             )
 

@@ -16,6 +16,7 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
+from drake_dae.systems.lifetime import weakly
 
 
 class TrackingController(ParameterizedSystem):
@@ -62,9 +63,11 @@ class TrackingController(ParameterizedSystem):
             sizes["measured_force"] = dae.num_constraints
         self._input_ports = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-        self.DeclareVectorOutputPort("control", dae.num_controls, self._calc_control, sources)
         self.DeclareVectorOutputPort(
-            "tracking_error", dae.num_controls, self._calc_tracking_error, sources
+            "control", dae.num_controls, weakly(self._calc_control), sources
+        )
+        self.DeclareVectorOutputPort(
+            "tracking_error", dae.num_controls, weakly(self._calc_tracking_error), sources
         )
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:

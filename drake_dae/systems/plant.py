@@ -20,6 +20,7 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
+from drake_dae.systems.lifetime import weakly
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -89,24 +90,24 @@ class DaePlant(ParameterizedSystem):
         self.DeclareVectorOutputPort(
             "constraint_force",
             system.num_constraints,
-            self._calc_force,
+            weakly(self._calc_force),
             by_control if self._force_needs_control else by_state,
         )
         self.DeclareVectorOutputPort(
             "constraint_residual",
             len(structure.manifold.residual_signals),
-            self._calc_residual,
+            weakly(self._calc_residual),
             by_state,
         )
         self.DeclareVectorOutputPort(
             "controlled_output",
             system.num_controls,
-            self._calc_output,
+            weakly(self._calc_output),
             by_control if self._output_needs_control else by_state,
         )
-        self.DeclareInitializationPublishEvent(self._check_start)
+        self.DeclareInitializationPublishEvent(weakly(self._check_start))
         if project and system.num_constraints:
-            self.DeclarePerStepUnrestrictedUpdateEvent(self._project)
+            self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""

@@ -4,12 +4,19 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, ContinuousState, ValueProducer
+from pydrake.systems.framework import (
+    BasicVector,
+    CacheEntry,
+    Context,
+    ContinuousState,
+    ValueProducer,
+)
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.block import Formula, ParameterizedSystem
+from drake_dae.systems.lifetime import weakly
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -85,29 +92,30 @@ class StateRealization(ParameterizedSystem):
         by_state = {self.xc_ticket(), self.all_parameters_ticket()}
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
         # Drake hands the value before to the calculation: Newton's method starts there.
-        self._state_entry = self.DeclareCacheEntry(
+        # Its number, since Drake's entry would keep this system for ever.
+        self._state_index = self.DeclareCacheEntry(
             "state",
-            ValueProducer(lambda: AbstractValue.Make(start.copy()), self._calc_state),
+            ValueProducer(lambda: AbstractValue.Make(start.copy()), weakly(self._calc_state)),
             by_state,
-        )
-        self.DeclareVectorOutputPort("state", dae.num_states, self._copy_state, by_state)
+        ).cache_index()
+        self.DeclareVectorOutputPort("state", dae.num_states, weakly(self._copy_state), by_state)
         self.DeclareStateOutputPort("coordinates", state_index)
         self.DeclareVectorOutputPort(
             "constraint_force",
             dae.num_constraints,
-            self._calc_force,
+            weakly(self._calc_force),
             by_control if self._force_needs_control else by_state,
         )
         self.DeclareVectorOutputPort(
             "controlled_output",
             dae.num_controls,
-            self._calc_output,
+            weakly(self._calc_output),
             by_control if layout.direct.size else {self.xc_ticket()},
         )
 
     def state(self, context: Context) -> FloatArray:
         """The state x = Phi^-1(0, zeta, xi) in a context, shape (n,)."""
-        return self._state_entry.Eval(context).copy()
+        return self._state_entry().Eval(context).copy()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the coordinates to those of a state on N*, shape (n,), and the branch to its own.
@@ -129,7 +137,7 @@ class StateRealization(ParameterizedSystem):
         context.SetContinuousState(self._coordinates(x, p))
         # Makes x out of date where N* is but points, so that there are no coordinates to set.
         context.get_mutable_numeric_parameter(0)
-        entry = self._state_entry.get_mutable_cache_entry_value(context)
+        entry = self._state_entry().get_mutable_cache_entry_value(context)
         entry.GetMutableValueOrThrow()[:] = x
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
@@ -139,6 +147,9 @@ class StateRealization(ParameterizedSystem):
         value[self._layout.ends] = rates[: self._layout.ends.size]
         value[self._layout.chain_size :] = rates[self._layout.ends.size :]
         derivatives.get_mutable_vector().SetFromVector(value)
+
+    def _state_entry(self) -> CacheEntry:
+        return self.get_cache_entry(self._state_index)
 
     def _coordinates(self, state: FloatArray, parameters: FloatArray | None) -> FloatArray:
         return self.normal_form.coordinates(state, parameters)[self._on_manifold.size :]
@@ -172,7 +183,7 @@ class StateRealization(ParameterizedSystem):
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
-        x = self._state_entry.Eval(context)
+        x = self._state_entry().Eval(context)
         inputs = (self._control_port.Eval(context),) if needs_control else ()
         return self._checked(function, context, x, *inputs)[0]
 
@@ -183,7 +194,7 @@ class StateRealization(ParameterizedSystem):
         )
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._state_entry.Eval(context))
+        output.SetFromVector(self._state_entry().Eval(context))
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))

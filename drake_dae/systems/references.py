@@ -13,6 +13,7 @@ from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems.block import DifferentiableSystem, Formula
+from drake_dae.systems.lifetime import weakly
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +131,7 @@ class ReferenceGenerator(DifferentiableSystem):
         self.DeclareVectorOutputPort(
             "reference",
             sum(degree + 1 for degree in degrees),
-            self._calc_reference,
+            weakly(self._calc_reference),
             {self.time_ticket()},
         )
 

@@ -1,12 +1,11 @@
 """A RobotModel as a LeafSystem."""
 
-from functools import partial
-
 from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
+from drake_dae.systems.lifetime import weakly
 from drake_dae.systems.plant import DaePlant
 from drake_dae.trace.functions import TracedFunction
 
@@ -47,7 +46,7 @@ class RobotPlant(DaePlant):
             self.DeclareVectorOutputPort(
                 name,
                 part.stop - part.start,
-                partial(self._calc_part, part),
+                weakly(self._calc_part, part),
                 {self.xc_ticket()},
             )
         if model.joint_force is not None:
@@ -55,7 +54,7 @@ class RobotPlant(DaePlant):
             self.DeclareVectorOutputPort(
                 "joint_torque",
                 model.joint_force.numel(),
-                self._calc_joint_torque,
+                weakly(self._calc_joint_torque),
                 {self.xc_ticket(), self.all_parameters_ticket()},
             )
 

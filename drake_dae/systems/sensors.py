@@ -8,6 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.systems.block import DifferentiableSystem, Formula, TracedFormula
+from drake_dae.systems.lifetime import weakly
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -79,13 +80,13 @@ class ForceSensor(DifferentiableSystem):
             self.DeclareContinuousState(size)
         if self.sample_period:
             self._held = self.DeclareDiscreteState(size)
-            self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, self._sample)
+            self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, weakly(self._sample))
             sources = {self.xd_ticket()}
         else:
             sources = {self.xc_ticket()}
             if self._noise_port is not None:
                 sources.add(self.input_port_ticket(self._noise_port.get_index()))
-        self.DeclareVectorOutputPort("measured_force", size, self._calc_measured, sources)
+        self.DeclareVectorOutputPort("measured_force", size, weakly(self._calc_measured), sources)
 
     def set_force(self, context: Context, force: ArrayLike) -> None:
         """Starts the sensor as if it had felt a constant force, shape (m,), without noise."""

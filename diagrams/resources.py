@@ -1,0 +1,138 @@
+"""Which files a robot's geometry may be read from.
+
+Meshcat copies meshes, and the files that they name, into the page that it writes. A model from a
+stranger could name any file of this machine, and the page would take it along when it is sent.
+"""
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from pydrake.common import GetDrakePath
+from pydrake.geometry import Role, SceneGraph
+
+from drake_dae.errors import ModelError
+
+# Generous, since readers of these formats are: options and line ends may stand before a name.
+_MATERIAL_LIBRARY = re.compile(r"mtllib\s+([^\r\n]+)")
+_TEXTURE = re.compile(r"(?:map_|bump|disp|decal|norm|refl)[^\r\n]*[\r\n]*[^\r\n]*", re.IGNORECASE)
+_COLLADA_IMAGE = re.compile(r"<(?:\w+:)?(?:init_from|ref)\b[^>]*>\s*([^<]+?)\s*<")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+
+_OUTSIDE = (
+    "which is outside of the model's package or folder: it would be copied into the animation. "
+    "Move it there, or name its folder under robot.packages"
+)
+
+
+def package_folder(model: Path) -> Path:
+    """The folder that a model file may read from: that of its package, or else its own."""
+    folder = model.resolve().parent
+    homes = (above for above in (folder, *folder.parents) if (above / "package.xml").is_file())
+    return next(homes, folder)
+
+
+def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
+    """Refuses a mesh or texture, or what a mesh names, that is outside of all folders.
+
+    Links in the file system are followed: what counts is where a file really is. Drake's own
+    packages are always allowed.
+
+    Args:
+        scene_graph: With the geometry of the robot, not drawn yet.
+        folders: Of the model and its packages.
+
+    Raises:
+        ModelError: The link, the file and what it names.
+    """
+    allowed = [folder.resolve() for folder in (*folders, *_drake_folders())]
+    inspector = scene_graph.model_inspector()
+    for geometry in inspector.GetAllGeometryIds():
+        body = inspector.GetName(inspector.GetFrameId(geometry)).split("::")[-1]
+        source = getattr(inspector.GetShape(geometry), "source", None)
+        files = []
+        if source is not None and source().is_path():
+            files.append(Path(source().path()))
+        for role in (Role.kPerception, Role.kIllustration):
+            properties = inspector.GetProperties(geometry, role)
+            if properties is not None and properties.HasProperty("phong", "diffuse_map"):
+                files.append(Path(properties.GetProperty("phong", "diffuse_map")))
+        for file in files:
+            if not _is_within(file, allowed):
+                raise ModelError(f"link '{body}' names the file '{file}', {_OUTSIDE}")
+            _check_references(body, file, allowed)
+
+
+def _check_references(body: str, file: Path, allowed: list[Path]) -> None:
+    """Refuses what a file names outside of the folders, and what those files name."""
+    waiting, seen = [file], set()
+    while waiting:
+        current = waiting.pop()
+        if current in seen or not current.is_file():
+            continue
+        seen.add(current)
+        for name in _references(current):
+            if name.lower().startswith("data:"):
+                continue
+            # Percent signs are decoded by some readers, and taken as they are by Drake's.
+            for spelled in {name, unquote(name)}:
+                target = current.parent / spelled
+                if _SCHEME.match(spelled) or not _is_within(target, allowed):
+                    raise ModelError(
+                        f"link '{body}' has the mesh '{file}', in which '{current.name}' names "
+                        f"'{name}', {_OUTSIDE}"
+                    )
+                waiting.append(target)
+
+
+def _references(file: Path) -> Iterator[str]:
+    """The files that a mesh or a material names, as they are written."""
+    kind = file.suffix.lower()
+    if kind not in (".gltf", ".obj", ".mtl", ".dae"):
+        return
+    text = file.read_bytes().decode("utf-8", errors="replace")
+    if kind == ".gltf":
+        try:
+            yield from _uris(json.loads(text, object_pairs_hook=list))
+        except (ValueError, RecursionError):
+            raise ModelError(f"the mesh '{file}' is not JSON, as glTF has to be") from None
+    elif kind == ".obj":
+        for names in _MATERIAL_LIBRARY.findall(text):
+            yield from {names.strip(), *names.split()}
+    elif kind == ".mtl":
+        for line in _TEXTURE.findall(text):
+            yield from line.split()
+    else:
+        yield from _COLLADA_IMAGE.findall(text)
+
+
+def _uris(data: Any) -> Iterator[str]:
+    """The entries "uri" of buffers, of images, and of whatever an extension adds.
+
+    Args:
+        data: JSON, with objects as lists of (key, value): a key may be there twice.
+    """
+    if isinstance(data, tuple) and data[0] == "uri" and isinstance(data[1], str):
+        yield data[1]
+    elif isinstance(data, (list, tuple)):
+        for part in data:
+            yield from _uris(part)
+
+
+def _is_within(file: Path, folders: list[Path]) -> bool:
+    try:
+        real = file.resolve()
+    except (OSError, RuntimeError, ValueError):  # A loop of links, or no path at all.
+        return False
+    return any(real.is_relative_to(folder) for folder in folders)
+
+
+def _drake_folders() -> Iterator[Path]:
+    """Where Drake's packages are: those that it brings, and those that it downloads."""
+    yield Path(GetDrakePath())
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    yield Path(cache) / "drake" / "package_map"

@@ -1,0 +1,85 @@
+"""How an attempt ended."""
+
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drake_dae import Record
+from drake_dae.errors import DrakeDaeError
+
+RESULT, REFUSED, ODD, WRONG, RAW, HANG = (
+    "result",
+    "refused",
+    "accepted without a reason",
+    "wrong number",
+    "raw exception",
+    "hang or crash",
+)
+CLASSES = (RESULT, REFUSED, ODD, WRONG, RAW, HANG)
+BAD = (ODD, WRONG, RAW, HANG)
+"""What must not be."""
+
+RESIDUAL = 1e-6
+"""The largest constraint residual of a run that is no wrong number, m or rad (per s, ...)."""
+
+OFF = 1e-4
+"""How far errors may be off the prediction, beside the largest output."""
+
+
+@dataclass
+class Outcome:
+    """How an attempt ended.
+
+    Attributes:
+        what: What was attempted.
+        kind: One of CLASSES.
+        text: The message, or why it was accepted.
+        residual, off: The largest constraint residual, and the largest deviation of the error from
+            its prediction beside the largest output; NaN if it did not run.
+    """
+
+    what: str
+    kind: str = RESULT
+    text: str = ""
+    residual: float = np.nan
+    off: float = np.nan
+
+    def figures(self, record: Record, predicted: np.ndarray | None) -> None:
+        """Judges the numbers of a run; no prediction is compared with if it is None."""
+        residual = record["constraint_residual"]
+        self.residual = float(np.max(np.abs(residual), initial=0.0))
+        finite = all(np.all(np.isfinite(signal.values)) for signal in record.signals.values())
+        self.off = 0.0
+        if predicted is not None:
+            # Outputs of one kind share a scale: the largest of any, as springs mix them.
+            size = max(1.0, float(np.max(np.abs(record["controlled_output"]), initial=0.0)))
+            self.off = float(np.max(np.abs(record["tracking_error"] - predicted)) / size)
+        if not (finite and self.residual <= RESIDUAL and self.off <= OFF):
+            self.kind = WRONG
+            self.text = f"finite {finite}, residual {self.residual:.2g}, off {self.off:.2g}"
+
+    def accepted(self, excuse: str) -> None:
+        """Says why a bad input may run."""
+        if self.kind == RESULT:
+            self.kind, self.text = (RESULT, excuse) if excuse else (ODD, "it ran")
+
+
+@contextmanager
+def checked(what: str) -> Iterator[Outcome]:
+    """An outcome that takes down how its block ends."""
+    outcome = Outcome(what)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield outcome
+    except DrakeDaeError as error:
+        outcome.kind, outcome.text = REFUSED, f"{type(error).__name__}: {error}"
+    except (Exception, SystemExit) as error:  # SystemExit: an assertion of Drake's.
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(last.filename).name}:{last.lineno}"
+        outcome.kind, outcome.text = RAW, f"{type(error).__name__} at {where}: {error}"
