@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
@@ -21,6 +22,7 @@ CELLS = 24
 """How many cells of a mesh stand side by side."""
 
 
+@checked(ModelError)
 class Surface(ABC):
     """A smooth surface that stands in the world.
 
