@@ -27,6 +27,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.arrays import brief, numbers
+from drake_dae.cli import main
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.diagrams.scenario_parts import Robot
@@ -264,3 +265,13 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
 
 def test_dollars_in_names_are_no_mathematics():
     assert _label(Signal("$x^$", "m")) == r"\$x^\$ [m]"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("file", "is a file; name a folder"), ("a\0b", "null byte")]
+)
+def test_a_folder_that_is_none(tmp_path, capsys, name, words):
+    (tmp_path / "file").write_text("kept")
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path / name)]) == 1
+    assert words in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "kept"
