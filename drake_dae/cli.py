@@ -189,6 +189,8 @@ def _unused(name: str) -> Path:
 def _prepare(folder: Path) -> Path:
     """Makes the folder of a run; the files of an earlier one are removed, others never."""
     try:
+        if folder.exists() and not folder.is_dir():
+            raise ScenarioError(("--out", f"'{folder}' is a file; name a folder"))
         folder.mkdir(parents=True, exist_ok=True)
         present = [folder / name for name in FILES if (folder / name).exists()]
         if present:
@@ -201,7 +203,9 @@ def _prepare(folder: Path) -> Path:
             file.unlink()
         # A folder that cannot be written to is found now, not at the end of the run.
         (folder / FILES[0]).touch()
-    except (OSError, UnicodeDecodeError) as error:
+    except ScenarioError:
+        raise
+    except (OSError, ValueError) as error:  # A null byte in the path, text of another encoding.
         reason = getattr(error, "strerror", None) or error
         raise ScenarioError(("--out", f"cannot write to '{folder}': {reason}")) from None
     return folder

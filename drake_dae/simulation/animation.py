@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, Rgba
 from pydrake.systems.framework import Context
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
@@ -24,6 +25,7 @@ class Viewed(Protocol):
         """The blocks that draw, or None."""
 
 
+@checked(ModelError)
 def make_animation(loop: Viewed, record: Record, context: Context) -> str:
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
 
@@ -39,7 +41,7 @@ def make_animation(loop: Viewed, record: Record, context: Context) -> str:
         ModelError: There is no meshcat or no robot.
     """
     view = loop.view
-    if view is None:
+    if not isinstance(view, View):
         raise ModelError("an animation needs a closed loop of a RobotPlant, made with a meshcat")
     meshcat, plant, model = view.meshcat, view.plant, view.plant.model
     parameters = plant.parameters(plant.GetMyContextFromRoot(context))

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, ValueProducer
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
@@ -13,6 +14,7 @@ from drake_dae.systems.block import Formula, ParameterizedSystem
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class StateRealization(ParameterizedSystem):
     """The motion on N* in coordinates (zeta, xi) of the normal form, equations (26)-(27):
 
@@ -53,11 +55,6 @@ class StateRealization(ParameterizedSystem):
     """
 
     def __init__(self, normal_form: NormalForm) -> None:
-        if not isinstance(normal_form, NormalForm):
-            raise ModelError(
-                f"StateRealization needs a NormalForm, got {type(normal_form).__name__}; make it "
-                "with NormalForm(system)"
-            )
         structure, dae = normal_form.structure, normal_form.system
         signals = {"state": dae.state_signals, "control": dae.control_signals}
         super().__init__(dae, dae.parameter_values, signals)

@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
@@ -15,6 +16,7 @@ from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems.block import DifferentiableSystem, Formula
 
 
+@checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class TrajectoryReference(Reference):
     """A reference that is a Drake Trajectory, with the derivatives that it provides itself.
@@ -91,6 +93,7 @@ class TrajectoryReference(Reference):
                         )
 
 
+@checked(ReferenceSignalError)
 class ReferenceGenerator(DifferentiableSystem):
     """References of all outputs, stacked, with their derivatives.
 
@@ -114,12 +117,6 @@ class ReferenceGenerator(DifferentiableSystem):
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
         super().__init__()
         self.set_name("reference")
-        for index, reference in enumerate(references):
-            if not isinstance(reference, Reference):
-                raise ReferenceSignalError(
-                    f"references[{index}] must be a reference such as ConstantReference(0.3), got "
-                    f"{reference!r}"
-                )
         covered = sum(reference.size for reference in references)
         if covered != len(degrees):
             raise ReferenceSignalError(

@@ -8,7 +8,8 @@ import pytest
 from problems import double_integrator
 
 from drake_dae.dae.signals import Parameter, Signal, signals
-from drake_dae.dae.system import DaeSystem, check_is_system
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
 
@@ -222,12 +223,11 @@ def test_a_system_is_one_line_at_the_prompt():
 
 def test_what_has_a_system_is_no_system():
     system = double_integrator()
-    check_is_system(system, "a test")
-    with pytest.raises(ModelError, match=r"a test needs a DaeSystem, got NoneType$"):
-        check_is_system(None, "a test")
+    with pytest.raises(ModelError, match=r"find_structure: system must be a DaeSystem, got None$"):
+        find_structure(None)
     for name in ("dae", "system"):
-        with pytest.raises(ModelError, match=rf"got SimpleNamespace; pass its \.{name}$"):
-            check_is_system(SimpleNamespace(**{name: system}), "a test")
+        with pytest.raises(ModelError, match=rf"must be a DaeSystem, got .*; pass its \.{name}$"):
+            find_structure(SimpleNamespace(**{name: system}))
 
 
 def test_too_many_and_too_few_outputs_are_refused():
@@ -399,7 +399,7 @@ def test_bad_parameters_are_refused():
     for value in (np.nan, [1.0, np.inf], [[1.0]]):
         with pytest.raises(ModelError, match="'mass' must be finite and one-dimensional"):
             Parameter("mass", value)
-    with pytest.raises(ModelError, match="'mass' must be real numbers"):
+    with pytest.raises(ModelError, match="must be numbers, got 'heavy'"):
         Parameter("mass", "heavy")
     for symbol in (
         ca.SX.sym("m", 3),
@@ -407,7 +407,7 @@ def test_bad_parameters_are_refused():
         ca.SX.sym("m", 2) ** 2,
         ca.MX.sym("m", 2),
     ):
-        with pytest.raises(ModelError, match="symbol of parameter 'mass' must be a CasADi SX colu"):
+        with pytest.raises(ModelError, match=r"symbol .*must be a CasADi SX"):
             Parameter("mass", [1.0, 2.0], symbol=symbol)
     with pytest.raises(ModelError, match=r"must be Python identifiers.*link1\.mass"):
         double_integrator(parameters={"link1.mass": 1.0})

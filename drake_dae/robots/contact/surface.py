@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
@@ -22,6 +23,7 @@ CELLS = 24
 """How many cells a mesh has along each side."""
 
 
+@checked(ModelError)
 class Surface(ABC):
     """A smooth surface that stands in the world.
 
@@ -82,8 +84,8 @@ class Surface(ABC):
         grid = self._patch(np.asarray(center, float), size)
         if np.all(np.isfinite(grid), axis=2).sum() < 3:
             warnings.warn(
-                f"{type(self).__name__}: no point of it is found within {size:.3g} m of {show(center)}, relative "
-                "to its reference point; it is not drawn",
+                f"{type(self).__name__}: no point of it is found within {size:.3g} m of "
+                f"{show(center)}, relative to its reference point; it is not drawn",
                 stacklevel=2,
             )
             return None
