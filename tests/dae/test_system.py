@@ -196,7 +196,7 @@ def test_only_g_beside_k_is_refused():
 @pytest.mark.parametrize("state", [None, 2.0, "xv", [3], [], 0, -1])
 def test_states_that_are_none_are_refused(state):
     fields = {"f": lambda x: x, "h": lambda x: x, "l": lambda x: x}
-    with pytest.raises(ModelError, match=r"the states must be a list|at least one state"):
+    with pytest.raises(ModelError, match=r"state.* must be a |at least one state"):
         DaeSystem.from_functions(state, **fields)
 
 
@@ -256,7 +256,7 @@ BAD_VALUES = {
         r"missing 1 required positional argument: 'p'. It is called with the state x alone",
     ),
     "a place that is not there": (lambda x: [x[5], 0], "out of bounds with supplied length of 2$"),
-    "no function": ([1, 2], r"f must be a function of the state, got list"),
+    "no function": ([1, 2], r"f must be a function, got"),
     "a condition": (lambda x: [x[1], 1 if x[0] > 0 else 2], "Conditions are not smooth"),
     "Python's max": (lambda x: [x[1], max(x[0], 0)], "Conditions are not smooth"),
     "a function of others": (
