@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
@@ -31,6 +32,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.robot_plant import RobotPlant
 
 
+@checked(lambda text: ScenarioError(("", text)))
 def build_scenario(
     scenario: Scenario, meshcat: Meshcat | None = None
 ) -> tuple[ClosedLoop, Context]:

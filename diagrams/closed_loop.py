@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
@@ -9,6 +10,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
@@ -22,7 +24,10 @@ from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
 
+Block = TypeVar("Block", DaePlant, ForceSensor)
 
+
+@checked(WiringError)
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """A plant that follows a reference under the law (28).
@@ -84,6 +89,7 @@ class ClosedLoop:
         )
 
 
+@checked(WiringError)
 def make_closed_loop(
     system: DaePlant,
     law: TrackingLaw,
@@ -118,15 +124,11 @@ def make_closed_loop(
         WiringError: The law or the sensor has other sizes than the plant; measured force would
             close an algebraic loop, or a sampled loop that diverges; or no law uses the sensor.
     """
-    if not isinstance(system, DaePlant):
-        raise WiringError(
-            f"make_closed_loop needs a DaePlant or RobotPlant, got {type(system).__name__}"
-        )
     _check_sizes(system, law, sensor)
     builder = DiagramBuilder()
 
     # The plant, its reference and its controller.
-    plant = builder.AddSystem(system)
+    plant = _add(builder, system)
     reference = builder.AddSystem(ReferenceGenerator(references, law.degrees))
     try:
         outputs = law.layout.values(reference.reference(start_time))
@@ -171,6 +173,16 @@ def make_closed_loop(
     diagram = builder.Build()
     diagram.set_name("closed_loop")
     return ClosedLoop(diagram, plant, controller, reference, loggers, scene_graph, sensor, noise)
+
+
+def _add(builder: DiagramBuilder, block: Block) -> Block:
+    """Adds what the caller made."""
+    try:
+        return builder.AddSystem(block)
+    except RuntimeError:
+        raise WiringError(
+            f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
+        ) from None
 
 
 def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
@@ -225,7 +237,7 @@ def _add_force_feedback(
                 f"{sensor.largest_stable_gain():.3g}. Lower force_gain, or give the sensor a "
                 "time_constant well above its sample_period"
             )
-        builder.AddSystem(sensor)
+        _add(builder, sensor)
         builder.Connect(force, sensor.GetInputPort("force"))
         force = sensor.GetOutputPort("measured_force")
         if sensor.HasInputPort("noise"):

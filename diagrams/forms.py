@@ -15,6 +15,7 @@ import numpy as np
 import pydantic
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
+from drake_dae.arrays import brief
 from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import ScenarioError
 
@@ -241,7 +242,7 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
 def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
     """What is wrong with a key that is missing or should not be there."""
     if name == TAG:
-        return f"takes no tag, got {value}"
+        return f"takes no tag, got {str(value)[:60]}"
     names = [name for name in place.schema["properties"] if name != TAG]
     title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
     if is_missing:
@@ -313,5 +314,5 @@ def _show(data: Any) -> str:
         return "nothing"
     if isinstance(data, dict) and TAG in data:
         return str(data[TAG])
-    text = repr(data)
+    text = brief(data)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.dae import references
 from drake_dae.diagrams import scenario_parts as parts
@@ -146,11 +147,15 @@ def find_scenario(name: str) -> Path:
     if name in shipped:
         return shipped[name]
     path = Path(name)
-    if path.is_file():
-        return path
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError):
+        pass  # Such as a null byte.
     raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
 
 
+@checked(lambda text: ScenarioError(("", text)))
 def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """Reads a scenario file.
 
@@ -166,7 +171,9 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
+    except (OSError, ValueError) as error:  # A null byte in the path.
         raise ScenarioError((str(path), str(error))) from None
     data = load_yaml(text, str(path))
     data = {} if data is None else data
@@ -177,11 +184,16 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         set_entry(data, setting, _reader().free_names)
     scenario = _reader().read(data)
     # Absolute, so that the scenario as run means the same wherever it is written.
-    robot, here = scenario.robot, path.resolve().parent
+    robot = scenario.robot
     file = robot.file
-    if file and not file.startswith("package://"):
-        file = str((here / file).resolve())
-    packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
+    try:
+        here = path.resolve().parent
+        if file and not file.startswith("package://"):
+            file = str((here / file).resolve())
+        packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
+    except (OSError, RuntimeError, ValueError) as error:
+        # The working directory is gone; a link that leads to itself; a null byte.
+        raise ScenarioError(("robot", f"no path: {error}")) from None
     return replace(scenario, robot=parts.Robot(file, packages))
 
 

@@ -1,7 +1,10 @@
 """The robot of a scenario, with what it touches and what it shall steer."""
 
+import logging
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -98,16 +101,21 @@ def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
 
 def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
     is_url = robot.file.startswith("package://")
-    if not is_url and not Path(robot.file).is_file():
+    if not is_url and not _is_file(robot.file):
         raise ModelError(f"no file '{robot.file}'; a relative path starts in the scenario's folder")
     # Continuous: only then are the plant's own dynamics those of (37).
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     parser = Parser(plant)
+    dropped = _Dropped()
+    log = logging.getLogger("drake")
+    log.addFilter(dropped)
     try:
         parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
         for name, folder in robot.packages.items():
             parser.package_map().Add(name, folder)
+        file = parser.package_map().ResolveUrl(robot.file) if is_url else robot.file
+        _check_one_robot(Path(file))
         if is_url:
             parser.AddModelsFromUrl(robot.file)
         else:
@@ -119,7 +127,66 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
     except (RuntimeError, ValueError, SystemExit) as error:
         # Drake has all of them: SystemExit for what an assertion of its own finds.
         raise ModelError(str(error)) from None
+    finally:
+        log.removeFilter(dropped)
+    if dropped.warnings:
+        raise ModelError("; ".join(map(_explained, dropped.warnings)))
     return plant
+
+
+class _Dropped(logging.Filter):
+    """Collects what Drake's parser changes or leaves out, with no more than a warning."""
+
+    KINDS = ("inertia", "friction", "effort limit")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.warnings: list[str] = []
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        is_dropped = "warning: " in text and any(kind in text for kind in self.KINDS)
+        if is_dropped:
+            self.warnings.append(text)
+        return not is_dropped
+
+
+def _explained(warning: str) -> str:
+    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint."""
+    place, text = warning.split(": warning: ", 1)
+    kind = "link" if "inertia" in text else "joint"
+    if "inertia" in text:
+        text = (
+            "mass or inertia of no body: a mass is positive, moments of inertia are positive and "
+            "none exceeds the sum of the others"
+        )
+    elif "friction" in text:
+        text = "Coulomb friction of a joint is not supported; leave <dynamics friction> out"
+    file, _, line = place.rpartition(":")
+    owner = ""
+    if _is_file(file) and line.isdecimal():
+        with open(file, encoding="utf-8", errors="replace") as lines:
+            before = "".join(islice(lines, int(line)))
+        names = re.findall(rf"<{kind}\s[^>]*?name\s*=\s*[\"']([^\"']*)", before)
+        owner = f"{kind} '{names[-1]}': " if names else ""
+    return f"{place}: {owner}{' '.join(text.split())}"
+
+
+def _check_one_robot(file: Path) -> None:
+    """Refuses a second robot in a URDF, which Drake would not read."""
+    if file.suffix != ".urdf":
+        return
+    text = re.sub(r"<!--.*?-->", "", file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
+    names = re.findall(r"<robot\b[^>]*", text)
+    if len(names) > 1:
+        raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except (OSError, ValueError):  # A null byte.
+        return False
 
 
 def _constraints(

@@ -2,24 +2,69 @@
 
 import re
 from collections.abc import Container
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped]
 
+from drake_dae.arrays import brief
 from drake_dae.errors import ScenarioError
 
 TAG = "_tag"
 """The key under which a mapping holds its tag."""
 
 
+_READ_HERE = ("int", "float", "timestamp")
+
+MOST_VALUES, MOST_TEXT, MOST_LEVELS = 100_000, 1_000_000, 50
+"""Of a file, with each alias counted as often as it is used: the shipped ones have 200 values in
+4,000 characters, and what is larger takes longer to read than to simulate."""
+
+
 class _Loader(yaml.SafeLoader):
-    """YAML 1.1, but 1e-8 is a number, keys are text and stand once, and tags are kept."""
+    """YAML 1.1, but numbers are those of JSON, keys are text and stand once, and tags are kept."""
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _READ_HERE]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self._depth += 1
+        if self._depth > MOST_LEVELS:
+            mark = self.peek_event().start_mark
+            text = f"more than {MOST_LEVELS} lists or keys in each other"
+            raise yaml.composer.ComposerError(problem=text, problem_mark=mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None:
+            self._check_size(node, {})
+        return node
+
+    def _check_size(self, node: yaml.Node, known: dict[int, int]) -> int:
+        """How many values a node stands for."""
+        if id(node) not in known:
+            known[id(node)] = MOST_VALUES  # Of an alias inside of itself.
+            parts = node.value if isinstance(node, yaml.CollectionNode) else []
+            if isinstance(node, yaml.MappingNode):
+                parts = [part for pair in parts for part in pair]
+            size = 1 + sum(self._check_size(part, known) for part in parts)
+            if size > MOST_VALUES:
+                text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
+                raise self._error(text, node)
+            known[id(node)] = size
+        return known[id(node)]
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
         names = set()
         for key, _ in node.value:
             if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
-                raise self._error(f"the key {key.value!r} is not text; quote it", key)
+                raise self._error(f"the key {brief(key.value)} is not text; quote it", key)
             if key.value in names:
                 raise self._error(f"the key '{key.value}' is given twice", key)
             names.add(key.value)
@@ -36,9 +81,16 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_multi_constructor("!", _Loader.construct_tagged)
+# YAML 1.1 has also 1_000, 010 for eight and 1:30 for ninety. These are text.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"[-+]?(0|[1-9][0-9]*)$"), list("-+0123456789")
+)
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
+    re.compile(
+        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
+        r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
+    ),
     list("-+.0123456789"),
 )
 
@@ -65,14 +117,19 @@ def load_yaml(text: str, name: str) -> Any:
         ScenarioError: The YAML is broken, or a key is no text or given twice; the message has the
             line.
     """
+    if len(text) > MOST_TEXT:
+        raise ScenarioError((name, f"more than {MOST_TEXT} characters, got {len(text)}"))
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         what = ", ".join(part for part in (error.context, error.problem) if part)
         raise ScenarioError((name, line + what)) from None
-    except (yaml.YAMLError, ValueError) as error:  # Control characters; a date that is none.
+    except yaml.YAMLError as error:  # Control characters.
         raise ScenarioError((name, str(error))) from None
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
+        raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
 
 
 def dump_yaml(data: Any) -> str:
@@ -108,7 +165,7 @@ def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
                 raise ScenarioError((path, f"no entry '{part}'; entries: {known}"))
             slot = int(part)
         elif not isinstance(data, dict):
-            raise ScenarioError((path, f"{data!r} has no entry '{part}'"))
+            raise ScenarioError((path, f"{brief(data)} has no entry '{part}'"))
         if not rest:
             data[slot] = value
             return

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Integral, Real
+from reprlib import Repr
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ Booleans = np.typing.NDArray[np.bool_]
 
 
 def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> FloatArray:
-    """Real numbers as a new array; they need not be finite.
+    """Real numbers as a new array; they need not be finite. Text and masked entries are none.
 
     Args:
         what: How a message calls them.
@@ -25,12 +27,46 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
     Raises:
         ModelError: The value holds something else, or rows of different lengths.
     """
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value.copy()
     try:
-        if np.iscomplexobj(value):  # NumPy would drop the imaginary parts.
-            raise TypeError
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise error(f"{what} must be real numbers, got {value!r}") from None
+        if np.ma.is_masked(value):
+            raise error(f"{what} must be real numbers, and some entries are masked")
+        # NumPy would read text, count True as 1, and drop imaginary parts.
+        array = np.array(value)
+        is_real = array.dtype.kind in "iuf" or (
+            array.dtype.kind == "O"
+            and all(isinstance(entry, Real) and not isinstance(entry, bool) for entry in array.flat)
+        )
+        if is_real:
+            return array.astype(float, copy=False)
+    except (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError):
+        pass
+    raise error(f"{what} must be real numbers, got {brief(value)}") from None
+
+
+def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
+    """A finite real number.
+
+    Raises:
+        ModelError: It is none.
+    """
+    array = numbers(what, value, error)
+    if array.shape != () or not np.isfinite(array):
+        raise error(f"{what} must be a finite number, got {brief(value)}")
+    return float(array)
+
+
+def positive(what: str, value: Any, error: type[Exception] = ModelError) -> float:
+    """A finite real number above 0.
+
+    Raises:
+        ModelError: It is none.
+    """
+    found = number(what, value, error)
+    if found <= 0.0:
+        raise error(f"{what} must be positive, got {brief(value)}")
+    return found
 
 
 def vector(
@@ -55,8 +91,8 @@ def check_whole_number(what: str, value: Any, least: int) -> None:
     Raises:
         ModelError: The value is too small, or no whole number.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ModelError(f"{what} must be a whole number from {least}, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ModelError(f"{what} must be a whole number from {least}, got {brief(value)}")
 
 
 def check_axes(name: str, axes: str) -> None:
@@ -84,6 +120,22 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
     near = get_close_matches(str(name), names, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
     return f"no {kind} '{name}'; {hint}there are {', '.join(names) or 'none'}"
+
+
+_BRIEF = Repr()
+_BRIEF.maxlevel, _BRIEF.maxlist, _BRIEF.maxtuple, _BRIEF.maxdict, _BRIEF.maxset = 3, 6, 6, 4, 4
+_BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
+
+
+def brief(value: Any) -> str:
+    """Any value in a message: in one line, and short however large it is."""
+    try:
+        text = " ".join(_BRIEF.repr(value).split())
+    except Exception:  # Of a __repr__ that is not ours.
+        text = f"a {type(value).__name__}"
+    if text.startswith("<"):  # It says where in memory it is, and no more.
+        return f"a {type(value).__name__}"
+    return text if len(text) <= 200 else f"{text[:197]}..."
 
 
 def show(array: ArrayLike) -> str:

@@ -10,6 +10,8 @@ import casadi as ca
 import numpy as np
 from pydrake.symbolic import Expression, ExpressionKind, Variable
 
+from drake_dae.arguments import checked
+from drake_dae.arrays import numbers
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -50,6 +52,7 @@ _NOT_SMOOTH = {
 }
 
 
+@checked(ModelError)
 def from_symbolic(
     state: Sequence[Variable],
     *,
@@ -80,8 +83,6 @@ def from_symbolic(
             system, see `DaeSystem`.
     """
     owner = labels.get("name", "system")
-    if isinstance(state, Variable):
-        raise ModelError(f"{owner}: the states must be a list of Variables, got {state!r}")
     defaults = dict(parameters or {})
     symbols: dict[int, ca.SX] = {}
     for variable in [*state, *defaults]:
@@ -139,7 +140,7 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX]) -> ca.SX:
             )
         return symbols[expression.get_id()]
     if isinstance(expression, Real):
-        return ca.SX(float(expression))
+        return ca.SX(float(numbers("it", expression)))
     if not isinstance(expression, Expression):
         raise ModelError(
             f"it is no expression of pydrake.symbolic, but {type(expression).__name__}"

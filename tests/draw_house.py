@@ -25,6 +25,7 @@ LOOKS = {
     "analysis": ("what the theory says", "#4d9a4a"),
     "dae": ("sections 1 and 2, in the order of the paper", "#c77d1e"),
     "trace": ("CasADi alone: functions, derivatives, Newton", "#b8493c"),
+    "arguments": ("annotations as checks", "#7a6a5a"),
     "arrays": ("checked numbers", "#7a6a5a"),
     "errors": ("exceptions", "#7a6a5a"),
 }

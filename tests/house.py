@@ -20,6 +20,7 @@ PACKAGE = ROOT / "drake_dae"
 FLOORS = (
     ("errors",),
     ("arrays",),
+    ("arguments",),
     ("trace",),
     ("dae",),
     ("analysis", "symbolic", "robots"),
@@ -33,7 +34,7 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "trace", "dae", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "arguments", "trace", "dae", "analysis")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (

@@ -231,15 +231,15 @@ def test_refusals_name_the_function_and_the_expression(make, message):
 
 def test_refused_variables():
     x = Variable("x")
-    with pytest.raises(ModelError, match=r"states must be a list of Variables, got Variable"):
+    with pytest.raises(ModelError, match=r"state must be a list, got Variable"):
         from_symbolic(x, f=[x], h=[1.0], l=[x])
     for states, parameters, message in (
         ([x, x], {}, "the variable x stands twice"),
         ([x], {x: 1.0}, "the variable x stands twice"),
-        (["x"], {}, "must be continuous Variables of pydrake.symbolic, got 'x'"),
+        (["x"], {}, r"state\[0\] must be a Variable, got 'x'"),
         ([Variable("n", Variable.Type.INTEGER)], {}, "must be continuous Variables"),
         ([x, Variable("x")], {}, "names must be unique"),
-        ([x], {Variable("c"): [1.0, 2.0]}, "the symbol of parameter 'c'"),
+        ([x], {Variable("c"): [1.0, 2.0]}, r"parameters\[.*\] must be a finite number"),
     ):
         with pytest.raises(ModelError, match=message):
             from_symbolic(

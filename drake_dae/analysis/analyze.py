@@ -15,6 +15,7 @@ from drake_dae.analysis.examined_states import ExaminedStates, check_consistent
 from drake_dae.analysis.findings import Assumption, Finding
 from drake_dae.analysis.reference_check import check_reference
 from drake_dae.analysis.report import Analysis
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.states.margins import Margin, find_margin, is_regular
 from drake_dae.dae.states.samples import Samples
@@ -26,7 +27,7 @@ from drake_dae.dae.structure.constrained import (
     examine_constraints,
 )
 from drake_dae.dae.structure.structure import Structure, control_violation, examine_outputs
-from drake_dae.dae.system import DaeSystem, check_is_system
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
 
@@ -40,6 +41,7 @@ STATEMENTS = (
 """What Assumptions (1) to (5) ask for, in a line each."""
 
 
+@checked(ModelError)
 def analyze(
     system: DaeSystem,
     *,
@@ -83,7 +85,6 @@ def analyze(
             its values; or the system has no controls, a function that is not finite, or a mass
             matrix that is not symmetric and positive definite.
     """
-    check_is_system(system, "analyze")
     if region is not None and states is not None:
         raise ModelError(f"{system.name}: give a region or states, not both")
     if (reference is None) != (times is None):
@@ -92,11 +93,6 @@ def analyze(
         raise ModelError(f"{system.name}: start is where a reference begins, and there is none")
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
-    if not (reference is None or callable(reference)):
-        raise ModelError(
-            f"{system.name}: reference must be a function of the time that returns R(t), got "
-            f"{reference!r}"
-        )
     random = np.random.default_rng(seed)
     chosen = (
         ExaminedStates.drawn(system, region, count, random)

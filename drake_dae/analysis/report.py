@@ -6,8 +6,11 @@ from typing import Any
 from drake_dae.analysis.findings import Findings
 from drake_dae.analysis.presentation import as_dict, parts_of
 from drake_dae.analysis.tables import Part, count_of, to_markdown, to_text
+from drake_dae.arguments import checked
+from drake_dae.errors import ModelError
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Analysis(Findings):
     """What the theory says about one system; made by `analyze`, printed by `print`."""

@@ -8,11 +8,13 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, show, vector
 from drake_dae.dae.layout import Layout
 from drake_dae.errors import GainError
 
 
+@checked(GainError)
 @dataclass(frozen=True, eq=False)
 class FeedbackGains:
     """The gains of the law (28), and with them the error dynamics (30).
@@ -94,8 +96,8 @@ class FeedbackGains:
         Raises:
             GainError: The number of error coordinates is wrong.
         """
-        moments = np.atleast_1d(np.asarray(times, dtype=float))
-        coordinates = np.asarray(initial, dtype=float)
+        moments = vector("times", np.atleast_1d(times), None, GainError)
+        coordinates = numbers("initial", initial, GainError)
         matrix = self.error_matrix
         if coordinates.shape != (matrix.shape[0],):
             raise GainError(
@@ -134,6 +136,7 @@ GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
 Poles = float | complex | Sequence[float | complex]
 
 
+@checked(GainError)
 def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
     """Gains K_ij that give each output its own poles: the coefficients of (32).
 
@@ -150,7 +153,10 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
     return design
 
 
-def gain_coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -> GainDesign:
+@checked(GainError)
+def gain_coefficients(
+    values: Sequence[float] | Mapping[str, float | Sequence[float]],
+) -> GainDesign:
     """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first.
 
     Args:
@@ -160,7 +166,9 @@ def gain_coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         matrix = np.zeros((len(names), sum(degrees)))
         starts = dict(zip(names, Layout(tuple(degrees)).starts, strict=True))
-        for name, degree, row in _per_output(values, names, degrees):
+        chosen: list[tuple[str, int, float | Sequence[float]]]
+        chosen = _per_output(values, names, degrees)
+        for name, degree, row in chosen:
             given = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
             if given.shape != (degree,):
                 raise GainError(
@@ -174,6 +182,7 @@ def gain_coefficients(values: Sequence[float] | Mapping[str, Sequence[float]]) -
     return design
 
 
+@checked(GainError)
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
     """Gains as full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ..., Lambda_6 of (72)-(73).
 

@@ -11,12 +11,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked, result_of
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.smoothness import find_flaw
 
 
+@checked(ReferenceSignalError)
 class Reference(ABC):
     """Desired values r(t) of one or several outputs, with their time derivatives.
 
@@ -58,6 +60,7 @@ class Reference(ABC):
         return None
 
 
+@checked(ReferenceSignalError)
 class _Expression(Reference):
     """A reference that is a CasADi expression of time; differentiated exactly."""
 
@@ -91,6 +94,7 @@ class _Expression(Reference):
         return _at_time(time, self.expression(degrees, time))
 
 
+@checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class ConstantReference(_Expression):
     """A reference that stays at given values.
@@ -115,6 +119,7 @@ class ConstantReference(_Expression):
         return ca.SX(ca.DM(self.values))
 
 
+@checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class SinusoidReference(_Expression):
     """The sum r(t) = offset + sum_i amplitude_i sin(frequency_i t + phase_i), for one output.
@@ -146,6 +151,7 @@ class SinusoidReference(_Expression):
         return ca.SX(self.offset + sum(a * ca.sin(w * time + p) for a, w, p in terms))
 
 
+@checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PointToPointReference(_Expression):
     """A smooth move from rest at `start` to rest at `end`, held before and after.
@@ -201,6 +207,7 @@ class PointToPointReference(_Expression):
             )
 
 
+@checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class ExpressionReference(_Expression):
     """A reference that is any CasADi expression of time.
@@ -231,7 +238,7 @@ class ExpressionReference(_Expression):
         return int(self._rows(ca.SX.sym("t")).numel())
 
     def _rows(self, time: ca.SX) -> ca.SX:
-        value = self.function(time)
+        value = result_of("function", self.function, time, error=ReferenceSignalError)
         try:
             return ca.SX(ca.vertcat(*(value if isinstance(value, (list, tuple)) else [value])))
         except (NotImplementedError, RuntimeError) as error:

@@ -7,10 +7,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Signal:
     """A scalar of a vector signal.
@@ -31,6 +33,7 @@ class Signal:
         return Signal(self.name + "'" * order, (self.unit or "1") + per_time)
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Parameter:
     """A number, or a vector of numbers, that a study changes without tracing again.

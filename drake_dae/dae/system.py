@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
@@ -83,7 +84,13 @@ class DaeSystem:
                 f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
             )
         self._put("state", ca.vec(self.state))
-        self._put("parameters", tuple(self.parameters))
+        given = self.parameters if isinstance(self.parameters, (list, tuple)) else [None]
+        if not all(isinstance(parameter, Parameter) for parameter in given):
+            raise ModelError(
+                f"{self.name}: parameters must be a list of Parameters, got "
+                f"{brief(self.parameters)}"
+            )
+        self._put("parameters", tuple(given))
         check_unique(self.name, "parameter", [p.name for p in self.parameters])
         if self.mass_matrix is None:
             self._put("mass_matrix", ca.SX.eye(self.state.numel()))
@@ -99,14 +106,14 @@ class DaeSystem:
             ("control_signals", self.num_controls, "u"),
             ("output_signals", self.num_controls, "z"),
         ):
-            given = getattr(self, key) or [f"{letter}{i}" for i in range(count)]
-            signals = as_signals(f"{self.name}: {key}", given)
+            labels = getattr(self, key) or [f"{letter}{i}" for i in range(count)]
+            signals = as_signals(f"{self.name}: {key}", labels)
             if len(signals) != count:
                 raise ModelError(f"{self.name}: {key} has {len(signals)} entries, expected {count}")
             check_unique(self.name, key, [signal.name for signal in signals])
             self._put(key, signals)
-        given = np.zeros(self.num_states) if self.nominal_state is None else self.nominal_state
-        nominal = vector(f"{self.name}: nominal_state", given, self.num_states)
+        start = np.zeros(self.num_states) if self.nominal_state is None else self.nominal_state
+        nominal = vector(f"{self.name}: nominal_state", start, self.num_states)
         nominal.setflags(write=False)
         self._put("nominal_state", nominal)
 
@@ -119,6 +126,7 @@ class DaeSystem:
         return f"DaeSystem('{self.name}', n={counts[0]}, m={counts[1]}, p={counts[2]})"
 
     @classmethod
+    @checked(ModelError)
     def from_functions(
         cls,
         state: Sequence[Signal | str] | int,
@@ -281,6 +289,7 @@ class DaeSystem:
         """
         return vector(f"{self.name}: a state", state, self.num_states)
 
+    @checked(ModelError)
     def parameter_slice(self, name: str) -> slice:
         """Where a parameter stands in `parameter_values`.
 
@@ -305,16 +314,3 @@ def usual_spread(state: FloatArray) -> FloatArray:
     size = np.abs(state)
     small = (size < 1e-3) & (size > 1e-12 * size.max())
     return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
-
-
-def check_is_system(value: Any, owner: str) -> None:
-    """Refuses what is no DaeSystem.
-
-    Raises:
-        ModelError: It is none; the message names the attribute that was meant, if there is one.
-    """
-    if isinstance(value, DaeSystem):
-        return
-    meant = [name for name in ("dae", "system") if isinstance(getattr(value, name, 0), DaeSystem)]
-    hint = f"; pass its .{meant[0]}" if meant else ""
-    raise ModelError(f"{owner} needs a DaeSystem, got {type(value).__name__}{hint}")

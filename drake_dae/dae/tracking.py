@@ -6,16 +6,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arguments import checked, result_of
+from drake_dae.arrays import FloatArray, brief, numbers
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.measured_force import MeasuredForce
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import GainError
+from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class TrackingLaw:
     """The law (28), which makes the controlled outputs follow a reference:
 
@@ -116,9 +118,13 @@ class TrackingLaw:
             GainError: The gains are for other outputs or degrees, or are no gains.
         """
         names = tuple(signal.name for signal in self.system.output_signals)
-        if not (isinstance(gains, FeedbackGains) or callable(gains)):
-            raise GainError(f"gains must be a design such as poles(-4.0), got {gains!r}")
-        found = gains if isinstance(gains, FeedbackGains) else gains(names, self.degrees)
+        found = gains
+        if not isinstance(found, FeedbackGains):
+            found = result_of("gains", found, names, self.degrees, error=GainError)
+        if not isinstance(found, FeedbackGains):
+            raise GainError(
+                f"gains must be a design such as poles(-4.0), got one of {brief(found)}"
+            )
         if (found.names, found.degrees) != (names, self.degrees):
             raise GainError(
                 f"the gains are for the outputs {', '.join(found.names)} with degrees "

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -25,6 +26,7 @@ from drake_dae.robots.statics import Balance, Placing
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class RobotModel:
     """A robot in contact, equations (37)-(40):
 
@@ -131,14 +133,9 @@ class RobotModel:
             InconsistentStateError: There is no such configuration near the guess.
             ModelError: A shape does not fit.
         """
-        q = numbers("the guess", guess)
-        wanted = numbers("outputs", [] if outputs is None else outputs)
+        q = vector(f"{self.name}: guess", guess, self.links.q.numel())
         count = 0 if outputs is None else len(self.position_signals)
-        if wanted.shape != (count,) or q.shape != (self.links.q.numel(),):
-            raise ModelError(
-                f"{self.name}: outputs and guess have shapes {wanted.shape} and {q.shape}, "
-                f"expected ({count},) and ({self.links.q.numel()},)"
-            )
+        wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
         found, left = self._placing.solve(wanted, q, values)
         size = float(np.max(np.abs(left), initial=0.0))
@@ -171,7 +168,8 @@ class RobotModel:
             ModelError: No drive holds the robot there.
         """
         values = self.dae.parameter_vector(parameters)
-        q, load = numbers("positions", positions), numbers("forces", forces)
+        q = vector(f"{self.name}: positions", positions, self.links.q.numel())
+        load = vector(f"{self.name}: forces", forces, self.dae.num_constraints)
         state, left = self._balance.rest(q, load, values)
         if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
@@ -183,7 +181,15 @@ class RobotModel:
 
     def _check_outputs(self, m: int, count: int) -> None:
         """Refuses outputs that, with the m constraint forces, are not as many as the actuators."""
-        nu = self.links.actuation_matrix.shape[1]
+        actuation = self.links.actuation_matrix
+        nu = actuation.shape[1]
+        rank = int(np.linalg.matrix_rank(actuation)) if nu else 0
+        if rank < nu:
+            actuators = ", ".join(signal.name for signal in self.links.actuator_signals)
+            raise ModelError(
+                f"{self.name}: the {nu} actuators {actuators} move the joints in {rank} "
+                "independent ways only, as where two drive one joint; leave one out"
+            )
         if m > nu:
             raise ModelError(
                 f"{self.name}: {m} constraint forces are outputs, but {nu} actuators can steer "
@@ -199,13 +205,7 @@ class RobotModel:
 
     def _nominal(self, given: ArrayLike | None) -> FloatArray:
         nominal = self.links.default_positions if given is None else given
-        nominal = numbers(f"{self.name}: nominal_positions", nominal)
-        if nominal.shape != (self.links.q.numel(),):
-            raise ModelError(
-                f"{self.name}: nominal_positions has shape {nominal.shape}, not "
-                f"({self.links.q.numel()},)"
-            )
-        return nominal
+        return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
 
     def _equations(
         self, bound: ConstraintSet, h_1: ca.SX, driven: ActuationChain, nominal: FloatArray

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from drake_dae.arguments import checked, result_of
 from drake_dae.arrays import check_axes, unknown_name
+from drake_dae.dae.expressions import as_expression
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Constraint
@@ -32,6 +34,7 @@ class PositionOutput(ABC):
         """Names and units of the components."""
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class PointCoordinates(PositionOutput):
     """The world coordinates of a point that is fixed in a frame, in m.
@@ -59,6 +62,7 @@ class PointCoordinates(PositionOutput):
         return tuple(Signal(f"{self.name or self.frame}.{axis}", "m") for axis in self.axes)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class AxisCoordinates(PositionOutput):
     """The world components of an axis of a frame: two of them steer where the axis points.
@@ -87,6 +91,7 @@ class AxisCoordinates(PositionOutput):
         return tuple(Signal(f"{self.frame}.{self.axis}_axis.{c}") for c in self.components)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class SurfaceCoordinates(PositionOutput):
     """The coordinates along a constraint; the constraint tells what they are.
@@ -111,6 +116,7 @@ class SurfaceCoordinates(PositionOutput):
         return self.contact.coordinate_signals
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class JointPositions(PositionOutput):
     """The generalized positions with given names.
@@ -133,6 +139,7 @@ class JointPositions(PositionOutput):
         return tuple(Signal(joint, units[joint]) for joint in self.joints)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class ExpressionOutput(PositionOutput):
     """Any smooth function of the robot's configuration.
@@ -147,7 +154,8 @@ class ExpressionOutput(PositionOutput):
     outputs: Sequence[Signal]
 
     def expression(self, links: Links) -> ca.SX:
-        value = ca.vec(ca.SX(self.function(links)))
+        given = result_of("function", self.function, links)
+        value = ca.vec(as_expression("an ExpressionOutput", "its function", given))
         if value.numel() != len(self.outputs):
             raise ModelError(
                 f"an output function returned {value.numel()} components, named were "

@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, Rgba, SceneGraph
 from pydrake.systems.framework import Context
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
@@ -36,6 +37,7 @@ class Loop(Protocol):
         """The geometry of a robot, or None."""
 
 
+@checked(ModelError)
 def make_animation(loop: Loop, record: Record, context: Context) -> str:
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
 

@@ -131,7 +131,8 @@ def _grid(titles: Sequence[str]) -> tuple[Figure, list[Axes]]:
 
 
 def _label(signal: Signal) -> str:
-    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
+    name = signal.name.replace("$", r"\$")  # Matplotlib would read mathematics.
+    return f"{name} [{signal.unit}]" if signal.unit else name
 
 
 def _legend(figure: Figure, axis: Axes) -> None:

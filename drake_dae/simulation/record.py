@@ -11,11 +11,13 @@ import numpy as np
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import VectorLogSink
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """A vector signal over time.
@@ -29,6 +31,7 @@ class Recorded:
     signals: tuple[Signal, ...]
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Record:
     """All signals of a run at the ends of the integrator's steps.
@@ -43,6 +46,23 @@ class Record:
 
     time: FloatArray
     signals: Mapping[str, Recorded]
+
+    def __post_init__(self) -> None:
+        lengths = {"time": np.shape(self.time)[:1]} | {
+            name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
+        }
+        if np.ndim(self.time) != 1 or len(set(lengths.values())) != 1:
+            found = ", ".join(f"{name} {size}" for name, size in lengths.items())
+            raise ModelError(f"a record has one sample of each signal at each time, got {found}")
+        if np.any(np.diff(self.time) <= 0.0):
+            raise ModelError("the times of a record must be strictly increasing")
+        for name, (values, signals) in (
+            (name, (recorded.values, recorded.signals)) for name, recorded in self.signals.items()
+        ):
+            if np.ndim(values) != 2 or np.shape(values)[1] != len(signals):
+                raise ModelError(
+                    f"'{name}' of a record has shape {np.shape(values)}, but {len(signals)} names"
+                )
 
     def __getitem__(self, name: str) -> FloatArray:
         """The values of a signal, shape (k, size).
@@ -74,7 +94,11 @@ class Record:
         count = min((len(t) for t in times), default=0)
         time = times[0][:count] if times else np.zeros(0)
         first = int(np.searchsorted(time, after, side="right"))
-        time = time[first:]
+        # Nor is what a run that failed left in its last step a number.
+        finite = [np.isfinite(log.data()[:, first:count]).all(axis=0) for log in logs.values()]
+        broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
+        count = first + int(np.argmax(broken)) if broken.any() else count
+        time = time[first:count]
         # The last sample of a moment is the one after the projection.
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
         return cls(
@@ -110,7 +134,15 @@ class Record:
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
                 return cls(file["time"], signals)
-        except (AttributeError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:
+        except (
+            AttributeError,
+            EOFError,
+            KeyError,
+            OSError,
+            TypeError,
+            ValueError,
+            BadZipFile,
+        ) as error:
             raise ModelError(f"{path} is not a record of a run: {error}") from None
 
 

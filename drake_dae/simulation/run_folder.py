@@ -41,8 +41,12 @@ def run_folder(folder: Path) -> Iterator[None]:
         ModelError: The folder cannot be used; why.
     """
     try:
+        if folder.exists() and not folder.is_dir():
+            raise ModelError(f"'{folder}' is a file; name a folder")
         lock = _prepare(folder)
-    except (OSError, UnicodeDecodeError) as error:
+    except ModelError:
+        raise
+    except (OSError, ValueError) as error:  # A null byte in the path, text of another encoding.
         reason, path = getattr(error, "strerror", None) or error, getattr(error, "filename", None)
         where = f" ({path})" if path and Path(path) != folder else ""
         raise ModelError(f"cannot write to '{folder}': {reason}{where}") from None

@@ -20,10 +20,11 @@ from pydrake.systems.analysis import (
     Simulator,
     SimulatorConfig,
 )
-from pydrake.systems.framework import Context, Diagram, EventStatus
+from pydrake.systems.framework import Context, EventStatus, System
 from pydrake.systems.primitives import Integrator
 from tqdm import tqdm
 
+from drake_dae.arguments import checked
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.interruption import Ending, ending_signals
 
@@ -59,8 +60,9 @@ class RunStatistics:
         return self.simulated_time / max(self.wall_time, 1e-9)
 
 
+@checked(ModelError)
 def simulate(
-    diagram: Diagram,
+    diagram: System,
     context: Context,
     duration: float,
     config: SimulatorConfig,
@@ -90,6 +92,7 @@ def simulate(
     """
     check_duration(duration)
     check_config(config)
+    _check_times(config.start_time, duration)
     _warn_of_many_steps(duration, config.max_step_size)
     simulator = Simulator(diagram, context)
     ApplySimulatorConfig(config, simulator)
@@ -155,6 +158,14 @@ def check_duration(duration: float) -> None:
     """
     if not (isfinite(duration) and duration > 0.0):
         raise ModelError(f"a duration must be positive, got {duration} s")
+
+
+def _check_times(start: float, duration: float) -> None:
+    """Refuses times that floating-point numbers cannot tell apart."""
+    if not np.isfinite(start) or np.spacing(abs(start)) > 1e-9 * duration:
+        raise ModelError(
+            f"start_time must be a time from which {duration:g} s can be counted, got {start:g} s"
+        )
 
 
 def check_config(config: SimulatorConfig) -> None:

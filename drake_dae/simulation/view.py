@@ -14,7 +14,9 @@ from pydrake.geometry import (
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import (
     ConstraintForceVisualizer,
@@ -34,6 +36,7 @@ _ON_REQUEST = 1e9
 _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 
+@checked(ModelError)
 def start_meshcat(host: str = "localhost") -> Meshcat:
     """A Meshcat server that only this machine reaches, unless told otherwise.
 

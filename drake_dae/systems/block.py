@@ -23,6 +23,7 @@ from pydrake.systems.framework import (
     SystemScalarConverter,
 )
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
@@ -97,6 +98,7 @@ class TracedFormula:
             raise simulation_error(error.failure, time, state, self._signals) from None
 
 
+@checked(ModelError)
 class DifferentiableSystem(LeafSystem, metaclass=Collectable):
     """A LeafSystem with vector ports that converts to AutoDiffXd, alone or in a diagram.
 
@@ -123,6 +125,20 @@ class DifferentiableSystem(LeafSystem, metaclass=Collectable):
     def _formulas(self) -> dict[str, Formula]:
         raise NotImplementedError
 
+    def check_context(self, context: Context) -> None:
+        """Refuses the context of another system.
+
+        Raises:
+            ModelError: It is none of this system.
+        """
+        try:
+            self.ValidateContext(context)
+        except RuntimeError:
+            raise ModelError(
+                f"the context is not that of '{self.get_name()}'; of a diagram's context take "
+                "system.GetMyMutableContextFromRoot(context)"
+            ) from None
+
     def ToAutoDiffXd(self) -> LeafSystem_[AutoDiffXd]:
         """The converted system. Drake's own method would wrap it and rename its ports.
 
@@ -132,6 +148,7 @@ class DifferentiableSystem(LeafSystem, metaclass=Collectable):
         return _AutoDiffSystem(self)
 
 
+@checked(ModelError)
 class ParameterizedSystem(DifferentiableSystem):
     """A LeafSystem whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
@@ -169,6 +186,7 @@ class ParameterizedSystem(DifferentiableSystem):
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
+        self.check_context(context)
         values = context.get_numeric_parameter(0).value()
         return np.array(values[: self.dae.parameter_values.size])
 
@@ -191,11 +209,12 @@ class ParameterizedSystem(DifferentiableSystem):
         Raises:
             ModelError: No parameter has that name, or the value does not fit.
         """
+        self.check_context(context)
         values = context.get_numeric_parameter(0).CopyToVector()
         place = self.dae.parameter_slice(name)
         given = numbers(f"parameter '{name}'", value)
         size = place.stop - place.start
-        if given.shape not in ((), (1,), (size,)):
+        if given.shape not in ((), (size,)):
             raise ModelError(f"parameter '{name}' has {size} entries, got {value!r}")
         values[place] = given
         for parameter in self.dae.parameters:

@@ -5,12 +5,13 @@ import warnings
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import NonMinimumPhaseWarning
+from drake_dae.errors import ModelError, NonMinimumPhaseWarning
 from drake_dae.systems.block import (
     Formula,
     ParameterizedSystem,
@@ -19,6 +20,7 @@ from drake_dae.systems.block import (
 from drake_dae.systems.lifetime import weakly
 
 
+@checked(ModelError)
 class TrackingController(ParameterizedSystem):
     """The law (28) of any `TrackingLaw`: u = B(x)^-1 (-a(x) + ubar(x, R)).
 

@@ -11,10 +11,11 @@ from pydrake.systems.framework import (
     State,
 )
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import InconsistentStateError, SimulationError
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.systems.block import (
     Formula,
     ParameterizedSystem,
@@ -24,6 +25,7 @@ from drake_dae.systems.lifetime import weakly
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class DaePlant(ParameterizedSystem):
     """The solution of a differential-algebraic system (1)-(3) on its manifold N*:
 
@@ -111,6 +113,7 @@ class DaePlant(ParameterizedSystem):
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
+        self.check_context(context)
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -119,6 +122,7 @@ class DaePlant(ParameterizedSystem):
         Raises:
             ModelError: The shape is wrong.
         """
+        self.check_context(context)
         context.SetContinuousState(self.dae.state_vector(state))
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:

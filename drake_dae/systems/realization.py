@@ -12,6 +12,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
@@ -20,6 +21,7 @@ from drake_dae.systems.lifetime import weakly
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class StateRealization(ParameterizedSystem):
     """The motion on N* in coordinates (zeta, xi) of the normal form, equations (26)-(27):
 
@@ -60,11 +62,6 @@ class StateRealization(ParameterizedSystem):
     """
 
     def __init__(self, normal_form: NormalForm) -> None:
-        if not isinstance(normal_form, NormalForm):
-            raise ModelError(
-                f"StateRealization needs a NormalForm, got {type(normal_form).__name__}; make it "
-                "with NormalForm(system)"
-            )
         structure, dae = normal_form.structure, normal_form.system
         signals = {"state": dae.state_signals, "control": dae.control_signals}
         super().__init__(dae, dae.parameter_values, signals)

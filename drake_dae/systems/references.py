@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
@@ -16,6 +17,7 @@ from drake_dae.systems.block import DifferentiableSystem, Formula
 from drake_dae.systems.lifetime import weakly
 
 
+@checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class TrajectoryReference(Reference):
     """A reference that is a Drake Trajectory, with the derivatives that it provides itself.
@@ -92,6 +94,7 @@ class TrajectoryReference(Reference):
                         )
 
 
+@checked(ReferenceSignalError)
 class ReferenceGenerator(DifferentiableSystem):
     """References of all outputs, stacked, with their derivatives.
 
@@ -115,12 +118,6 @@ class ReferenceGenerator(DifferentiableSystem):
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
         super().__init__()
         self.set_name("reference")
-        for index, reference in enumerate(references):
-            if not isinstance(reference, Reference):
-                raise ReferenceSignalError(
-                    f"references[{index}] must be a reference such as ConstantReference(0.3), got "
-                    f"{reference!r}"
-                )
         covered = sum(reference.size for reference in references)
         if covered != len(degrees):
             raise ReferenceSignalError(

@@ -2,7 +2,9 @@
 
 from pydrake.systems.framework import BasicVector, Context
 
+from drake_dae.arguments import checked
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
 from drake_dae.systems.lifetime import weakly
@@ -10,6 +12,7 @@ from drake_dae.systems.plant import DaePlant
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class RobotPlant(DaePlant):
     """A constrained robot (37)-(40) with the ports of `DaePlant` and:
 

@@ -5,13 +5,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
-from drake_dae.arrays import FloatArray
-from drake_dae.errors import ModelError
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, vector
+from drake_dae.errors import ModelError, NonFiniteError
 from drake_dae.systems.block import DifferentiableSystem, Formula, TracedFormula
 from drake_dae.systems.lifetime import weakly
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 class ForceSensor(DifferentiableSystem):
     """A force sensor with state, so that it can stand in a loop with a rigid robot:
 
@@ -90,7 +92,8 @@ class ForceSensor(DifferentiableSystem):
 
     def set_force(self, context: Context, force: ArrayLike) -> None:
         """Starts the sensor as if it had felt a constant force, shape (m,), without noise."""
-        value = np.asarray(force, dtype=float)
+        self.check_context(context)
+        value = vector("force", force, self._force_port.size())
         if self.time_constant:
             context.SetContinuousState(value)
         if self.sample_period:
@@ -110,7 +113,17 @@ class ForceSensor(DifferentiableSystem):
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         if self.time_constant:
             felt = context.get_continuous_state_vector().CopyToVector()
-            rate = (self._force_port.Eval(context) - felt) / self.time_constant
+            force = self._force_port.Eval(context)
+            with np.errstate(over="ignore"):
+                rate = (force - felt) / self.time_constant
+            if not np.isfinite(rate).all():
+                time = context.get_time()
+                raise NonFiniteError(
+                    f"{self.get_name()}: the rate of the measured force is not finite at "
+                    f"t = {time:.6g} s; its time_constant is {self.time_constant:g} s",
+                    time,
+                    felt,
+                )
             derivatives.get_mutable_vector().SetFromVector(rate)
 
     def _felt(self, context: Context) -> FloatArray:

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import DrakeDaeError, ModelError
 
 SINGULAR_PIVOT = 1e-12
@@ -191,18 +191,24 @@ class TracedFunction:
         """Calls the function and returns fresh arrays.
 
         Raises:
-            ModelError: The number of arguments is wrong, or one has a wrong size.
+            ModelError: The number of arguments is wrong, or one has a wrong shape or no numbers.
         """
         if len(arguments) != len(self._inputs):
             raise ModelError(
                 f"{self.name} takes {len(self._inputs)} arguments "
                 f"({', '.join(self.input_names)}), got {len(arguments)}"
             )
-        arrays = [np.asarray(argument, dtype=float).reshape(-1) for argument in arguments]
+        arrays = [
+            numbers(f"{self.name}: '{label}'", argument)
+            for label, argument in zip(self.input_names, arguments, strict=True)
+        ]
         for label, own, given in zip(self.input_names, self._inputs, arrays, strict=True):
             if own.size != given.size:
                 raise ModelError(f"{self.name}: '{label}' has size {given.size}, not {own.size}")
-        return tuple(output.copy() for output in self.evaluate(*arrays))
+            if given.ndim > 1 and given.shape != (own.size, 1):
+                raise ModelError(f"{self.name}: '{label}' has shape {given.shape}, not {own.shape}")
+        values = self.evaluate(*(array.reshape(-1) for array in arrays))
+        return tuple(output.copy() for output in values)
 
 
 def _identifier(name: str) -> str:

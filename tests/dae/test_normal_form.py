@@ -251,7 +251,7 @@ def test_a_given_completion():
     [
         (lambda x: x[:1], r"column of 2 expressions, n - sum r_i - sum mu_i; got shape \(1, 1\)"),
         (lambda x: x[:2].T, r"got shape \(1, 2\)"),
-        (lambda x: [x[0], x[1]], "got list"),
+        (lambda x: [x[0], x[1]], "completion must be a CasADi SX expression"),
         (lambda x: ca.vertcat(x[0], ca.SX.sym("w")), "depends on w, which is neither"),
         (lambda x: ca.vertcat(x[0], ca.sin(x[2])), r"'xi1' = sin\(heading\) is not independent"),
         (lambda x: ca.vertcat(x[2], x[1]), "completion 'heading' = heading is not independent"),
@@ -363,5 +363,5 @@ def test_what_is_out_of_reach_is_named():
 
 
 def test_something_else_than_a_system_is_refused():
-    with pytest.raises(ModelError, match="NormalForm needs a DaeSystem"):
+    with pytest.raises(ModelError, match="NormalForm: system must be a DaeSystem"):
         NormalForm(3.0)

@@ -8,7 +8,8 @@ import pytest
 from problems import double_integrator
 
 from drake_dae.dae.signals import Parameter, Signal, signals
-from drake_dae.dae.system import DaeSystem, check_is_system
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
 
@@ -195,7 +196,7 @@ def test_only_g_beside_k_is_refused():
 @pytest.mark.parametrize("state", [None, 2.0, "xv", [3], [], 0, -1])
 def test_states_that_are_none_are_refused(state):
     fields = {"f": lambda x: x, "h": lambda x: x, "l": lambda x: x}
-    with pytest.raises(ModelError, match=r"the states must be a list|at least one state"):
+    with pytest.raises(ModelError, match=r"state.* must be a |at least one state"):
         DaeSystem.from_functions(state, **fields)
 
 
@@ -222,12 +223,11 @@ def test_a_system_is_one_line_at_the_prompt():
 
 def test_what_has_a_system_is_no_system():
     system = double_integrator()
-    check_is_system(system, "a test")
-    with pytest.raises(ModelError, match=r"a test needs a DaeSystem, got NoneType$"):
-        check_is_system(None, "a test")
+    with pytest.raises(ModelError, match=r"find_structure: system must be a DaeSystem, got None$"):
+        find_structure(None)
     for name in ("dae", "system"):
-        with pytest.raises(ModelError, match=rf"got SimpleNamespace; pass its \.{name}$"):
-            check_is_system(SimpleNamespace(**{name: system}), "a test")
+        with pytest.raises(ModelError, match=rf"must be a DaeSystem, got .*; pass its \.{name}$"):
+            find_structure(SimpleNamespace(**{name: system}))
 
 
 def test_too_many_and_too_few_outputs_are_refused():
@@ -256,7 +256,7 @@ BAD_VALUES = {
         r"missing 1 required positional argument: 'p'. It is called with the state x alone",
     ),
     "a place that is not there": (lambda x: [x[5], 0], "out of bounds with supplied length of 2$"),
-    "no function": ([1, 2], r"f must be a function of the state, got list"),
+    "no function": ([1, 2], r"f must be a function, got"),
     "a condition": (lambda x: [x[1], 1 if x[0] > 0 else 2], "Conditions are not smooth"),
     "Python's max": (lambda x: [x[1], max(x[0], 0)], "Conditions are not smooth"),
     "a function of others": (
@@ -399,7 +399,7 @@ def test_bad_parameters_are_refused():
     for value in (np.nan, [1.0, np.inf], [[1.0]]):
         with pytest.raises(ModelError, match="'mass' must be finite and one-dimensional"):
             Parameter("mass", value)
-    with pytest.raises(ModelError, match="'mass' must be real numbers"):
+    with pytest.raises(ModelError, match="must be numbers, got 'heavy'"):
         Parameter("mass", "heavy")
     for symbol in (
         ca.SX.sym("m", 3),
@@ -407,7 +407,7 @@ def test_bad_parameters_are_refused():
         ca.SX.sym("m", 2) ** 2,
         ca.MX.sym("m", 2),
     ):
-        with pytest.raises(ModelError, match="symbol of parameter 'mass' must be a CasADi SX colu"):
+        with pytest.raises(ModelError, match=r"symbol .*must be a CasADi SX"):
             Parameter("mass", [1.0, 2.0], symbol=symbol)
     with pytest.raises(ModelError, match=r"must be Python identifiers.*link1\.mass"):
         double_integrator(parameters={"link1.mass": 1.0})

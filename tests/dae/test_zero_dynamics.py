@@ -634,13 +634,13 @@ def test_wrong_arguments_are_refused():
         dynamics.state(still[:2])
     with pytest.raises(ModelError, match=r"state must be finite and of shape \(4,\)"):
         dynamics.state(still, [0, 0, 0])
-    with pytest.raises(ModelError, match="state must be finite"):
+    with pytest.raises(ModelError, match="guess must be finite real numbers or None"):
         dynamics.state(still, [0, np.nan, 0, 0])
     with pytest.raises(ModelError, match=r"parameters must be finite and of shape \(0,\)"):
         dynamics.state(still, parameters=[1.0])
     with pytest.raises(ModelError, match=r"outputs must be finite and of shape \(2,\)"):
         dynamics.equilibrium([1, 2, 3])
-    with pytest.raises(ModelError, match="outputs must be real numbers"):
+    with pytest.raises(ModelError, match="outputs must be finite real numbers"):
         dynamics.equilibrium(["far", "away"])
 
 

@@ -214,5 +214,5 @@ def test_two_points_of_one_frame_need_names():
 
 
 def test_shapes_of_a_configuration_are_checked():
-    with pytest.raises(ModelError, match=r"shapes \(2,\) and \(2,\), expected \(1,\)"):
+    with pytest.raises(ModelError, match=r"outputs must be finite and of shape \(1,\)"):
         textbook().configuration([0.1, 0.2], [1.2, -1.6])

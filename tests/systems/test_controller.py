@@ -108,7 +108,7 @@ def test_gains_change_in_a_context():
             state, reference, parameters=system.parameters(context)
         ),
     )
-    with pytest.raises(GainError, match="poles of output"):
+    with pytest.raises(GainError, match="poles: values must be"):
         system.set_gains(context, poles("fast"))
 
 

@@ -81,7 +81,7 @@ def test_a_drawn_scenario_is_freed_with_its_model_and_its_geometry():
     made, context = build_scenario(scenario("two_link_wall"), meshcat)
     simulate(made.diagram, context, 0.02, arms.fixed_step())
     links = made.plant.model.links
-    forces = made.diagram.GetSubsystemByName("constraint_forces")
+    forces = made.diagram.GetSubsystemByName("constraint_force_visualizer")
     lasts = [ref(each) for each in (made.plant, forces, made.plant.model, links.plant)]
     del made, context, links, forces
     gc.collect()

@@ -203,5 +203,5 @@ def test_parameters_that_make_no_sense_are_refused():
 
 
 def test_what_is_no_system_is_refused():
-    with pytest.raises(ModelError, match="DaePlant needs a DaeSystem, got NoneType"):
+    with pytest.raises(ModelError, match="DaePlant: system must be a DaeSystem, got None"):
         DaePlant(None)

@@ -371,7 +371,7 @@ def test_wrong_inputs():
     with pytest.raises(InconsistentStateError, match=r"not on the constraint.*project") as info:
         minimal.set_state(context, [0.5, -0.6, 0.0, 0.0])
     np.testing.assert_allclose(info.value.residual, [(0.61 - 0.64) / 2, 0.0], atol=1e-15)
-    with pytest.raises(ModelError, match="a state must be finite"):
+    with pytest.raises(ModelError, match="state must be finite real numbers"):
         minimal.set_state(context, [np.nan, -0.6, 0.0, 0.0])
     with pytest.raises(ModelError, match="a state must be finite and of shape"):
         minimal.set_state(context, [0.5, 0.0])
@@ -388,5 +388,5 @@ def test_a_system_is_as_good_as_its_normal_form():
         plant.GetInputPort("control").FixValue(context, [0.7])
         contexts.append(plant.EvalTimeDerivatives(context).CopyToVector())
     np.testing.assert_array_equal(*contexts)
-    with pytest.raises(ModelError, match="StateRealization needs a NormalForm, got NoneType"):
+    with pytest.raises(ModelError, match="normal_form must be a NormalForm, got None"):
         StateRealization(None)

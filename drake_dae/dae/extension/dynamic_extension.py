@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls
 from drake_dae.dae.manifold import Manifold
@@ -26,13 +27,14 @@ from drake_dae.dae.states.margins import SINGULAR
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import eliminated_at
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
-from drake_dae.dae.system import DaeSystem, check_is_system
-from drake_dae.errors import AssumptionError
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.lie import lie_derivative
 from drake_dae.trace.round_off import multiply, positive
 
 
+@checked(ModelError)
 def dynamic_extension(
     system: DaeSystem,
     *,
@@ -65,7 +67,6 @@ def dynamic_extension(
             isolated states only, or more than max_integrators are needed.
         ModelError, InconsistentStateError: There is no structure to find; see `find_structure`.
     """
-    check_is_system(system, "dynamic_extension")
     limit = system.num_states if max_integrators is None else max_integrators
     check_whole_number(f"{system.name}: max_integrators", limit, 0)
     chain = _Chain(system, nominal_controls(system, nominal_control), spread)

@@ -8,14 +8,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system import DaeSystem, check_is_system
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Extension:
     """A system with integrators before its controls, whose B(x) is regular.
@@ -69,6 +71,7 @@ class Extension:
         )
 
 
+@checked(ModelError)
 def extend(
     system: DaeSystem,
     integrators: Mapping[str, int] | Sequence[str],
@@ -94,12 +97,6 @@ def extend(
     Raises:
         ModelError: A control is unknown, or a number of integrators is below 1.
     """
-    check_is_system(system, "extend")
-    if isinstance(integrators, str) or not isinstance(integrators, Mapping | Sequence):
-        raise ModelError(
-            f"{system.name}: integrators are a list of names, or name -> how many, got "
-            f"{integrators!r}"
-        )
     if not isinstance(integrators, Mapping):
         integrators = dict.fromkeys(integrators, 1)
     bad = {name: count for name, count in integrators.items() if not _is_count(count)}

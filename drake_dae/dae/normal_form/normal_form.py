@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dgetrf, dgetrs
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.normal_form.completion import check_completion, choose_completion
 from drake_dae.dae.states.samples import Samples
@@ -16,6 +17,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import ROUND_OFF, Linearization, newton
 
 
+@checked(ModelError)
 class NormalForm:
     """The change of coordinates Phi (20)-(22),
 

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.arrays import FloatArray, brief, numbers, show
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system import DaeSystem
@@ -152,6 +152,8 @@ def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
             f"{system.name}: spread must be a number or have shape ({system.num_states},), got "
             f"{spread!r}"
         )
+    if np.any(given < 0.0):
+        raise ModelError(f"{system.name}: spread must not be negative, got {brief(spread)}")
     return np.full(system.num_states, given)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, check_whole_number
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
@@ -21,12 +22,13 @@ from drake_dae.dae.structure.constrained import (
     examine_constraints,
 )
 from drake_dae.dae.structure.relative_degrees import output_chains
-from drake_dae.dae.system import DaeSystem, check_is_system
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import TracedFunction
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Structure:
     """The structure that the paper assumes, found for one system.
@@ -138,6 +140,7 @@ class Structure:
         return self.system.trace(name, {"value": value}, inputs, pivot, "A(x) of Assumption (2)")
 
 
+@checked(ModelError)
 def find_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> Structure:
@@ -177,7 +180,6 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
         AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
         ModelError: This is no system, or the structure is that of another one.
     """
-    check_is_system(system, owner)
     if structure is None:
         return find_structure(system)
     if not isinstance(structure, Structure):
@@ -206,7 +208,6 @@ def examine_structure(
             output has no degree.
         InconsistentStateError, ModelError: There is no structure to find; see `find_structure`.
     """
-    check_is_system(system, "find_structure")
     check_system(system)
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import scipy.integrate
 
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arguments import result_of
+from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause, Ending, PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point, Regularity
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
@@ -195,7 +196,8 @@ class _Pursuit:
         """R at a time, shape (sum (mu_i + 1),); the motion ends where it is not finite."""
         layout = self._pinned.layout
         try:
-            goal = np.asarray(self._reference(time), dtype=float).reshape(-1)
+            given = result_of("reference", self._reference, time)
+            goal = numbers(f"reference({time:g})", given).reshape(-1)
         except NonFiniteError as error:
             ending = Ending(Cause.REFERENCE_NOT_FINITE, time, str(error))
             raise _MotionEnd(ending) from error

@@ -8,6 +8,7 @@ on the choice of xi in (22).
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
@@ -25,6 +26,7 @@ from drake_dae.dae.zero_dynamics.stability import (
 from drake_dae.errors import InconsistentStateError, ModelError
 
 
+@checked(ModelError)
 class ZeroDynamics:
     """The dynamics (35) that are left when the outputs are pinned to a reference.
 

@@ -59,11 +59,6 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         ModelError: A stage stands behind one that nothing can drive, or two stages carry the
             rotors; or the actuators do not drive derivatives of positions, each its own.
     """
-    for stage in stages if isinstance(stages, Sequence) else [None]:
-        if not isinstance(stage, Stage):
-            raise ModelError(
-                f"actuation is a list of stages such as [FlexibleJoints(8000.0)], got {stages!r}"
-            )
     if not stages:
         return _rigid_joints(links)
     position, velocity = _actuated(links)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import casadi as ca
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.numbers import diagonal_parameter
@@ -12,6 +13,7 @@ from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class DcMotors(Stage):
     """Armature-controlled direct-current motors (74)-(75), driven by voltages u:

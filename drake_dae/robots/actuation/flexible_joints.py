@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import numbers
+from drake_dae.arguments import checked
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.numbers import full_matrix, matrix_parameter
@@ -14,6 +14,7 @@ from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class FlexibleJoints(Stage):
     """Elastic transmissions (64)-(65), with joint damping D beside the paper's stiffness K_2:
@@ -28,7 +29,9 @@ class FlexibleJoints(Stage):
     velocities of links and shafts. Their port is `motor_state`, (q_2, q_2'), shape (2p,).
 
     Attributes:
-        stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite.
+        stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite. None is
+            infinite: of rigid joints beside flexible ones B(x) of Assumption (5) is singular, as
+            the control reaches the outputs at different orders. Give a high stiffness instead.
         inertia: M_2 in kg m^2 (kg), likewise; what the URDF declares if None.
         damping: D in N m s/rad (N s/m), likewise positive definite; 0 for none.
     """
@@ -40,12 +43,6 @@ class FlexibleJoints(Stage):
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
         p = len(names)
-        if np.any(np.isinf(numbers("flexible_joints.stiffness", self.stiffness))):
-            raise ModelError(
-                "FlexibleJoints: a stiffness is infinite. Rigid joints beside flexible ones are "
-                "not supported: the control would reach the outputs at different orders, and B(x) "
-                "of Assumption (5) would be singular. Give a high stiffness instead"
-            )
         inertia = self.inertia
         if inertia is None:
             inertia = links.reflected_inertia

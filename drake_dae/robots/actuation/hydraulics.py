@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.numbers import (
@@ -17,6 +18,7 @@ from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class ElectrohydraulicServos(Stage):
     """Electrohydraulic servos (the last model of section 3.3), driven by normalized currents u:

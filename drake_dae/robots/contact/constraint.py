@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
@@ -29,6 +30,7 @@ class Application:
     moment_axes: ca.SX
 
 
+@checked(ModelError)
 class Constraint(ABC):
     """m equations that a robot keeps, and the m constraint forces lambda that make it keep them.
 

@@ -6,14 +6,17 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_axes
 from drake_dae.dae.signals import Parameter, Signal, signals
+from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint
 from drake_dae.robots.contact.picture import Picture
 from drake_dae.robots.contact.surface import Surface, Vector
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class PointOnSurface(Constraint):
     """A point of a frame stays on a surface: phi(q) = signed distance of p_W(q).
@@ -72,6 +75,7 @@ class PointOnSurface(Constraint):
         return None if picture is None else picture.moved(values)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class CoincidentPoints(Constraint):
     """A point of frame B stays on a point of frame A: phi(q) = p_WB(q) - p_WA(q).

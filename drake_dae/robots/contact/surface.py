@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
@@ -22,6 +23,7 @@ CELLS = 24
 """How many cells a mesh has along each side."""
 
 
+@checked(ModelError)
 class Surface(ABC):
     """A smooth surface that stands in the world.
 

@@ -10,13 +10,16 @@ from numpy.typing import ArrayLike
 from pydrake import geometry
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_dae.arrays import numbers
+from drake_dae.arguments import checked, result_of
+from drake_dae.arrays import positive, vector
+from drake_dae.dae.expressions import as_expression
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture, mesh_of_grid
 from drake_dae.robots.contact.surface import Surface, Vector, axes_along, tangents
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Plane(Surface):
     """A plane: phi = n . (p - point). Its coordinates are along `tangents(n)`, in m.
@@ -52,6 +55,7 @@ class Plane(Surface):
         return Picture(geometry.Box(size, size, thickness), pose)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Sphere(Surface):
     """A sphere: phi = |p - center| - radius; its negative if `inside`.
@@ -74,7 +78,7 @@ class Sphere(Surface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("center", self.center))
         object.__setattr__(self, "axis", _unit("axis", self.axis))
-        _positive("radius", self.radius)
+        positive("radius", self.radius)
 
     @property
     def position(self) -> Vector:
@@ -91,6 +95,7 @@ class Sphere(Surface):
         return Picture(geometry.Sphere(self.radius), RigidTransform())
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Cylinder(Surface):
     """A cylinder without ends: phi = distance from the axis - radius; its negative if `inside`.
@@ -113,7 +118,7 @@ class Cylinder(Surface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", _vector("point", self.point))
         object.__setattr__(self, "axis", _unit("axis", self.axis))
-        _positive("radius", self.radius)
+        positive("radius", self.radius)
 
     @property
     def position(self) -> Vector:
@@ -133,6 +138,7 @@ class Cylinder(Surface):
         return Picture(geometry.Cylinder(self.radius, size), pose)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Ellipsoid(Surface):
     """An ellipsoid: phi = F / |grad F| with F = (x/a)^2 + (y/b)^2 + (z/c)^2 - 1.
@@ -155,7 +161,7 @@ class Ellipsoid(Surface):
         object.__setattr__(self, "center", _vector("center", self.center))
         object.__setattr__(self, "semi_axes", _vector("semi_axes", self.semi_axes))
         for length in self.semi_axes:
-            _positive("semi_axes", length)
+            positive("semi_axes", length)
 
     @property
     def position(self) -> Vector:
@@ -174,6 +180,7 @@ class Ellipsoid(Surface):
         return Picture(geometry.Ellipsoid(*self.semi_axes), RigidTransform())
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class Torus(Surface):
     """A torus: phi = distance from the ring - minor radius; its negative if `inside`.
@@ -198,7 +205,8 @@ class Torus(Surface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("center", self.center))
         object.__setattr__(self, "axis", _unit("axis", self.axis))
-        _positive("minor_radius", self.minor_radius)
+        positive("minor_radius", self.minor_radius)
+        positive("major_radius", self.major_radius)
         if not self.major_radius > self.minor_radius:
             raise ModelError(
                 f"major_radius {self.major_radius} must exceed minor_radius {self.minor_radius}"
@@ -226,6 +234,7 @@ class Torus(Surface):
         return Picture(mesh_of_grid(points), pose)
 
 
+@checked(ModelError)
 @dataclass(frozen=True)
 class ImplicitSurface(Surface):
     """Any smooth surface F(p) = 0: phi = F / |grad F|, the distance to first order.
@@ -255,7 +264,7 @@ class ImplicitSurface(Surface):
 def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
     """F / |grad F| at a point."""
     p = ca.SX.sym("p", 3)
-    value = ca.SX(function(p))
+    value = as_expression("an ImplicitSurface", "its function", result_of("function", function, p))
     if value.shape != (1, 1):
         raise ModelError(f"a surface function returns one number, this one has {value.shape}")
     quotient = value / ca.norm_2(ca.gradient(value, p))
@@ -276,9 +285,7 @@ def _side(distance: ca.SX, inside: bool) -> ca.SX:
 
 
 def _vector(name: str, value: ArrayLike) -> Vector:
-    array = numbers(name, value)
-    if array.shape != (3,) or not np.all(np.isfinite(array)):
-        raise ModelError(f"{name} must be three finite numbers, got {value!r}")
+    array = vector(name, value, 3)
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
@@ -289,8 +296,3 @@ def _unit(name: str, value: ArrayLike) -> Vector:
         raise ModelError(f"{name} must not be zero")
     # A unit vector stays as it is, so that what was saved reads back equal.
     return _vector(name, array if abs(length - 1.0) < 1e-15 else array / length)
-
-
-def _positive(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0.0):
-        raise ModelError(f"{name} must be positive, got {value}")

@@ -5,12 +5,15 @@ from dataclasses import dataclass, field
 import casadi as ca
 from pydrake.math import RigidTransform
 
+from drake_dae.arguments import checked
 from drake_dae.dae.signals import Parameter, Signal, signals
+from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint
 from drake_dae.robots.links.joints import constant_pose
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class WeldedFrames(Constraint):
     """Frame B keeps a pose (R, p) in frame A, as with Drake's WeldFrames and AddWeldConstraint:

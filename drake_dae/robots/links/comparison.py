@@ -45,6 +45,11 @@ def compare_with_plant(
         ours = dict(zip(terms, function(*state, values), strict=True))
         theirs = _plant_terms(plant, *state)
         size = np.abs(theirs["mass matrix"]).max()
+        if not size > 0.0:
+            raise ModelError(
+                "no link that moves has mass or inertia; give each of them an <inertial>, or weld "
+                "it to one that has"
+            )
         for name, other in theirs.items():
             if not np.all(np.isfinite(other)):
                 raise ModelError(

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
@@ -32,6 +33,7 @@ from drake_dae.robots.links.tree import Inertia
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
 
 
+@checked(ModelError)
 class MultibodyExpressions:
     """The links of a finalized MultibodyPlant; see `Links`:
 
@@ -205,6 +207,11 @@ class MultibodyExpressions:
         self.actuation_matrix = np.array(plant.MakeActuationMatrix())
         self.effort_limits = np.array([a.effort_limit() for a in actuators])
         self.gear_ratios = np.array([a.default_gear_ratio() for a in actuators])
+        for actuator, ratio in zip(actuators, self.gear_ratios, strict=True):
+            if not (np.isfinite(ratio) and ratio != 0.0):
+                raise ModelError(
+                    f"the gear ratio of '{actuator.name()}' is {ratio:g}; it must be another number"
+                )
         self.reflected_inertia = np.array([a.default_reflected_inertia() for a in actuators])
         # As in Drake, where a joint has several actuators the last one counts.
         self._rotors = np.zeros(plant.num_velocities())
@@ -262,7 +269,7 @@ class MultibodyExpressions:
 
 def _check_support(plant: MultibodyPlant) -> None:
     """Refuses a plant that has no equations here."""
-    if not isinstance(plant, MultibodyPlant) or not plant.is_finalized():
+    if not plant.is_finalized():
         raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
     if plant.num_constraints() > 0:
         raise ModelError(

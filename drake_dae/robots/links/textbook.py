@@ -8,12 +8,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.signals import Parameter, Signal, signals
+from drake_dae.dae.expressions import as_expression
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
 
 
+@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class LinkExpressions:
     """Links given by their own M(q) and H(q, v), as in a textbook; see `Links`.
@@ -59,6 +62,13 @@ class LinkExpressions:
     plant: ClassVar[None] = None
 
     def __post_init__(self) -> None:
+        for name in ("q", "v"):
+            if not is_symbol(getattr(self, name)):
+                raise ModelError(f"{name} must be a CasADi SX column of symbols")
+        matrices = ("mass_matrix", "bias", "velocity_map")
+        for name in (name for name in matrices if getattr(self, name) is not None):
+            value = as_expression("LinkExpressions", name, getattr(self, name))
+            object.__setattr__(self, name, value)
         nq, nv = self.q.numel(), self.v.numel()
         actuation = np.eye(nv) if self.actuation_matrix is None else self.actuation_matrix
         actuation = numbers("actuation_matrix", actuation)

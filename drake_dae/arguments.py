@@ -1,0 +1,316 @@
+"""Arguments of public names, checked by their annotations: the same words everywhere."""
+
+import inspect
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import wraps
+from math import isfinite
+from numbers import Complex, Integral, Real
+from types import NoneType, UnionType
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import brief, numbers
+from drake_dae.errors import DrakeDaeError, ModelError
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def result_of(
+    what: str,
+    function: Callable[..., Any],
+    *arguments: Any,
+    error: Callable[[str], Exception] = ModelError,
+) -> Any:
+    """What a function that was given returns; if it fails, that is an error of the argument.
+
+    Args:
+        what: How a message calls the function.
+        function: The function, with its arguments.
+        error: Makes what is raised of a text. Errors of the library pass.
+    """
+    try:
+        return function(*arguments)
+    except DrakeDaeError:
+        raise
+    except Exception as failure:
+        text = f"{what} failed: {type(failure).__name__}: {brief(str(failure))}"
+        raise error(text) from failure
+
+
+class _Rule(NamedTuple):
+    """What an annotation asks of a value.
+
+    Attributes:
+        words: As in "must be ...".
+        holds: Whether a value is such, looking at it alone.
+        inside: (place, value, rule) of the values that it holds, for what has parts.
+    """
+
+    words: str
+    holds: Callable[[Any], bool]
+    inside: Callable[[str, Any], Iterator[tuple[str, Any, "_Rule"]]] | None = None
+
+
+def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
+    """A function that refuses arguments which are not what their annotations say.
+
+    Of a class: its constructor and its public methods. A number must be finite and no bool, arrays
+    must be of such numbers, text is no list of letters, and what a list or a mapping holds
+    is looked at too; shapes and ranges are left to the function. Where an argument's default is
+    None, None is fine.
+
+    Args:
+        error: Makes what is raised of a text "<function>: <argument> must be <what>, got <value>".
+    """
+
+    def decorate(target: F) -> F:
+        if not inspect.isclass(target):
+            return _checked(target, error, target.__qualname__)
+        for name, member in list(vars(target).items()):
+            if name == "__init__":
+                setattr(target, name, _checked(member, error, target.__name__))
+            elif name[0].islower() and isinstance(member, (classmethod, staticmethod)):
+                inner = _checked(member.__func__, error, f"{target.__name__}.{name}")
+                setattr(target, name, type(member)(inner))
+            elif name[0].islower() and inspect.isfunction(member):
+                setattr(target, name, _checked(member, error, f"{target.__name__}.{name}"))
+        return target
+
+    return decorate
+
+
+def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
+    rules: list[tuple[str, _Rule, Any]] = []
+    named: dict[str, tuple[str, _Rule, Any]] = {}
+    rest: list[tuple[str, _Rule, Any]] = []
+
+    def read() -> None:
+        """Reads the annotations: when they are needed, since they may name what comes later."""
+        hints = get_type_hints(function)
+        for name, parameter in inspect.signature(function).parameters.items():
+            entry = (name, _rule(hints.get(name, Any)), parameter.default)
+            if parameter.kind is parameter.VAR_POSITIONAL:
+                rest.append(entry)
+            elif parameter.kind is not parameter.VAR_KEYWORD:
+                named[name] = entry
+                if parameter.kind is not parameter.KEYWORD_ONLY:
+                    rules.append(entry)
+
+    def check(entry: tuple[str, _Rule, Any], value: Any) -> None:
+        name, rule, default = entry
+        if value is not default:
+            wrong = _wrong(name, value, rule)
+            if wrong:
+                raise error(f"{owner}: {wrong}")
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        if not named:
+            read()
+        for entry, value in zip(rules, arguments, strict=False):
+            check(entry, value)
+        for entry in rest:
+            for value in arguments[len(rules) :]:
+                check(entry, value)
+        for name, value in options.items():
+            if name in named:
+                check(named[name], value)
+        return function(*arguments, **options)
+
+    return call  # type: ignore[return-value]
+
+
+def _wrong(what: str, value: Any, rule: _Rule) -> str:
+    """What is wrong about a value; empty if nothing is."""
+    if not rule.holds(value):
+        return f"{what} must be {rule.words}, got {brief(value)}{_hint(value, rule)}"
+    for place, part, inner in rule.inside(what, value) if rule.inside else ():
+        wrong = _wrong(place, part, inner)
+        if wrong:
+            return wrong
+    return ""
+
+
+def _hint(value: Any, rule: _Rule) -> str:
+    """Where a value holds what is meant."""
+    holders = ("dae", "system", "model", "diagram", "links")
+    parts = vars(value) if hasattr(value, "__dict__") and not inspect.isclass(value) else {}
+    meant = [name for name in holders if name in parts and rule.holds(parts[name])]
+    return f"; pass its .{meant[0]}" if meant else ""
+
+
+_ARRAY = set(get_args(ArrayLike))
+
+
+def _rule(hint: Any) -> _Rule:
+    """What an annotation asks."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _rule(arguments[0])
+    if origin in (Union, UnionType):
+        return _any_of(set(arguments), arguments)
+    if hint in _PLAIN:
+        return _PLAIN[hint]
+    if origin is np.ndarray:
+        return _NUMBERS
+    if origin is tuple and arguments[1:] != (...,):
+        return _tuple(arguments)
+    if inspect.isclass(origin) and issubclass(origin, Mapping):
+        return _mapping(_rule(arguments[0]), _rule(arguments[1]))
+    if inspect.isclass(origin) and issubclass(origin, Collection):
+        return _list(_rule(arguments[0]))
+    if origin is not None and hint is not Any and origin in (Callable, _CALLABLE):
+        return _Rule("a function", callable)
+    if getattr(hint, "_is_protocol", False):
+        return _protocol(hint)
+    if inspect.isclass(hint) and hint is not Any:
+        return _Rule(_article(hint.__name__), lambda value: isinstance(value, hint))
+    return _Rule("anything", lambda value: True)
+
+
+_CALLABLE = get_origin(Callable[[], None])
+
+
+def _any_of(members: set[Any], order: Sequence[Any]) -> _Rule:
+    """One of several."""
+    rules = []
+    if members >= _ARRAY:
+        rules.append(_ARRAYS)
+        members = members - _ARRAY
+    rules += [_rule(member) for member in order if member in members]
+    words = " or ".join(dict.fromkeys(rule.words for rule in rules))
+
+    def fitting(value: Any) -> list[_Rule]:
+        return [rule for rule in rules if rule.holds(value)]
+
+    def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
+        fits = fitting(value)
+        if all(_wrong(what, value, rule) for rule in fits):
+            yield what, value, fits[0]
+
+    return _Rule(words, lambda value: bool(fitting(value)), inside)
+
+
+def _list(entry: _Rule) -> _Rule:
+    def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
+        return ((f"{what}[{index}]", part, entry) for index, part in enumerate(value))
+
+    # Also sets and the views of dictionaries; no generators, which could be read only once.
+    return _Rule(
+        "a list",
+        lambda value: (
+            isinstance(value, (Collection, np.ndarray))
+            and not isinstance(value, (str, bytes, Mapping))
+            and np.ndim(value if isinstance(value, np.ndarray) else [0]) > 0
+        ),
+        inside,
+    )
+
+
+def _tuple(entries: tuple[Any, ...]) -> _Rule:
+    if set(entries) == {float}:
+        count = {2: "two", 3: "three"}.get(len(entries), len(entries))
+        words = f"{count} finite numbers"
+        return _Rule(words, lambda value: _is_array(value) and np.shape(value) == (len(entries),))
+    rules = [_rule(entry) for entry in entries]
+    words = f"({', '.join(rule.words for rule in rules)})"
+
+    def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
+        parts = enumerate(zip(value, rules, strict=True))
+        return ((f"{what}[{index}]", part, rule) for index, (part, rule) in parts)
+
+    return _Rule(
+        words, lambda value: isinstance(value, (list, tuple)) and len(value) == len(rules), inside
+    )
+
+
+def _mapping(key: _Rule, entry: _Rule) -> _Rule:
+    def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
+        for name, part in value.items():
+            yield f"a key of {what}", name, key
+            yield f"{what}[{brief(name)}]", part, entry
+
+    return _Rule("a dictionary", lambda value: isinstance(value, Mapping), inside)
+
+
+def _protocol(protocol: Any) -> _Rule:
+    """Everything that has the members of a protocol."""
+    bases = [base for base in protocol.__mro__ if getattr(base, "_is_protocol", False)]
+    members = {
+        name
+        for base in bases
+        for name in (*vars(base), *vars(base).get("__annotations__", {}))
+        if not name.startswith("_")
+    }
+
+    def holds(value: Any) -> bool:
+        if inspect.isclass(value):
+            return False
+        return all(
+            inspect.getattr_static(value, name, None) is not None or hasattr(value, name)
+            for name in members
+        )
+
+    return _Rule(_article(protocol.__name__), holds)
+
+
+def _article(name: str) -> str:
+    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+
+
+def _is_bool(value: Any) -> bool:
+    return isinstance(value, (bool, np.bool_))
+
+
+def _is_array(value: Any, finite: bool = True) -> bool:
+    try:
+        array = numbers("", value, ValueError)
+    except ValueError:
+        return False
+    return not finite or bool(np.isfinite(array).all())
+
+
+def _is_real(value: Any) -> bool:
+    if not isinstance(value, Real) or _is_bool(value):
+        return False
+    try:
+        return isfinite(value)
+    except OverflowError:  # An int above 1e308.
+        return False
+
+
+def _is_whole(value: Any) -> bool:
+    # Those that a float holds exactly: nobody means more, and loops over them would not end.
+    return isinstance(value, Integral) and not _is_bool(value) and abs(int(value)) <= 2**53
+
+
+def _is_expression(value: Any) -> bool:
+    return isinstance(value, (ca.SX, ca.DM)) or _is_array(value, finite=False)
+
+
+_NUMBERS = _Rule(
+    "numbers",
+    lambda value: (
+        value.dtype.kind in "biufc" if type(value) is np.ndarray else _is_array(value, finite=False)
+    ),
+)
+_ARRAYS = _Rule("finite real numbers", _is_array)
+_PLAIN = {
+    float: _Rule("a finite number", _is_real),
+    int: _Rule("a whole number", _is_whole),
+    bool: _Rule("True or False", _is_bool),
+    complex: _Rule(
+        "a finite number",
+        lambda value: (
+            _is_real(value)
+            if isinstance(value, Real)
+            else isinstance(value, Complex) and isfinite(abs(complex(value)))
+        ),
+    ),
+    str: _Rule("text", lambda value: isinstance(value, str)),
+    NoneType: _Rule("None", lambda value: value is None),
+    ca.SX: _Rule("a CasADi SX expression", _is_expression),
+}

@@ -1,0 +1,471 @@
+"""Every public name, called with what makes no sense: only errors of errors.py come out.
+
+The calls are found by signatures. A public name that is new is called as well: with the values that
+SAMPLES has for the types of its arguments, or PLACES for their names; where there is none, the
+tests of that name fail and say so.
+"""
+
+import contextlib
+import datetime
+import inspect
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm, fixed_step, law
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame
+from pydrake.symbolic import Variable
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context, Diagram, System
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
+
+import drake_dae as dd
+from drake_dae.analysis.findings import Assumption
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.elimination import Elimination
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.states.margins import Margin
+from drake_dae.diagrams.scenario import Scenario, find_scenario
+from drake_dae.errors import DrakeDaeError
+from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.contact.surface import Surface
+from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.tree_kinematics import TreeKinematics
+from drake_dae.robots.outputs import PositionOutput
+from drake_dae.simulation.animation import Viewed
+from drake_dae.simulation.record import Recorded
+
+FOLDER = Path(__file__).parent / "made"
+
+
+@cache
+def loop() -> dd.ClosedLoop:
+    tracking = law("two_link")
+    references = [dd.ConstantReference(0.3), dd.ConstantReference(10.0)]
+    plant = dd.RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
+    return dd.make_closed_loop(plant, tracking, references)
+
+
+@cache
+def record() -> dd.Record:
+    context = loop().diagram.CreateDefaultContext()
+    dd.simulate(loop().diagram, context, 0.01, fixed_step())
+    return loop().record(context)
+
+
+def context_of(owner: Any) -> Context:
+    return (owner if isinstance(owner, System) else loop().diagram).CreateDefaultContext()
+
+
+def state() -> np.ndarray:
+    return arm("two_link").structure.states[0]
+
+
+def normal_form() -> dd.NormalForm:
+    return _normal_form()
+
+
+@cache
+def _normal_form() -> dd.NormalForm:
+    return dd.NormalForm(arm("two_link").model.dae, structure=arm("two_link").structure)
+
+
+@cache
+def analysis() -> dd.Analysis:
+    return dd.analyze(arm("two_link").model.dae, count=3)
+
+
+@cache
+def textbook() -> dd.LinkExpressions:
+    q, v = ca.SX.sym("q"), ca.SX.sym("v")
+    return dd.LinkExpressions(q, v, ca.SX(2.0), ca.SX(0.0), {"tool": ca.vertcat(q, 0, 0)})
+
+
+@cache
+def scenario() -> Scenario:
+    return dd.load_scenario(find_scenario("two_link_wall"))
+
+
+# A value of each type that is fine where nothing else is said.
+SAMPLES: dict[Any, Callable[[], Any]] = {
+    Any: lambda: 1.0,
+    ArrayLike: lambda: 1.0,
+    bool: lambda: False,
+    complex: lambda: -1.0,
+    float: lambda: 0.5,
+    int: lambda: 1,
+    str: lambda: "tool",
+    Path: lambda: find_scenario("two_link_wall"),
+    ca.SX: lambda: ca.SX.sym("p", 3),
+    Assumption: lambda: SAMPLES[dd.Analysis]().assumptions[0],
+    Diagram: lambda: loop().diagram,
+    dd.Analysis: analysis,
+    dd.ClosedLoop: loop,
+    dd.DaePlant: lambda: loop().plant,
+    dd.DaeSystem: lambda: arm("two_link").model.dae,
+    dd.Extension: lambda: dd.Extension(
+        arm("two_link").model.dae,
+        arm("two_link").model.dae,
+        arm("two_link").structure,
+        {},
+        ca.SX(2, 1),
+        ca.SX.eye(2),
+    ),
+    dd.FeedbackGains: lambda: law("two_link").gains,
+    dd.ForceSensor: lambda: dd.ForceSensor(1, 0.1),
+    dd.LinkExpressions: textbook,
+    dd.NormalForm: normal_form,
+    Manifold: lambda: arm("two_link").structure.manifold,
+    Derivatives: lambda: arm("two_link").structure.derivatives,
+    Elimination: lambda: arm("two_link").structure.elimination,
+    Margin: lambda: arm("two_link").structure.control_margin,
+    dd.Record: record,
+    dd.Reference: lambda: dd.ConstantReference(0.5),
+    dd.ReferenceGenerator: lambda: loop().reference,
+    dd.RobotModel: lambda: arm("two_link").model,
+    dd.Signal: lambda: dd.Signal("a"),
+    dd.Structure: lambda: arm("two_link").structure,
+    dd.TrackingController: lambda: loop().controller,
+    dd.TrackingLaw: lambda: law("two_link"),
+    Constraint: lambda: arm("two_link").model.constraints[0],
+    Context: lambda: context_of(None),
+    Frame: lambda: arm("two_link").plant.GetFrameByName("tool"),
+    Frames: lambda: arm("two_link").model.links,
+    Kinematics: lambda: arm("two_link").model.links.kinematics(),
+    TreeKinematics: lambda: arm("two_link").model.links.kinematics(),
+    Links: lambda: arm("two_link").model.links,
+    MultibodyPlant: lambda: arm("two_link").plant,
+    PositionOutput: lambda: arm("two_link").model.positions[0],
+    Reaction: lambda: Reaction(ca.SX(2, 1)),
+    Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
+    RigidTransform: RigidTransform,
+    SceneGraph: SceneGraph,
+    Scenario: scenario,
+    SimulatorConfig: fixed_step,
+    Stage: lambda: dd.DcMotors(0.1, 1e-3, 0.5),
+    Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
+    System: lambda: loop().diagram,
+    Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
+    Variable: lambda: Variable("x"),
+    Viewed: loop,
+}
+
+# What fits an argument with a name, of all names or of one.
+PLACES: dict[str, Callable[[], Any]] = {
+    "state": state,
+    "states": lambda: state()[None],
+    "nominal_state": state,
+    "guess": state,
+    "times": lambda: [0.0, 0.1],
+    "reference": lambda: record()["reference"][0],
+    "coordinates": lambda: normal_form().coordinates(state()),
+    "parameters": lambda: arm("two_link").model.dae.parameter_values,
+    "axes": lambda: "xz",
+    "axis": lambda: (0.0, 0.0, 1.0),
+    "axis of AxisCoordinates": lambda: "z",
+    "major_radius": lambda: 2.0,
+    "size": lambda: 1,
+    "n": lambda: 1,
+    "components": lambda: "xy",
+    "duration": lambda: 0.01,
+    "max_integrators": lambda: 2,
+    "region": lambda: None,
+    "measured_force": lambda: None,
+    "settings": lambda: (),
+    "constraint_force": lambda: ca.SX.sym("lambda", 1),
+    "constraint_force of CoincidentPoints.reaction": lambda: ca.SX.sym("lambda", 2),
+    "constraint_force of WeldedFrames.reaction": lambda: ca.SX.sym("lambda", 6),
+    "center": lambda: (0.0, 0.0, 0.0),
+    "degrees": lambda: [2],
+    "outputs": lambda: [0.3, 10.0],
+    "host": lambda: "localhost",
+    "seed": lambda: 0,
+    "system of make_closed_loop": lambda: dd.RobotPlant(
+        arm("two_link").model, structure=arm("two_link").structure
+    ),
+    "integrators": lambda: {"joint1_motor": 1},
+    "nominal_control": lambda: None,
+    "spread": lambda: None,
+    "count": lambda: 3,
+    "structure": lambda: arm("two_link").structure,
+    "structure of Analysis": lambda: None,
+    "actuation": lambda: (),
+    "name": lambda: "name",
+    "time": lambda: ca.SX.sym("t"),
+    "values": lambda: -1.0,
+    "values of gain_coefficients": lambda: [4.0, 4.0],
+    "name of DaePlant.get_parameter": lambda: "link1.mass",
+    "name of DaePlant.set_parameter": lambda: "link1.mass",
+    "name of RobotPlant.get_parameter": lambda: "link1.mass",
+    "name of RobotPlant.set_parameter": lambda: "link1.mass",
+    "name of StateRealization.get_parameter": lambda: "link1.mass",
+    "name of StateRealization.set_parameter": lambda: "link1.mass",
+    "name of TrackingController.get_parameter": lambda: "link1.mass",
+    "name of TrackingController.set_parameter": lambda: "link1.mass",
+    "name of DaeSystem.parameter_slice": lambda: "link1.mass",
+    "state of DaeSystem": lambda: ca.SX.sym("x", 1),
+    "state of DaeSystem.from_functions": lambda: ["x"],
+    "state of from_symbolic": lambda: [Variable("x")],
+    "f of from_symbolic": lambda: [1.0],
+    "h of from_symbolic": lambda: [1.0],
+    "outputs of ExpressionOutput": lambda: [dd.Signal("a")],
+    "outputs of RobotModel.configuration": lambda: [0.3],
+    "guess of RobotModel.configuration": lambda: [1.2, -1.6],
+    "positions of RobotModel.rest_state": lambda: [1.2, -1.6],
+    "forces": lambda: [1.0],
+    "matrix": lambda: [[4.0, 4.0]],
+    "times of FeedbackGains.error_response": lambda: [0.0, 0.1],
+    "initial": lambda: [1.0, 1.0],
+    "end_time": lambda: 1.0,
+    "control": lambda: [1.0, 1.0],
+    "reference of ZeroDynamics.motion": lambda: lambda t: record()["reference"][0],
+    "reference of analyze": lambda: None,
+    "times of analyze": lambda: None,
+    "time of Record": lambda: [0.0, 1.0],
+    "time of ReferenceGenerator.reference": lambda: 0.0,
+    "references": lambda: [dd.ConstantReference([0.3, 10.0])],
+    "references of ReferenceGenerator": lambda: [dd.ConstantReference(0.3)],
+    "q": lambda: ca.SX.sym("q"),
+    "v": lambda: ca.SX.sym("v"),
+    "mass_matrix": lambda: ca.SX(2.0),
+    "bias": lambda: ca.SX(0.0),
+    "path": lambda: find_scenario("two_link_wall"),
+    "loggers": lambda: loop().loggers,
+    "groups": lambda: [np.eye(1), np.eye(1)],
+}
+
+# What makes no sense for most arguments. Nothing is large: a long run that is asked for is none.
+NONSENSE: tuple[Any, ...] = (
+    None,
+    "",
+    "text",
+    "a\0b",
+    "$x^$",
+    b"bytes",
+    True,
+    -1,
+    0,
+    2.5,
+    1j,
+    10**400,
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    [],
+    [[]],
+    {},
+    {"a": 1.0},
+    {1: "a"},
+    ["a"],
+    [None],
+    [float("nan")],
+    [1.0, "a"],
+    [[1.0], [1.0, 2.0]],
+    [[[1.0]]],
+    (0.0, 0.0),
+    (0.0, 0.0, 0.0),
+    {1.0},
+    range(3),
+    object(),
+    int,
+    lambda *given: None,
+    lambda *given: "a",
+    lambda: 1.0,
+    np.zeros(3),
+    np.zeros((1, 4)),
+    np.full(4, np.nan),
+    np.full((2, 2), np.inf),
+    np.array(["a"]),
+    np.array(None),
+    np.array([1.0, None]),
+    np.ma.masked_array([1.0, 2.0], [True, False]),
+    np.datetime64("2020-01-01"),
+    datetime.date(2020, 1, 1),
+    ca.SX.sym("a"),
+    ca.SX.sym("a", 2, 2),
+    ca.MX.sym("a"),
+    ca.DM([1.0, 2.0]),
+    dd.Signal("a"),
+    dd.Parameter("a", 1.0),
+    dd.ConstantReference(1.0),
+    Path("nowhere"),
+)
+
+
+class Call(NamedTuple):
+    """A public function, a constructor, or a method of what SAMPLES has."""
+
+    label: str
+    function: Callable[..., Any]
+    annotations: dict[str, Any]
+    owner: Any = None
+
+
+def public() -> Iterator[tuple[str, Any]]:
+    for name in dd.__all__:
+        member = getattr(dd, name)
+        if callable(member) and not (
+            inspect.isclass(member) and issubclass(member, (Exception, Warning))
+        ):
+            yield name, member
+
+
+# What the library calls on its members, with arguments of its own: rules for who writes one.
+CONTRACTS = (Surface, Constraint, PositionOutput, Stage, dd.Reference)
+
+
+def methods(cls: type) -> set[str]:
+    """Public methods of ours; those of Drake begin with a capital, or are its own.
+
+    Not those of a contract, nor those that build expressions, as of `Kinematics`.
+    """
+    return {
+        name
+        for base in cls.__mro__
+        if base.__module__.startswith("drake_dae")
+        for name, member in vars(base).items()
+        if name[0].islower()
+        and (inspect.isfunction(member) or isinstance(member, (classmethod, staticmethod)))
+        and not any(hasattr(contract, name) for contract in CONTRACTS if issubclass(cls, contract))
+        and "casadi" not in str(inspect.signature(getattr(cls, name)))
+    }
+
+
+def labels() -> Iterator[str]:
+    for name, member in public():
+        if not inspect.isabstract(member):
+            yield name
+        if inspect.isclass(member):
+            yield from (f"{name}.{method}" for method in sorted(methods(member)))
+
+
+def call(label: str) -> Call:
+    name, _, method = label.partition(".")
+    member = getattr(dd, name)
+    if not method:
+        function = member.__init__ if inspect.isclass(member) else member
+        return Call(label, member, get_type_hints(function))
+    known = [of for of in (member, *member.__mro__) if of in SAMPLES]
+    owner = SAMPLES[known[0]]() if known and known[0] is member else made(name)
+    function = getattr(owner, method)
+    return Call(label, function, get_type_hints(inspect.unwrap(function)), owner)
+
+
+@cache
+def made(name: str) -> Any:
+    """One of a public class."""
+    cls = call(name)
+    return cls.function(**valid(cls))
+
+
+def valid(of: Call) -> dict[str, Any]:
+    """Arguments that fit; those with a default are left out."""
+    found = {}
+    for name, parameter in parameters(of).items():
+        if parameter.default is parameter.empty:
+            found[name] = sample(of, name)
+    return found
+
+
+def parameters(of: Call) -> dict[str, inspect.Parameter]:
+    every = inspect.signature(of.function).parameters
+    return {n: p for n, p in every.items() if p.kind is not p.VAR_KEYWORD}
+
+
+def sample(of: Call, name: str) -> Any:
+    for place in (f"{name} of {of.label}", name):
+        if place in PLACES:
+            return PLACES[place]()
+    hint = of.annotations.get(name, Any)
+    if hint is Context:
+        return context_of(of.owner)
+    return sample_of(hint, f"{of.label}: {name}")
+
+
+def sample_of(hint: Any, what: str) -> Any:
+    if hint in SAMPLES:
+        return SAMPLES[hint]()
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        known = [a for a in arguments if a in SAMPLES]
+        if NoneType in arguments and not known:
+            return None
+        return sample_of((known or arguments)[0], what)
+    if origin is np.ndarray:
+        return np.ones(1)
+    if origin is tuple and arguments[1:] != (...,):
+        return tuple(sample_of(argument, what) for argument in arguments)
+    if inspect.isclass(origin) and issubclass(origin, Mapping):
+        return {sample_of(arguments[0], what): sample_of(arguments[1], what)}
+    if inspect.isclass(origin) and issubclass(origin, (Sequence, tuple)):
+        return [sample_of(arguments[0], what)]
+    if origin is not None and callable(hint):
+        return lambda *given: 1.0
+    pytest.fail(f"{what} is a {hint}, and SAMPLES has none: add one, so that it is tested too")
+
+
+def invoke(of: Call, arguments: dict[str, Any]) -> None:
+    """Calls by position what can only be given so."""
+    positional = []
+    for name, parameter in parameters(of).items():
+        if parameter.kind is parameter.VAR_POSITIONAL and name in arguments:
+            given_list = arguments.pop(name)
+            positional += given_list if isinstance(given_list, list) else [given_list]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        of.function(*positional, **arguments)
+
+
+# By its place: CasADi and NumPy have no == and no hash, as Hypothesis would like.
+WRONG = st.one_of(
+    st.integers(0, len(NONSENSE) - 1).map(NONSENSE.__getitem__),
+    st.floats(-100.0, 100.0),
+    st.lists(st.floats(-2.0, 2.0), max_size=5),
+    st.text(max_size=5),
+)
+EXAMPLES = 12
+"""Of each name in a run of the tests; all of them, one argument at a time, are 20,000 calls."""
+
+EVERY = tuple(labels())
+# What a call does apart from its arguments is not wanted here.
+SIDE_EFFECTS = {"start_meshcat": "it opens a port", "Record.save": "it writes where it is told"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("label", [label for label in EVERY if label not in SIDE_EFFECTS])
+def test_wrong_arguments_end_as_errors_of_the_library(label, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    of = call(label)
+
+    @settings(
+        derandomize=True,
+        database=None,
+        deadline=None,
+        max_examples=EXAMPLES,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.data())
+    def every(data: st.DataObject) -> None:
+        wrong = data.draw(st.lists(st.sampled_from(list(parameters(of))), min_size=1, max_size=2))
+        arguments = valid(of)
+        for name in wrong:
+            arguments[name] = data.draw(WRONG)
+        with contextlib.suppress(DrakeDaeError):
+            invoke(of, arguments)
+
+    if parameters(of):
+        every()

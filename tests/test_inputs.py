@@ -1,0 +1,277 @@
+"""Inputs that were accepted, hung or ended in exceptions of others: each refused, with words."""
+
+import os
+
+import numpy as np
+import pytest
+from arms import arm, fixed_step, law
+from pydrake.geometry import SceneGraph
+from pydrake.systems.analysis import SimulatorConfig
+from runs import scenario
+
+from drake_dae import (
+    ConstantReference,
+    ForceSensor,
+    JointPositions,
+    MultibodyExpressions,
+    NormalForm,
+    PointToPointReference,
+    Record,
+    RobotModel,
+    RobotPlant,
+    Torus,
+    build_scenario,
+    dynamic_extension,
+    find_structure,
+    load_scenario,
+    simulate,
+)
+from drake_dae.arrays import brief, numbers
+from drake_dae.cli import main
+from drake_dae.dae.signals import Signal
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.diagrams.scenario_parts import Robot
+from drake_dae.diagrams.typed_yaml import load_yaml
+from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
+from drake_dae.simulation.plots import _label
+
+LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
+)
+
+YAML = {
+    "a billion laughs": (LAUGHS, "line .*more than 100000 values, counting aliases"),
+    "laughs in merged keys": (
+        "a: &a {x: 1}\n" + LAUGHS.replace("lol", "*a"),
+        "more than 100000 values",
+    ),
+    "an alias inside of itself": ("a: &a [*a]", "more than 100000 values"),
+    "5,000 brackets": ("[" * 5000 + "]" * 5000, "more than 50 lists or keys in each other"),
+    "two megabytes": ("a: " + "x" * 2_000_000, "more than 1000000 characters"),
+    "a date that is none": ("a: !!timestamp abc", "does not fit its value"),
+    "a whole number that is none": ("a: !!int ''", "does not fit its value"),
+    "a number that is none": ("a: !!float ''", "does not fit its value"),
+    "a null byte": ("a: \0", "not allowed"),
+}
+
+
+@pytest.mark.parametrize("what", YAML)
+def test_yaml_without_end_or_sense_is_refused(what):
+    text, message = YAML[what]
+    with pytest.raises(ScenarioError, match=message) as caught:
+        load_yaml(text, "file")
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("text", ["1:30", "0_0.0_5", "1_000", "010", "\uff11\uff12", "2020-01-01"])
+def test_numbers_that_only_yaml_1_1_reads_are_text(text):
+    assert load_yaml(f"a: {text}", "file") == {"a": text}
+    with pytest.raises(ScenarioError, match="duration: expected a number, got '"):
+        scenario("two_link_wall", f"duration={text}")
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "+2", "1.5", ".5", "-1.e3", "1e-8", "2E5", "-0.0"])
+def test_numbers_of_json_stay_numbers(text):
+    assert load_yaml(f"a: {text}", "file") == {"a": float(text)}
+
+
+def test_messages_are_short_whatever_the_value_is():
+    deep = ["x"] * 9
+    for _ in range(9):
+        deep = [deep] * 9
+    for value in (deep, "x" * 10**6, {i: deep for i in range(10**4)}, np.zeros(10**6), object()):
+        assert len(brief(value)) <= 200
+
+
+def test_paths_that_are_none(tmp_path, monkeypatch):
+    for path in ("a\0b", tmp_path, tmp_path / "none", "x" * 5000):
+        with pytest.raises(ScenarioError):
+            load_scenario(path)
+    utf16 = tmp_path / "utf16.yaml"
+    utf16.write_text("robot: {}", encoding="utf-16")
+    with pytest.raises(ScenarioError, match="not UTF-8 text"):
+        load_scenario(utf16)
+    for setting in ('robot.file="a\\0b"', 'robot.packages={a: "a\\0b"}'):
+        with pytest.raises(ScenarioError):
+            build_scenario(scenario("two_link_wall", setting))
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    if not os.path.exists(os.curdir):
+        with pytest.raises(ScenarioError):
+            load_scenario("scenario.yaml")
+
+
+URDF = """<robot name="r">
+<link name="arm"><inertial>{origin}{mass}
+{inertia}</inertial></link>
+<joint name="j" type="{type}">
+<parent link="world"/><child link="arm"/>{axis}
+{dynamics}
+<limit effort="{effort}"/></joint>
+<transmission name="t"><type>transmission_interface/SimpleTransmission</type>
+<joint name="j"/><actuator name="m">{gear}</actuator></transmission>{more}
+</robot>{after}"""
+FINE = {
+    "origin": "",
+    "mass": '<mass value="1"/>',
+    "inertia": '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>',
+    "type": "continuous",
+    "axis": '<axis xyz="0 0 1"/>',
+    "dynamics": '<dynamics damping="0.1"/>',
+    "effort": "10",
+    "gear": "",
+    "more": "",
+    "after": "",
+}
+SECOND = """<transmission name="t2"><type>transmission_interface/SimpleTransmission</type>
+<joint name="j"/><actuator name="m2"/></transmission>"""
+
+ROBOTS = {
+    "a mass below zero": ({"mass": '<mass value="-6"/>'}, "link 'arm': mass or inertia of no body"),
+    "no mass": ({"mass": '<mass value="0"/>'}, "link 'arm': mass or inertia of no body"),
+    "a mass left out": ({"mass": ""}, "link 'arm': mass or inertia of no body"),
+    "an impossible inertia": (
+        {"inertia": '<inertia ixx="1" iyy="1" izz="5" ixy="0" ixz="0" iyz="0"/>'},
+        "link 'arm': mass or inertia of no body.*none exceeds the sum of the others",
+    ),
+    "no inertia at all": ({"mass": "", "inertia": ""}, "no link that moves has mass or inertia"),
+    "an axis of two numbers": ({"axis": '<axis xyz="0 -1"/>'}, "Expected 3 values .* got 0 -1"),
+    "an origin that is NaN": ({"origin": '<origin xyz="nan 0 0"/>'}, "Expected 3 values .* nan"),
+    "one damping of a planar joint": (
+        {"type": "planar", "dynamics": '<dynamics damping="0"/>'},
+        "Expected 3 values for attribute damping",
+    ),
+    "Coulomb friction": (
+        {"dynamics": '<dynamics damping="0.1" friction="0.5"/>'},
+        "joint 'j': Coulomb friction of a joint is not supported",
+    ),
+    "no effort": ({"effort": "0"}, "joint 'j': .* zero effort limit"),
+    "two actuators on a joint": ({"more": SECOND}, "actuators m, m2 move the joints in 1 indepen"),
+    "a second robot": ({"after": '<robot name="b"/>'}, "has 2 <robot>s, and only one is read"),
+    "gears of ratio zero": (
+        {"gear": '<drake:gear_ratio xmlns:drake="http://drake.mit.edu" value="0"/>'},
+        "gear ratio of 'm' is 0",
+    ),
+}
+
+
+def robot_of(path, changes):
+    path.write_text(URDF.format(**FINE | changes))
+    chosen = scenario(
+        "two_link_wall", "constraints=[]", "outputs=[!JointPositions {joints: [j]}]", "start={}"
+    )
+    object.__setattr__(chosen, "robot", Robot(str(path)))
+    return scenario_model(chosen, SceneGraph())
+
+
+@pytest.mark.parametrize("what", ROBOTS)
+def test_robots_that_drake_would_change_are_refused_by_name(tmp_path, what):
+    changes, message = ROBOTS[what]
+    with pytest.raises(ScenarioError, match=message):
+        robot_of(tmp_path / "robot.urdf", changes)
+
+
+def test_the_robot_without_these_is_fine(tmp_path):
+    assert robot_of(tmp_path / "robot.urdf", {}).links.q.numel() == 1
+
+
+def test_a_context_of_another_system_is_refused():
+    plants = [RobotPlant(arm("two_link").model, structure=arm("two_link").structure) for _ in "ab"]
+    context = plants[1].CreateDefaultContext()
+    for refused in (
+        lambda: plants[0].set_parameter(context, "link1.mass", 2.0),
+        lambda: plants[0].get_parameter(context, "link1.mass"),
+        lambda: plants[0].set_state(context, arm("two_link").structure.states[0]),
+    ):
+        with pytest.raises(ModelError, match=r"is not that of 'two_link'; .*FromRoot"):
+            refused()
+
+
+def test_one_number_does_not_fill_a_position():
+    with pytest.raises(ScenarioError, match=r"plant_parameters: .*wall\.position' has 3 entries"):
+        build_scenario(scenario("two_link_wall", "plant_parameters={wall.position: [0.5]}"))
+
+
+@pytest.mark.parametrize("start", [np.nan, np.inf, 1e18])
+def test_a_start_from_which_time_does_not_go_on_is_refused(start):
+    plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
+    config = SimulatorConfig(max_step_size=0.01, use_error_control=False, start_time=start)
+    with pytest.raises(ModelError, match="start_time must be a time from which"):
+        simulate(plant, plant.CreateDefaultContext(), 1.0, config)
+
+
+def test_a_lag_that_is_none_ends_the_run_and_leaves_a_finite_record():
+    chosen = scenario(
+        "two_link_wall", "force=!MeasuredForce {time_constant: 1e-300}", "duration=0.1"
+    )
+    loop, context = build_scenario(chosen)
+    with pytest.raises((NonFiniteError, DrakeDaeError)):
+        simulate(loop.diagram, context, chosen.duration, fixed_step())
+    record = loop.record(context)
+    for recorded in record.signals.values():
+        assert np.isfinite(recorded.values).all()
+
+
+ARGUMENTS = {
+    "constant(nan)": lambda: ConstantReference(np.nan),
+    "point_to_point(nan)": lambda: PointToPointReference(0.0, 1.0, np.nan, 1.0),
+    "Torus(inf)": lambda: Torus((0, 0, 0), (0, 0, 1), np.inf, 1.0),
+    "max_integrators=-1": lambda: dynamic_extension(arm("two_link").model.dae, max_integrators=-1),
+    "spread=-1": lambda: find_structure(arm("two_link").model.dae, spread=-1.0),
+    "a row as a state": lambda: law("two_link").control(
+        np.zeros((1, 4)), np.zeros(law("two_link").layout.reference_size)
+    ),
+    "NaN in a state": lambda: law("two_link").predicted_error(
+        [0.0], [0, np.nan, 0, 0], np.zeros(law("two_link").layout.reference_size)
+    ),
+    "NaN in coordinates": lambda: NormalForm(
+        arm("two_link").model.dae, structure=arm("two_link").structure
+    ).coordinates([np.nan] * 4),
+    "masked entries": lambda: numbers("numbers", np.ma.masked_array([1.0, 2.0], [True, False])),
+    "text as a number": lambda: numbers("numbers", "1.5"),
+    "a sensor of text": lambda: ForceSensor("one", 0.1),
+    "no list": lambda: RobotModel(MultibodyExpressions(arm("two_link").plant), 3, JointPositions),
+}
+
+
+@pytest.mark.parametrize("what", ARGUMENTS)
+def test_arguments_that_make_no_sense_are_refused(what):
+    with pytest.raises(DrakeDaeError):
+        ARGUMENTS[what]()
+
+
+@pytest.mark.parametrize("change", ["a signal shorter", "a time back", "names left out"])
+def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
+    values = {
+        "time": np.arange(3.0),
+        "x": np.zeros((3, 2)),
+        "x.names": np.array(["a", "b"]),
+        "x.units": np.array(["", ""]),
+    }
+    if change == "a signal shorter":
+        values["x"] = values["x"][:2]
+    elif change == "a time back":
+        values["time"] = np.array([0.0, 2.0, 1.0])
+    else:
+        values["x.names"], values["x.units"] = values["x.names"][:1], values["x.units"][:1]
+    np.savez(tmp_path / "record.npz", **values)
+    with pytest.raises(ModelError, match="record"):
+        Record.load(tmp_path / "record.npz")
+    with pytest.raises(ModelError, match="nowhere is not a record"):
+        Record.load("nowhere")
+
+
+def test_dollars_in_names_are_no_mathematics():
+    assert _label(Signal("$x^$", "m")) == r"\$x^\$ [m]"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("file", "is a file; name a folder"), ("a\0b", "null byte")]
+)
+def test_a_folder_that_is_none(tmp_path, capsys, name, words):
+    (tmp_path / "file").write_text("kept")
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path / name)]) == 1
+    assert words in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "kept"
