@@ -2,6 +2,7 @@
 
 import random
 import re
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from math import isfinite
@@ -242,7 +243,7 @@ def _shipped(choice: random.Random) -> Any:
     return load_yaml(shipped_scenarios()[name[0]].read_text(), name[0])
 
 
-def _places(data: Any) -> Any:
+def _places(data: Any) -> Iterator[tuple[Any, Any]]:
     """All (container, key) of plain data."""
     for key in list(data) if isinstance(data, dict) else range(len(data)):
         if key != "_tag":

@@ -5,6 +5,7 @@ import ctypes
 import gc
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 from pydrake.systems.analysis import SimulatorConfig
@@ -23,7 +24,7 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4.096
 
 
-def growth(make, count: int) -> float:
+def growth(make: Callable[[], object], count: int) -> float:
     """kB that stay per call, after as many calls as it takes for caches to fill."""
     for _ in range(max(5, count // 10)):
         make()

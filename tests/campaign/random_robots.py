@@ -109,7 +109,7 @@ def attempt(seed: int, folder: Path) -> Outcome:
         outcome.what = str(plan)
         outputs = _outputs(random, links, constraints, tree)
         model = RobotModel(
-            links, constraints, outputs, tree.positions, "random", _stages(random, plan, links)
+            links, constraints, outputs, tree.positions, "random", _stages(random, plan)
         )
         structure = find_structure(model.dae)
         law = TrackingLaw(model.dae, poles(-random.uniform(3.0, 8.0)), structure=structure)
@@ -252,21 +252,14 @@ def _constraints(random: Random, plan: Plan, tree: Tree) -> list[Constraint]:
             surface = _surface(random, kind, poses[tip] @ point)
             made.append(PointOnSurface(tip, surface, tuple(point), f"surface{index}"))
         return made
-    if plan.binding == "pin" or len(tips) < 2:
-        if plan.binding == "weld":
-            return [WeldedFrames("world", tips[0], poses[tips[0]])]
-        axes = str(random.choice(["x", "xz", "xyz"])) if plan.joints > 2 else "y"
-        return [
-            CoincidentPoints("world", tuple(poses[tips[0]].translation()), tips[0], (0, 0, 0), axes)
-        ]
-    first, second = tips[:2]
-    between = poses[first].InvertAndCompose(poses[second])
-    if plan.binding == "welded branches":
-        return [WeldedFrames(first, second, between)]
-    if plan.binding == "weld":
-        return [WeldedFrames("world", first, poses[first])]
-    axes = str(random.choice(["x", "yz", "xyz"])) if plan.joints > 2 else "z"
-    return [CoincidentPoints(first, tuple(between.translation()), second, (0, 0, 0), axes)]
+    # Two branches meet, or one of them is held by the world.
+    meet = plan.binding in ("loop", "welded branches") and len(tips) > 1
+    a, b = (tips[0], tips[1]) if meet else ("world", tips[0])
+    between = poses[a].InvertAndCompose(poses[b]) if meet else poses[b]
+    if plan.binding in ("weld", "welded branches"):
+        return [WeldedFrames(a, b, between)]
+    axes = str(random.choice(["x", "yz", "xyz"])) if plan.joints > 2 else "y"
+    return [CoincidentPoints(a, tuple(between.translation()), b, (0, 0, 0), axes)]
 
 
 def _surface(random: Random, kind: str, point: np.ndarray) -> Surface:
@@ -296,7 +289,7 @@ def _surface(random: Random, kind: str, point: np.ndarray) -> Surface:
     return Torus(tuple(center), tuple(axis), size, minor, inside)
 
 
-def _stages(random: Random, plan: Plan, links: MultibodyExpressions) -> list[Stage]:
+def _stages(random: Random, plan: Plan) -> list[Stage]:
     # With a damper the springs' rate, stiffness / damping, is part of the zero dynamics: the step
     # must resolve it.
     damping = random.uniform(5.0, 20.0) if random.random() < 0.5 else 0.0

@@ -1,15 +1,14 @@
 """Python frees what a closed loop was made of when nobody needs the loop any more."""
 
-import ctypes
 import gc
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from weakref import ref
 
 import arms
 import numpy as np
 import pytest
+from campaign.memory import resident
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import FirstOrderTaylorApproximation
@@ -109,13 +108,6 @@ def test_a_loop_lives_as_long_as_its_simulator():
     state = simulator.get_context().get_continuous_state_vector().CopyToVector()
     assert state.shape == (size,)
     assert np.all(np.isfinite(state))
-
-
-def resident() -> float:
-    """Memory of this process in kB, after everything that can be freed was."""
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4.096
 
 
 @pytest.mark.slow
