@@ -107,9 +107,10 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     parser = Parser(plant)
-    dropped = _Dropped()
     log = logging.getLogger("drake")
+    level, dropped = log.level, _Dropped(log.getEffectiveLevel())
     log.addFilter(dropped)
+    log.setLevel(logging.WARNING)  # Whoever wants to see less must still be told.
     try:
         parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
         for name, folder in robot.packages.items():
@@ -120,14 +121,14 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
             parser.AddModelsFromUrl(robot.file)
         else:
             parser.AddModels(robot.file)
-        model = parser.package_map().ResolveUrl(robot.file) if is_url else robot.file
         folders = [FOLDER / "models", *map(Path, robot.packages.values())]
-        check_resources(scene_graph, [package_folder(Path(model)), *folders])
+        check_resources(scene_graph, [package_folder(Path(file)), *folders])
         plant.Finalize()
     except (RuntimeError, ValueError, SystemExit) as error:
         # Drake has all of them: SystemExit for what an assertion of its own finds.
         raise ModelError(str(error)) from None
     finally:
+        log.setLevel(level)
         log.removeFilter(dropped)
     if dropped.warnings:
         raise ModelError("; ".join(map(_explained, dropped.warnings)))
@@ -139,8 +140,9 @@ class _Dropped(logging.Filter):
 
     KINDS = ("inertia", "friction", "effort limit")
 
-    def __init__(self) -> None:
+    def __init__(self, level: int) -> None:
         super().__init__()
+        self._level = level
         self.warnings: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -148,7 +150,7 @@ class _Dropped(logging.Filter):
         is_dropped = "warning: " in text and any(kind in text for kind in self.KINDS)
         if is_dropped:
             self.warnings.append(text)
-        return not is_dropped
+        return not is_dropped and record.levelno >= self._level
 
 
 def _explained(warning: str) -> str:

@@ -1,5 +1,6 @@
 """Inputs that were accepted, hung or ended in exceptions of others: each refused, with words."""
 
+import logging
 import os
 
 import numpy as np
@@ -170,6 +171,12 @@ def robot_of(path, changes):
 def test_robots_that_drake_would_change_are_refused_by_name(tmp_path, what):
     changes, message = ROBOTS[what]
     with pytest.raises(ScenarioError, match=message):
+        robot_of(tmp_path / "robot.urdf", changes)
+
+
+def test_a_quiet_log_hides_no_refusal(tmp_path, caplog):
+    changes, message = ROBOTS["a mass below zero"]
+    with caplog.at_level(logging.CRITICAL, "drake"), pytest.raises(ScenarioError, match=message):
         robot_of(tmp_path / "robot.urdf", changes)
 
 
