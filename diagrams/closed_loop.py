@@ -66,12 +66,12 @@ class ClosedLoop:
             own = self.noise.GetMyMutableContextFromRoot(context)
             self.noise.SetRandomContext(own, RandomGenerator(seed))
 
-    def record(self, context: Context, after: float = -np.inf) -> Record:
+    def record(self, context: Context, after: float | None = None) -> Record:
         """What was logged up to now, with `desired_output` r and `tracking_error` z - r (29).
 
         Args:
             context: The diagram's context.
-            after: Only what was logged later than this time, in s.
+            after: Only what was logged later than this time, in s; None for all.
         """
         record = Record.from_logs(self.loggers, context, after)
         desired = record["reference"][:, self.controller.law.layout.lowest]

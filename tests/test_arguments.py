@@ -46,7 +46,7 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
-from drake_dae.simulation.animation import Viewed
+from drake_dae.simulation.animation import Loop
 from drake_dae.simulation.record import Recorded
 
 FOLDER = Path(__file__).parent / "made"
@@ -161,7 +161,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
     Variable: lambda: Variable("x"),
-    Viewed: loop,
+    Loop: loop,
 }
 
 # What fits an argument with a name, of all names or of one.

@@ -79,21 +79,21 @@ class Record:
         cls,
         loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]],
         context: Context,
-        after: float = -np.inf,
+        after: float | None = None,
     ) -> Self:
         """Collects per-step logs, whatever they hold up to now.
 
         Args:
             loggers: Name -> (sink, names and units of its input).
             context: The context of the diagram.
-            after: Only what was logged later than this time is collected, in s.
+            after: Only what was logged later than this time is collected, in s; None for all.
         """
         logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
         times = [log.sample_times() for log in logs.values()]
         # A run that failed in the middle of a step may have logged some of the signals only.
         count = min((len(t) for t in times), default=0)
         time = times[0][:count] if times else np.zeros(0)
-        first = int(np.searchsorted(time, after, side="right"))
+        first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
         # Nor is what a run that failed left in its last step a number.
         finite = [np.isfinite(log.data()[:, first:count]).all(axis=0) for log in logs.values()]
         broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)

@@ -12,6 +12,9 @@ from typing import Self
 import numpy as np
 from pydrake.systems.framework import Context
 
+from drake_dae.arguments import checked, result_of
+from drake_dae.arrays import brief
+from drake_dae.errors import ModelError
 from drake_dae.simulation.record import Record
 
 PERIOD = 1.0
@@ -21,6 +24,7 @@ _SHARE = 0.02
 """Of the run that appending may take: on a slow disk it waits longer."""
 
 
+@checked(ModelError)
 class RecordWriter:
     """Appends the record of a run to a file, about once a second, while the run goes on:
 
@@ -36,14 +40,16 @@ class RecordWriter:
 
     Args:
         path: The file.
-        record: From a context and a time in s to what was recorded later, as `ClosedLoop.record`.
+        record: From a context and a time in s, or None, to what was recorded later, as
+            `ClosedLoop.record`.
     """
 
-    def __init__(self, path: str | Path, record: Callable[[Context, float], Record]) -> None:
+    def __init__(self, path: str | Path, record: Callable[[Context, float | None], Record]) -> None:
         self.path = Path(path)
         self._record = record
         self._file: int | None = None
-        self._end, self._time = 0, -np.inf
+        self._end = 0
+        self._time: float | None = None
         self._next = time.perf_counter() + PERIOD
         self._warned = False
 
@@ -72,7 +78,7 @@ class RecordWriter:
         if began < self._next:
             return
         try:
-            self._append(self._record(context, self._time), keep_last=True)
+            self._append(context, keep_last=True)
         except OSError as error:
             if not self._warned:
                 reason = error.strerror or error
@@ -88,11 +94,15 @@ class RecordWriter:
         """Appends all that was recorded since the last time.
 
         Raises:
+            ModelError: What makes the record fails.
             OSError: The file cannot be written to; it keeps what fits.
         """
-        self._append(self._record(context, self._time), keep_last=False)
+        self._append(context, keep_last=False)
 
-    def _append(self, record: Record, keep_last: bool) -> None:
+    def _append(self, context: Context, keep_last: bool) -> None:
+        record = result_of("record", self._record, context, self._time)
+        if not isinstance(record, Record):
+            raise ModelError(f"record must return a Record, got {brief(record)}")
         stop = record.time.size - keep_last
         if stop < 1:
             return
