@@ -194,7 +194,9 @@ def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         assert main(["simulate", "two_link_wall", "--out", str(folder), *SHORT, *BARE]) == 1
-        assert f"error: cannot write to '{folder}': " in error_line(capsys)
+        assert re.search(
+            rf"error: ('{folder}' is a file|cannot write to '{folder}': )", error_line(capsys)
+        )
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
