@@ -16,7 +16,7 @@ from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.surface import axes_along
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.lifetime import Collectable, weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.trace.functions import TracedFunction
 
 _FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
@@ -152,7 +152,7 @@ class ForceArrows:
         self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
 
 
-class ConstraintForceVisualizer(LeafSystem, metaclass=Collectable):
+class ConstraintForceVisualizer(LeafSystem):
     """Draws the constraint forces of a robot while it runs.
 
     Input ports:
@@ -164,6 +164,8 @@ class ConstraintForceVisualizer(LeafSystem, metaclass=Collectable):
         model: The robot.
         period: Time between pictures in s.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(self, arrows: ForceArrows, model: RobotModel, period: float) -> None:
         super().__init__()

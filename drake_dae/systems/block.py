@@ -29,7 +29,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.systems.failures import simulation_error
-from drake_dae.systems.lifetime import Collectable, weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 STATES = ("state", "estimated_state")
@@ -99,7 +99,7 @@ class TracedFormula:
 
 
 @checked(ModelError)
-class DifferentiableSystem(LeafSystem, metaclass=Collectable):
+class DifferentiableSystem(LeafSystem):
     """A LeafSystem with vector ports that converts to AutoDiffXd, alone or in a diagram.
 
     The converted system has the same ports, continuous state and numeric parameters, and exact
@@ -107,6 +107,8 @@ class DifferentiableSystem(LeafSystem, metaclass=Collectable):
     refuse a start that is off N*.
 
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(self) -> None:
         converter = SystemScalarConverter()
@@ -160,6 +162,8 @@ class ParameterizedSystem(DifferentiableSystem):
         values: The default: `dae.parameter_values`, and what else the block appends.
         signals: Name of an input of the block's functions -> names of its entries, for messages.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(
         self, dae: DaeSystem, values: FloatArray, signals: Mapping[str, Sequence[Signal]]
@@ -223,8 +227,10 @@ class ParameterizedSystem(DifferentiableSystem):
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
 
-class _AutoDiffSystem(LeafSystem_[AutoDiffXd], metaclass=Collectable):
+class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
     """A DifferentiableSystem on AutoDiffXd."""
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(self, original: DifferentiableSystem) -> None:
         super().__init__()

@@ -17,7 +17,7 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
-from drake_dae.systems.lifetime import weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 
 
 @checked(ModelError)
@@ -48,6 +48,8 @@ class TrackingController(ParameterizedSystem):
         SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
         dae = law.system

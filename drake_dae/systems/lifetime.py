@@ -4,23 +4,13 @@ from collections.abc import Callable
 from typing import Any
 from weakref import ref
 
-from pydrake.systems.framework import LeafSystem
+SHARED_DICTIONARY: tuple[str, ...] = ()
+"""The `__slots__` of classes below LeafSystem: instances have the dictionary of Drake's class.
 
-_DrakeType: Any = type(LeafSystem)
-
-
-class Collectable(_DrakeType):
-    """The metaclass of LeafSystems that the garbage collector can free: `__slots__` is empty.
-
-    The instances have the dictionary of Drake's class. A Python class adds one of its own on top,
-    which is the same; CPython 3.11 then visits it twice when it counts references, finds more than
-    there are, and keeps for ever whatever is part of a cycle, as every system of a diagram is.
-    """
-
-    def __new__(
-        cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **options: Any
-    ) -> Any:
-        return super().__new__(cls, name, bases, {"__slots__": (), **namespace}, **options)
+A Python class adds one of its own otherwise, which is the same; CPython 3.11 then visits it twice
+when it counts references, finds more than there are, and keeps for ever whatever is part of a
+cycle, as every system of a diagram is.
+"""
 
 
 def weakly(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:

@@ -21,7 +21,7 @@ from drake_dae.systems.block import (
     ParameterizedSystem,
     TracedFormula,
 )
-from drake_dae.systems.lifetime import weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -64,6 +64,8 @@ class DaePlant(ParameterizedSystem):
         NonFiniteError: A value is not finite on the way, likewise.
         SimulationError: The state cannot be projected onto N* on the way, likewise.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(
         self, system: DaeSystem, *, structure: Structure | None = None, project: bool = True

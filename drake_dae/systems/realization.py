@@ -17,7 +17,7 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.block import Formula, ParameterizedSystem
-from drake_dae.systems.lifetime import weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -60,6 +60,8 @@ class StateRealization(ParameterizedSystem):
         SingularityError: A(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(self, normal_form: NormalForm) -> None:
         structure, dae = normal_form.structure, normal_form.system

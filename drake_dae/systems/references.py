@@ -14,7 +14,7 @@ from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems.block import DifferentiableSystem, Formula
-from drake_dae.systems.lifetime import weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 
 
 @checked(ReferenceSignalError)
@@ -114,6 +114,8 @@ class ReferenceGenerator(DifferentiableSystem):
             enough.
         NonFiniteError: A reference is not finite on the way; the exception has the time.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
         super().__init__()

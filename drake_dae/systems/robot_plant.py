@@ -7,7 +7,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
-from drake_dae.systems.lifetime import weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.plant import DaePlant
 from drake_dae.trace.functions import TracedFunction
 
@@ -31,6 +31,8 @@ class RobotPlant(DaePlant):
         structure: The structure of `model.dae`; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(
         self, model: RobotModel, *, structure: Structure | None = None, project: bool = True

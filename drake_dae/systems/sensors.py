@@ -9,7 +9,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.errors import ModelError, NonFiniteError
 from drake_dae.systems.block import DifferentiableSystem, Formula, TracedFormula
-from drake_dae.systems.lifetime import weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -41,6 +41,8 @@ class ForceSensor(DifferentiableSystem):
     Raises:
         ModelError: A number is negative, or there is neither lag nor sampling.
     """
+
+    __slots__ = SHARED_DICTIONARY
 
     def __init__(
         self,
