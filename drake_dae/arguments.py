@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_ori
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drake_dae.arrays import brief, numbers
 from drake_dae.errors import DrakeDaeError, ModelError
@@ -142,7 +142,7 @@ def _hint(value: Any, rule: _Rule) -> str:
     return f"; pass its .{meant[0]}" if meant else ""
 
 
-_ARRAY = set(get_args(ArrayLike))
+_ARRAY = set(get_args(ArrayLike)) or {ArrayLike}  # A union, or in newer NumPy an alias.
 
 
 def _rule(hint: Any) -> _Rule:
@@ -152,9 +152,11 @@ def _rule(hint: Any) -> _Rule:
         return _rule(arguments[0])
     if origin in (Union, UnionType):
         return _any_of(set(arguments), arguments)
+    if hint is ArrayLike:
+        return _ARRAYS
     if hint in _PLAIN:
         return _PLAIN[hint]
-    if origin is np.ndarray:
+    if origin is np.ndarray or origin is NDArray:
         return _NUMBERS
     if origin is tuple and arguments[1:] != (...,):
         return _tuple(arguments)
