@@ -21,7 +21,7 @@ import pytest
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -405,7 +405,7 @@ def sample_of(hint: Any, what: str) -> Any:
         if NoneType in arguments and not known:
             return None
         return sample_of((known or arguments)[0], what)
-    if origin is np.ndarray:
+    if origin is np.ndarray or origin is NDArray:  # The latter from NumPy 2.5 on.
         return np.ones(1)
     if origin is tuple and arguments[1:] != (...,):
         return tuple(sample_of(argument, what) for argument in arguments)

@@ -265,6 +265,7 @@ def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
     assert Record.load(tmp_path / "record.part").time[-1] == 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", [0, 5000])
 def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monkeypatch, capsys):
     """Room for so many bytes, and nowhere a file that is cut off."""
@@ -326,6 +327,7 @@ def test_a_terminal_without_letters_of_a_name(tmp_path):
     assert (out / "summary.txt").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux which ports listen")
 def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monkeypatch, capsys):
     def listening():

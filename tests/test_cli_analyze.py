@@ -68,6 +68,7 @@ def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
         assert found.least == pytest.approx(states.values[:, index].min(), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_joint_force_behind_an_actuation():
     """At rest the springs hold what rigid joints would: the same tau, against the same limits."""
     still = [
@@ -174,6 +175,7 @@ def test_times_that_do_not_suffice_are_told():
     assert told.to_dict()["resolved"] is False
 
 
+@pytest.mark.slow
 def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
     """2 + 5 sin 20 pi t over 10 s at 101 even times, all of them at its zeros."""
     monkeypatch.setattr(module, "SAMPLES", 101)
@@ -228,6 +230,7 @@ def test_a_violated_assumption_is_a_finding(capsys):
     assert "PROBLEM  Assumption (5): the control never acts on output 'tool.x'" in text
 
 
+@pytest.mark.slow
 def test_json(capsys):
     move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
     code, text = analyze(capsys, "two_link_motors", "--json", "--set", "duration=1")

@@ -153,6 +153,7 @@ def test_the_guide_has_the_order_of_the_paper() -> None:
     assert tuple(name.rstrip("/") for name in order.split()) == PAPER
 
 
+@pytest.mark.slow
 def test_the_house_is_drawn(tmp_path) -> None:
     draw(tmp_path / "house.png")
     assert (tmp_path / "house.png").stat().st_size > 50_000

@@ -1,6 +1,7 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
 from collections.abc import Sequence
+from math import isfinite
 
 import casadi as ca
 import numpy as np
@@ -10,7 +11,14 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import Linearization, are_dependent, newton, shortest_steps
+from drake_dae.trace.newton import (
+    ROUNDING,
+    Linearization,
+    are_dependent,
+    newton,
+    norm,
+    shortest_steps,
+)
 from drake_dae.trace.round_off import positive
 
 CONSISTENT = 1e-8
@@ -74,13 +82,12 @@ class Manifold:
 
         The arguments are those of `residual`.
         """
-        p = self.system.parameter_vector(parameters)
-        (residual,), (step,) = self._residual(state, p), self._newton(state, state, p)
-        reach = float(np.linalg.norm(step))
-        # A step of exactly zero with something left: no state changes it.
-        if np.isfinite(reach) and (reach > 0.0 or not residual.any()):
-            return bool(reach <= CONSISTENT * float(np.linalg.norm(state)) + FLOOR)
-        return bool(np.linalg.norm(residual) <= CONSISTENT)
+        x, p = self._state(state), self.system.parameter_vector(parameters)
+        reach = norm(self._newton.evaluate(x, x, p)[0])
+        if isfinite(reach) and reach > 0.0:
+            return reach <= CONSISTENT * norm(x) + FLOOR
+        # Gradients that depend on each other; or nothing is left, or what no state changes.
+        return self._residual_size(x, p) <= CONSISTENT
 
     def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """The consistent state next to a given one, to round-off, by Newton's method.
@@ -96,13 +103,10 @@ class Manifold:
             InconsistentStateError: Newton's method does not reach N* from there.
             ModelError: The state has a wrong shape.
         """
-        p = self.system.parameter_vector(parameters)
-        start = numbers(f"{self.system.name}: a state", state).reshape(-1)
-        if start.size != self.system.num_states:
-            raise ModelError(
-                f"{self.system.name}: a state has shape ({self.system.num_states},), got "
-                f"{start.shape}"
-            )
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        reach = norm(self._newton.evaluate(start, start, p)[0])
+        if 0.0 < reach <= ROUNDING or (reach == 0.0 and self._residual_size(start, p) == 0.0):
+            return start  # As in most steps of a simulation.
         found, converged = newton(start, lambda x: self._linearize(x, p))
         if not converged:
             # Gradients that depend on each other, or steps that mislead: least squares, downhill.
@@ -116,6 +120,18 @@ class Manifold:
         if converged and self._newton.evaluate(found, found, p)[0].any():
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
+
+    def _state(self, state: ArrayLike) -> FloatArray:
+        """A state as a new array; its numbers need not be finite."""
+        x = numbers(f"{self.system.name}: a state", state).reshape(-1)
+        if x.size != self.system.num_states:
+            raise ModelError(
+                f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
+            )
+        return x
+
+    def _residual_size(self, state: FloatArray, parameters: FloatArray) -> float:
+        return norm(self._residual.evaluate(state, parameters)[0])
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
         """Newton steps of least norm by the gradients at a state."""

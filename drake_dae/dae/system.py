@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from math import isfinite
 from types import SimpleNamespace
 from typing import Any, Self
 
@@ -273,10 +274,10 @@ class DaeSystem:
         if parameters is None:
             return self._defaults
         if (  # In each step of a simulation, so without a copy.
-            isinstance(parameters, np.ndarray)
+            type(parameters) is np.ndarray
             and parameters.dtype == np.float64
             and parameters.shape == self._defaults.shape
-            and np.isfinite(parameters).all()
+            and isfinite(parameters.dot(parameters))
         ):
             return parameters
         return vector(f"{self.name}: parameters", parameters, self._defaults.size)

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.simulation.plots import PLOTS
 
@@ -40,13 +41,15 @@ def run_folder(folder: Path) -> Iterator[None]:
     Raises:
         ModelError: The folder cannot be used; why.
     """
+    if "\0" in str(folder):
+        raise ModelError(f"no path holds a null byte, got {brief(str(folder))}")
     try:
         if folder.exists() and not folder.is_dir():
             raise ModelError(f"'{folder}' is a file; name a folder")
         lock = _prepare(folder)
     except ModelError:
         raise
-    except (OSError, ValueError) as error:  # A null byte in the path, text of another encoding.
+    except (OSError, ValueError) as error:  # The latter for text of another encoding.
         reason, path = getattr(error, "strerror", None) or error, getattr(error, "filename", None)
         where = f" ({path})" if path and Path(path) != folder else ""
         raise ModelError(f"cannot write to '{folder}': {reason}{where}") from None

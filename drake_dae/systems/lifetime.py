@@ -1,8 +1,10 @@
 """What lets Python free a LeafSystem that is written in Python, and with it what it holds."""
 
 from collections.abc import Callable
+from functools import partial
+from types import MethodType
 from typing import Any
-from weakref import ref
+from weakref import proxy
 
 SHARED_DICTIONARY: tuple[str, ...] = ()
 """The `__slots__` of classes below LeafSystem: instances have the dictionary of Drake's class.
@@ -23,9 +25,5 @@ def weakly(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
         method: Bound to its system.
         first: Its first arguments; Drake gives the others.
     """
-    owner, function = ref(method.__self__), method.__func__  # type: ignore[attr-defined]
-
-    def call(*others: Any) -> Any:
-        return function(owner(), *first, *others)
-
-    return call
+    weak = MethodType(method.__func__, proxy(method.__self__))  # type: ignore[attr-defined]
+    return partial(weak, *first) if first else weak

@@ -171,7 +171,10 @@ class DaePlant(ParameterizedSystem):
 
     def _calc_residual(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(
-            self.structure.manifold.residual(self.state(context), self.parameters(context))
+            self.structure.manifold.residual(
+                context.get_continuous_state_vector().CopyToVector(),
+                context.get_numeric_parameter(0).value(),
+            )
         )
 
     def _check_start(self, context: Context) -> EventStatus:
@@ -192,10 +195,11 @@ class DaePlant(ParameterizedSystem):
         )
 
     def _project(self, context: Context, state: State) -> EventStatus:
+        x = context.get_continuous_state_vector().CopyToVector()
         try:
-            x = self.structure.manifold.project(self.state(context), self.parameters(context))
+            x = self.structure.manifold.project(x, context.get_numeric_parameter(0).value())
         except InconsistentStateError as error:
-            time, x = context.get_time(), self.state(context)
+            time = context.get_time()
             raise SimulationError(
                 f"the state left the constraint too far at t = {time:.6g} s, state "
                 f"{show(x)}: {error}. Take smaller "

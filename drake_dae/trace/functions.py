@@ -125,9 +125,15 @@ class TracedFunction:
 
         Returns:
             The outputs. The arrays are overwritten by the next call: copy what must last.
+
+        Raises:
+            TypeError: The number of arguments is wrong.
         """
-        for own, given in zip(self._inputs, arguments, strict=True):
-            own[:] = given
+        if len(arguments) != len(self._inputs):
+            raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
+        # zip(..., strict=True) and [:] would take as long as the function.
+        for index, given in enumerate(arguments):
+            self._inputs[index][...] = given
         self._evaluate()
         return self._outputs
 
@@ -137,11 +143,9 @@ class TracedFunction:
         Raises:
             InvalidValueError: A value is not finite, or a matrix that must be regular is singular.
         """
-        for own, given in zip(self._inputs, arguments, strict=True):
-            own[:] = given
-        self._evaluate()
+        values = self.evaluate(*arguments)
         if isfinite(self._valid[0]):
-            return self._outputs
+            return values
         raise InvalidValueError(self._failure())
 
     @property

@@ -71,6 +71,7 @@ def test_margins_belong_to_their_states(problem):
     assert b.singular_value <= found * (1 + 1e-10)
 
 
+@pytest.mark.slow
 def test_the_gradients_of_all_chains(problem):
     """Theorem 2.1, from the chains that find_structure returns, by NumPy's rank."""
     analysis = analyze(problem.system, count=3)
@@ -303,6 +304,7 @@ def test_a_state_can_be_held():
     np.testing.assert_allclose(analysis.states[:, :2], [[0.48, -0.64]] * 51, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("region", [{"x": (1.0, 2.0)}, {"x": (0.5, 0.7), "y": (-0.3, -0.2)}])
 def test_a_region_without_consistent_states(region):
     """The rod is 0.8 m long."""
@@ -545,6 +547,7 @@ def test_text_is_aligned_and_not_too_wide(problem):
         assert row[rows[0].index("finding") :].split()[0] in map(str, Finding)
 
 
+@pytest.mark.slow
 def test_markdown_has_the_same_words(problem):
     analysis = analyze(problem.system, count=3)
     markdown = analysis._repr_markdown_()

@@ -23,6 +23,7 @@ def test_a_bad_input_is_refused_or_runs_with_a_reason(seed: int, tmp_path: Path)
     assert outcome.kind not in BAD, outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", each(FEW_ROBOTS, MANY_ROBOTS))
 def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Path):
     outcome = random_robots.attempt(seed, tmp_path)

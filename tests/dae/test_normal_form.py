@@ -169,6 +169,7 @@ def test_the_jacobian_is_singular_exactly_where_b_is():
         assert abs(determinant) == pytest.approx(3.0 * abs(rate), abs=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4, 8, 11])
 def test_systems_made_from_their_normal_form(seed):
     """With d > 0 and 4 to 6 coordinates bent by a polynomial: the inverse over a wider range."""

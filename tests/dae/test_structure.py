@@ -174,6 +174,7 @@ def test_units_do_not_matter(problem, seed):
     assert structure.control_margin.relative == pytest.approx(relative, rel=0.9)
 
 
+@pytest.mark.slow
 def test_a_mass_matrix_changes_nothing(problem):
     """(1) multiplied by a positive definite E(x) has the same A, alpha, beta, a, B and degrees."""
     system, random = problem.system, np.random.default_rng(0)

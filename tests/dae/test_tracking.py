@@ -104,6 +104,7 @@ def test_repeated_poles_in_closed_form():
     np.testing.assert_allclose(errors, polynomial * np.exp(-a * times), rtol=0, atol=2e-10)
 
 
+@pytest.mark.slow
 def test_error_coordinates_are_the_derivatives_of_the_outputs(problem):
     """e_i^(j) = L_f*^j l*_i - r_i^(j), against differences along the closed loop."""
     law = TrackingLaw(problem.system, poles(-3.0))
@@ -145,6 +146,7 @@ def test_control_by_hand():
     assert error == pytest.approx([0.5], rel=1e-15)
 
 
+@pytest.mark.slow
 def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
     """z - r by the model, with the control that the law chose."""
     law = TrackingLaw(problem.system, poles(-3.0))

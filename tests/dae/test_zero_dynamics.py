@@ -309,6 +309,7 @@ def test_margins_are_the_singular_values_of_a_and_b(problem):
         assert motion.constraint_margins[i] == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_shapes(problem):
     dynamics, times, motion = following(problem, 4)
     system, k = problem.system, times.size
@@ -320,6 +321,7 @@ def test_shapes(problem):
     assert len(dynamics.residual_signals) == system.num_states - dynamics.dimension
 
 
+@pytest.mark.slow
 def test_a_state_on_the_reference_from_a_guess_off_it(problem):
     dynamics = zero_dynamics(problem.system)
     guess = problem.consistent(np.random.default_rng(3)) + 0.01
@@ -509,6 +511,7 @@ def test_a_long_motion_does_not_drift(monkeypatch):
     np.testing.assert_allclose(found, expected[0], rtol=0, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_long_chains_do_not_drift_away(monkeypatch):
     """z^(4) = u and s' = z - s: an error of 1e-8 in z^(3) is one of 1e-8 t^3/6 in z, 0.7 here."""
     monkeypatch.setattr(module, "TOLERANCE", 1e-3)
@@ -839,6 +842,7 @@ def test_a_defective_zero_is_undecided():
     np.testing.assert_allclose(stability.eigenvalues, 0.0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_eigenvalues_do_not_depend_on_units():
     system = cart_pendulum(0.3)
     random = np.random.default_rng(0)

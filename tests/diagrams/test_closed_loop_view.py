@@ -71,6 +71,7 @@ def rotation(quaternion):
     return RotationMatrix(Quaternion(np.array([w, x, y, z]))).matrix()
 
 
+@pytest.mark.slow
 def test_every_link_moves_as_the_plant_does(shown):
     loop, record, page = shown
     tracks = animation(page)
@@ -343,6 +344,7 @@ def shown_at_rest(model, forces):
     return state, meshcat.StaticHtml()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "surface",
     [Saddle((1.2, 0.0, 0.0), 0.5), ImplicitSurface(lambda p: p[2] - p[0] ** 2, (1.2, 0.0, 0.0))],
@@ -384,6 +386,7 @@ def test_the_force_of_a_pin_is_drawn():
     assert f"/contact/{pin.name}/moment" not in [path for path, _ in tracks]
 
 
+@pytest.mark.slow
 def test_force_and_moment_of_a_weld_are_drawn():
     """In the axes of frame A, at the origin of frame B; the moment along its axis, two heads."""
     model = two_arms()

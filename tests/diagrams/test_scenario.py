@@ -181,6 +181,7 @@ def test_a_saved_scenario_reads_back_equal(name, tmp_path):
     assert copy != scenario
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_the_json_schema_holds_for_shipped_scenarios(name, tmp_path):
     """As they are written, and with all keys and tags."""
@@ -432,6 +433,7 @@ def test_build_leaves_the_scenario_alone():
     assert scenario == before
 
 
+@pytest.mark.slow
 def test_weld():
     """The shipped scenario is the model of tests/two_arms.py."""
     loop, _ = build_scenario(load_scenario(find_scenario("two_arms")))

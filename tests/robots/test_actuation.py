@@ -23,6 +23,7 @@ from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
 from drake_dae.robots.outputs import JointPositions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DEGREES)
 @pytest.mark.parametrize("name", ARMS)
 def test_dynamics_are_those_of_a_dense_solve(name, kind):

@@ -105,6 +105,7 @@ def push(context, forces, frame, point, force, moment=(0.0, 0.0, 0.0)):
     body.AddInForce(context, lever, SpatialForce(moment, force), plant.world_frame(), forces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_weld_measures_a_pose_and_its_rate_the_relative_velocity(first, second):
     """Anywhere, also far off the constraint: phi from Drake's angle and axis, and

@@ -215,6 +215,7 @@ def test_terms_are_those_of_the_plant(seed):
         assert_terms_agree(robot.plant, context, robot.terms, default_masses(robot.expressions))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_gravity_is_the_bias_at_rest(seed):
     """At rest H is gravity and springs, which Drake computes apart from the rest."""

@@ -98,6 +98,7 @@ def test_coordinates_that_there_are_not_are_refused(name):
         SURFACES[name].coordinates(ca.SX.sym("p", 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SURFACES)
 def test_any_surface_is_drawn_from_its_distance_alone(name):
     """As `Surface` does where a class has no shape of its own: around a point, on the surface."""
@@ -168,6 +169,7 @@ def test_a_torus_is_drawn_on_its_surface():
     np.testing.assert_allclose(distances, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", "sphere", "cylinder", "torus"])
 def test_distance_is_the_distance_to_the_nearest_point(name):
     """Against the nearest of a dense cloud of points on the surface."""
@@ -223,6 +225,7 @@ def test_refusals(make, message):
         make()
 
 
+@pytest.mark.slow
 def test_a_surface_without_points_is_not_drawn_and_says_so():
     with pytest.warns(UserWarning, match=r"ImplicitSurface: no point of it is found within 0\.4 m"):
         assert ImplicitSurface(lambda p: ca.sumsqr(p) + 1.0).picture([0.1, 0.0, 0.0], 0.4) is None

@@ -164,6 +164,7 @@ def test_saved_as_png(tmp_path):
         assert path.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_single_moment_can_be_drawn(tmp_path):
     """As a run leaves it that failed in its first step."""
     run, predicted = record()

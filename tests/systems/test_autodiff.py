@@ -133,12 +133,14 @@ def check_gradient(system, inputs, state=()):
         np.testing.assert_allclose(row, wanted, rtol=0, atol=GRADIENT * (1 + np.abs(wanted).max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANTS)
 def test_plants(name):
     plant, state, control = plant_of(name)
     check_gradient(plant, {"control": control}, state)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
 @pytest.mark.parametrize("name", PLANTS)
 def test_controllers(name):

@@ -48,6 +48,7 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", SYSTEMS.values(), ids=SYSTEMS)
 def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], LeafSystem]):
     system = make()

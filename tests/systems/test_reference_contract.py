@@ -70,6 +70,7 @@ def test_rule_3_each_derivative_is_that_of_the_one_before(reference):
         np.testing.assert_allclose(found[:, 1:], slope[:, :-1], rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_rule_3_what_the_law_integrates_is_continuous(reference):
     """Across 2 us, values and first derivatives change by less than their slopes allow."""
     for time in [*np.linspace(0.01, 1.99, 67).tolist(), 0.3, 1.0, 1.7]:

@@ -70,7 +70,7 @@ def test_wrong_arguments_are_refused_by_name():
         function(X[None], P)
     with pytest.raises(ModelError, match="test: 'x' has size 1, not 3"):
         function(1.0, P)
-    with pytest.raises(ValueError, match="argument"):
+    with pytest.raises(TypeError, match=r"test takes \('x', 'p'\), got 1 arguments"):
         function.evaluate(X)
 
 
