@@ -10,6 +10,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from io import TextIOWrapper
 from pathlib import Path
@@ -182,12 +183,26 @@ def _unused(name: str) -> Path:
             number += 1
 
 
+@dataclass
+class _Run:
+    """A run: what it is of, where it is written, and how it ended."""
+
+    loop: ClosedLoop
+    context: Context
+    scenario: Scenario
+    folder: Path
+    writer: RecordWriter
+    statistics: RunStatistics | None = None
+    failure: str = ""
+    pictures: bool = True
+
+
 def _run(loop: ClosedLoop, context: Context, scenario: Scenario, folder: Path) -> int:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
-    run, failure, pictures = None, "", True
     with RecordWriter(folder / PART, loop.record) as writer:
+        run = _Run(loop, context, scenario, folder, writer)
         try:
-            run = simulate(
+            run.statistics = simulate(
                 loop.diagram,
                 context,
                 scenario.duration,
@@ -196,52 +211,44 @@ def _run(loop: ClosedLoop, context: Context, scenario: Scenario, folder: Path) -
                 after_step=writer.update if scenario.write.record else None,
             )
         except DrakeDaeError as error:
-            failure = str(error)
+            run.failure = str(error)
             raise
         except KeyboardInterrupt:
-            failure, pictures = "interrupted in the middle of a step", False
+            run.failure, run.pictures = "interrupted in the middle of a step", False
             raise
         finally:
-            complete = _write(loop, context, scenario, folder, run, failure, pictures, writer)
-    if run.interrupted:
-        return 128 + run.interrupted
+            complete = _write(run)
+    if run.statistics.interrupted:
+        return 128 + run.statistics.interrupted
     return 0 if complete else 1
 
 
-def _write(
-    loop: ClosedLoop,
-    context: Context,
-    scenario: Scenario,
-    folder: Path,
-    run: RunStatistics | None,
-    failure: str,
-    pictures: bool,
-    writer: RecordWriter,
-) -> bool:
+def _write(run: _Run) -> bool:
     """Writes the files, prints the summary, and says whether all files are complete."""
+    loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
     # A signal that comes now does not stop before the record is written, but before the pictures.
     with ending_signals(ending := Ending()):
-        record = loop.record(context)
+        record = loop.record(run.context)
         if record.time.size == 0:
             return True
         predicted = loop.predicted_error(record)
         limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
-        text = summary(record, predicted, limits, run, failure)
-        if scenario.write.record:
+        text = summary(record, predicted, limits, run.statistics, run.failure)
+        if write.record:
             with _collected(problems):
-                _write_record(record, context, folder, writer)
+                _write_record(record, run)
         with _collected(problems), stage(folder, "summary.txt") as place:
             (place / "summary.txt").write_text(text + "\n", encoding="utf-8")
     try:
         if ending.signal is not None:
             end_at_once(ending.signal)
-        if scenario.write.plots and pictures:
+        if write.plots and run.pictures:
             with _collected(problems), stage(folder, *PLOTS) as place:
                 save_plots(record, predicted, limits.control, place)
-        if scenario.write.animation and pictures:
+        if write.animation and run.pictures:
             with _collected(problems), stage(folder, "animation.html") as place:
-                page = make_animation(loop, record, context)
+                page = make_animation(loop, record, run.context)
                 (place / "animation.html").write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PART) if (folder / name).exists()]
@@ -252,13 +259,14 @@ def _write(
     return not problems
 
 
-def _write_record(record: Record, context: Context, folder: Path, writer: RecordWriter) -> None:
+def _write_record(record: Record, run: _Run) -> None:
+    writer = run.writer
     try:
-        with stage(folder, "record.npz") as place:
+        with stage(run.folder, "record.npz") as place:
             record.save(place / "record.npz")
     except OSError as error:
         with suppress(OSError):
-            writer.finish(context)  # Rows that fit are kept.
+            writer.finish(run.context)  # Rows that fit are kept.
         with suppress(OSError, ModelError, IndexError):
             kept = Record.load(writer.path).time[-1]
             error.strerror = f"{error.strerror or error}; {PART} has the record up to {kept:.6g} s"
