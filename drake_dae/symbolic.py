@@ -57,8 +57,8 @@ def from_symbolic(
     state: Sequence[Variable],
     *,
     f: Any,
-    h: Any,
-    l: Any,  # noqa: E741 - the paper's letter
+    h: Any = None,
+    l: Any = None,  # noqa: E741 - the paper's letter
     g: Any = None,
     k: Any = None,
     m: Any = None,
@@ -73,7 +73,7 @@ def from_symbolic(
         state: The variables x, in order.
         f, g, h, k, l, m: The functions of (1)-(3): an Expression, Variable or number, or a list or
             array of these, of lists for a matrix, row by row. Without constraints leave out g, k
-            and m.
+            and m; without controls h; without controlled outputs l and m.
         parameters: Variable -> default.
         labels: The remaining fields of `DaeSystem`; the states are named as their variables.
 

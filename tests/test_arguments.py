@@ -138,6 +138,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.ReferenceGenerator: lambda: loop().reference,
     dd.RobotModel: lambda: arm("two_link").model,
     dd.Signal: lambda: dd.Signal("a"),
+    dd.ConstraintStructure: lambda: arm("two_link").structure,
     dd.Structure: lambda: arm("two_link").structure,
     dd.TrackingController: lambda: loop().controller,
     dd.TrackingLaw: lambda: law("two_link"),

@@ -21,12 +21,17 @@ from drake_dae.dae.states.margins import Margin, find_margin, is_regular
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import (
-    Constrained,
+    ConstraintStructure,
     check_system,
     constraint_violation,
     examine_constraints,
 )
-from drake_dae.dae.structure.structure import Structure, control_violation, examine_outputs
+from drake_dae.dae.structure.structure import (
+    Structure,
+    control_violation,
+    examine_outputs,
+    why_not_square,
+)
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
@@ -82,8 +87,8 @@ def analyze(
         InconsistentStateError: There is no consistent state in the region or around the nominal
             state, or given states are not consistent.
         ModelError: Arguments make no sense, such as a reference whose derivatives are not those of
-            its values; or the system has no controls, a function that is not finite, or a mass
-            matrix that is not symmetric and positive definite.
+            its values; or the system has a function that is not finite, or a mass matrix that
+            is not symmetric and positive definite.
     """
     if region is not None and states is not None:
         raise ModelError(f"{system.name}: give a region or states, not both")
@@ -102,7 +107,7 @@ def analyze(
     given = chosen.guesses[: chosen.num_given]
     try:
         check_system(system)
-        constrained = examine_constraints(system, chosen.guesses, chosen.region)
+        constrained, around = examine_constraints(system, chosen.guesses, chosen.region)
     except AssumptionError as error:
         where = chosen.describe(len(chosen.guesses), "state")
         tried = given if states is not None else chosen.guesses
@@ -115,13 +120,13 @@ def analyze(
             "another region",
             error.residual,
         ) from error
-    samples = constrained.samples
+    samples = around
     if states is not None:
         # Degrees are decided around them, too; margins are theirs alone.
-        samples = Samples(samples.manifold, given)
+        samples = Samples(around.manifold, given)
         check_consistent(samples.manifold, given, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
-    analysis = _examine(constrained, samples, where, search=states is None)
+    analysis = _examine(constrained, around, samples, where, search=states is None)
     if analysis.structure is None:
         return analysis
     dynamics = ZeroDynamics(system, structure=analysis.structure)
@@ -140,10 +145,12 @@ def analyze(
     return replace(analysis, motion=motion, zero_dynamics=stability)
 
 
-def _examine(constrained: Constrained, samples: Samples, where: str, search: bool) -> Analysis:
-    """All but the zero dynamics and the reference, with margins at given samples."""
+def _examine(
+    constrained: ConstraintStructure, around: Samples, samples: Samples, where: str, search: bool
+) -> Analysis:
+    """All but the zero dynamics and the reference: degrees at some samples, margins at others."""
     system, elimination = samples.system, constrained.elimination
-    known: dict[str, Any] = {"constraint_degrees": constrained.degrees}
+    known: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
     margins: dict[int, Margin] = {}
     violations: list[Violation] = []
     satisfied, regular = {1, 2, 3}, True
@@ -154,15 +161,18 @@ def _examine(constrained: Constrained, samples: Samples, where: str, search: boo
             satisfied.difference_update({violation.assumption, number})
         margins[violation.assumption if violation else number] = margin
 
-    if constrained.margin is not None:
+    if constrained.constraint_margin is not None:
         matrix = elimination.constraint_matrix
         margin = find_margin(samples, matrix, search=search)
-        constrained = replace(constrained, margin=margin)
-        judge(margin, constraint_violation(system, constrained.degrees, margin), 2)
+        constrained = replace(constrained, constraint_margin=margin)
+        judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
+        known["constraint_structure"] = constrained
+    without_law = why_not_square(system)
+    if regular and not without_law:
         try:
-            structure = examine_outputs(constrained)
+            structure = examine_outputs(constrained, around)
         except AssumptionError as error:
             violations.append(error.violation)
         else:
@@ -177,7 +187,7 @@ def _examine(constrained: Constrained, samples: Samples, where: str, search: boo
             }
             if is_regular(samples, matrix, structure.round_off):
                 known["structure"] = structure
-    assumptions = _assumptions(satisfied, violations, margins)
+    assumptions = _assumptions(satisfied, violations, margins, without_law)
     return Analysis(system, where, samples.states, assumptions, **known)
 
 
@@ -185,10 +195,11 @@ def _assumptions(
     satisfied: Container[int],
     violations: Sequence[Violation],
     margins: Mapping[int, Margin] | None = None,
+    not_examined: str = "",
 ) -> tuple[Assumption, ...]:
     """Assumptions (1)-(5); one that is neither satisfied nor violated was not examined."""
     violated = {violation.assumption: violation for violation in violations}
-    before = f"Assumption ({violations[0].assumption}) is violated" if violations else ""
+    before = f"Assumption ({violations[0].assumption}) is violated" if violations else not_examined
     result = []
     for number, statement in enumerate(STATEMENTS, start=1):
         if number in violated:

@@ -8,6 +8,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.assumptions import Violation
+from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
@@ -71,6 +72,8 @@ class Findings:
             Theorem 2.1; None also where there are no chains.
         zero_dynamics: Assumption 2.2, by linearization at an equilibrium.
         motion: The motion along the reference; None also without one.
+        constraint_structure: What the constraints alone decide, for `DaePlant`; None where A(x) is
+            singular at an examined state itself, or there are no degrees.
         structure: The structure, for laws and blocks; None where A(x) or B(x) is singular at an
             examined state itself. One that is singular only between them violates its assumption,
             no more.
@@ -85,6 +88,7 @@ class Findings:
     independence: Margin | None = None
     zero_dynamics: Stability | None = None
     motion: PinnedMotion | None = None
+    constraint_structure: ConstraintStructure | None = None
     structure: Structure | None = None
 
     @property

@@ -10,6 +10,7 @@ from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR, Margin
+from drake_dae.dae.structure.structure import why_not_square
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
@@ -23,6 +24,7 @@ def as_dict(findings: Findings) -> dict[str, Any]:
         "num_states": system.num_states,
         "num_constraints": system.num_constraints,
         "num_controls": system.num_controls,
+        "num_outputs": system.num_outputs,
         "states": [signal.name for signal in system.state_signals],
         "examined_at": findings.where,
         "constraint_degrees": _by_name(
@@ -66,6 +68,7 @@ def parts_of(findings: Findings) -> list[Part]:
         count_of(system.num_states, "state"),
         count_of(system.num_constraints, "constraint"),
         count_of(system.num_controls, "control"),
+        count_of(system.num_outputs, "controlled output"),
     )
     parts: list[Part] = [[f"{system.name}: {', '.join(counts)}", f"examined at {findings.where}"]]
     if system.num_constraints:
@@ -83,7 +86,8 @@ def parts_of(findings: Findings) -> list[Part]:
         ]
         for i, signal in enumerate(system.output_signals)
     ]
-    parts.append(Table(["output", "mu", "order in (15)"], rows))
+    if rows:
+        parts.append(Table(["output", "mu", "order in (15)"], rows))
     index, manifold, zero = (
         "?" if number is None else str(number)
         for number in (
@@ -92,7 +96,8 @@ def parts_of(findings: Findings) -> list[Part]:
             findings.zero_dynamics_dimension,
         )
     )
-    parts.append([f"index {index}, N* of dimension {manifold}, zero dynamics of dimension {zero}"])
+    dimensions = f"index {index}, N* of dimension {manifold}"
+    parts.append([f"{dimensions}, zero dynamics of dimension {zero}" if rows else dimensions])
     parts.append(_findings(findings))
     margins = [a.margin for a in findings.assumptions if a.margin] + [findings.independence]
     if any(margins):
@@ -137,16 +142,20 @@ def _findings(findings: Findings) -> Table:
 
 
 def _places(findings: Findings) -> list[Part]:
-    """Where the margins are smallest, and what the zero dynamics do."""
-    lines = []
-    found = findings.structure
-    if found is not None:
-        matrices = {2: found.elimination.constraint_matrix, 5: found.control_matrix}
-        lines = [
-            _nearest(findings, a.number, matrices[a.number], a.margin)
-            for a in findings.assumptions
-            if a.margin is not None and a.finding is Finding.SATISFIED
-        ]
+    """Where the margins are smallest, what the zero dynamics do, and why no more is known."""
+    matrices = {}
+    if findings.constraint_structure is not None:
+        matrices[2] = findings.constraint_structure.elimination.constraint_matrix
+    if findings.structure is not None:
+        matrices[5] = findings.structure.control_matrix
+    lines = [
+        _nearest(findings, a.number, matrices[a.number], a.margin)
+        for a in findings.assumptions
+        if a.margin is not None and a.finding is Finding.SATISFIED and a.number in matrices
+    ]
+    why = why_not_square(findings.system)
+    if why and findings.constraint_structure is not None:
+        lines.append(f"Not more was examined: {why}.")
     zero = findings.zero_dynamics
     if zero is not None and zero.eigenvalues.size:
         lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")

@@ -60,7 +60,8 @@ def as_functions(
     """
     values = {key: as_expression(owner, key, value) for key, value in given.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
-    shapes = {"f": (n, 1), "g": (n, m), "h": (n, p), "k": (m, 1), "l": (p, 1), "m": (p, m)}
+    q = values["l"].numel()
+    shapes = {"f": (n, 1), "g": (n, m), "h": (n, p), "k": (m, 1), "l": (q, 1), "m": (q, m)}
     shapes["mass_matrix"] = (n, n)
     known = ca.vertcat(state, parameters)
     if len(ca.symvar(known)) != known.numel():
@@ -72,7 +73,7 @@ def as_functions(
         if value.shape != shape and value.shape == shape[::-1] and 1 in shape:
             value = value.T
         if value.shape != shape:
-            raise ModelError(f"{owner}: {_misshapen(key, value, shape, (n, m, p))}")
+            raise ModelError(f"{owner}: {_misshapen(key, value, shape, (n, m, p, q))}")
         unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(known, s)]
         if unknown:
             raise ModelError(
@@ -84,18 +85,15 @@ def as_functions(
     return values
 
 
-def _misshapen(key: str, value: ca.SX, shape: tuple[int, int], sizes: tuple[int, int, int]) -> str:
-    n, m, p = sizes
+def _misshapen(
+    key: str, value: ca.SX, shape: tuple[int, int], sizes: tuple[int, int, int, int]
+) -> str:
+    n, m, p, q = sizes
     if value.numel() == 0 and m and key in "gm":
         return f"k is given, so g and m are needed; {key} is missing, with shape {shape}"
-    hint = ""
-    if key in "lm":
-        hint = (
-            " (as many controlled outputs as controls: the law (28) inverts B(x), which is p x p)"
-        )
     return (
         f"{key} has shape {value.shape}, expected {shape} for n = {n} states, m = {m} constraints, "
-        f"p = {p} controls{hint}"
+        f"p = {p} controls, {q} controlled outputs"
     )
 
 

@@ -37,9 +37,10 @@ class DaeSystem:
         state: The symbols x, shape (n, 1).
         f: The drift, shape (n, 1).
         g: How the constraint inputs v enter, shape (n, m).
-        h: How the control inputs u enter, shape (n, p).
+        h: How the control inputs u enter, shape (n, p); p = 0 is a system that nobody steers.
         k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
-        l: The controlled outputs at v = 0, shape (p, 1).
+        l: The controlled outputs z at v = 0, as many as the controls for a law (28), shape (p, 1);
+            a system that is only simulated may have others, or none.
         m: How v enters the controlled outputs, shape (p, m).
         parameters: Named numbers that the expressions depend on.
         state_signals, constraint_input_signals, control_signals, constraint_output_signals,
@@ -105,7 +106,7 @@ class DaeSystem:
             ("constraint_input_signals", self.num_constraints, "v"),
             ("constraint_output_signals", self.num_constraints, "y"),
             ("control_signals", self.num_controls, "u"),
-            ("output_signals", self.num_controls, "z"),
+            ("output_signals", self.num_outputs, "z"),
         ):
             labels = getattr(self, key) or [f"{letter}{i}" for i in range(count)]
             signals = as_signals(f"{self.name}: {key}", labels)
@@ -133,8 +134,8 @@ class DaeSystem:
         state: Sequence[Signal | str] | int,
         *,
         f: Callable[..., Any],
-        h: Callable[..., Any],
-        l: Callable[..., Any],  # noqa: E741
+        h: Callable[..., Any] | None = None,
+        l: Callable[..., Any] | None = None,  # noqa: E741
         g: Callable[..., Any] | None = None,
         k: Callable[..., Any] | None = None,
         m: Callable[..., Any] | None = None,
@@ -150,7 +151,8 @@ class DaeSystem:
 
         Args:
             state: Names (or Signals) of the states, or their number n.
-            f, g, h, k, l, m: The functions of (1)-(3). Without constraints leave out g, k and m.
+            f, g, h, k, l, m: The functions of (1)-(3). Without constraints leave out g, k and m;
+                without controls h; without controlled outputs l and m.
             parameters: Name -> default; a name must be a Python identifier.
             labels: The remaining fields of the class.
 
@@ -222,8 +224,13 @@ class DaeSystem:
 
     @property
     def num_controls(self) -> int:
-        """p, the number of controls and of controlled outputs."""
+        """p, the number of controls."""
         return int(self.h.shape[1])
+
+    @property
+    def num_outputs(self) -> int:
+        """The number of controlled outputs; that of the controls where there is a law (28)."""
+        return int(self.l.numel())
 
     @property
     def parameter_symbol(self) -> ca.SX:

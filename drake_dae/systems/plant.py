@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.structure.structure import Structure, structure_of
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.systems.block import (
@@ -35,6 +35,9 @@ class DaePlant(ParameterizedSystem):
     start of the next step, so a log or a monitor sees it before its projection;
     `Simulator.AdvancePendingEvents()` projects the last state of a run.
 
+    Assumptions (1)-(3) are all it asks for: there may be no controls, no controlled outputs, other
+    numbers of them, or outputs that the control does not reach. A port of size 0 needs no wire.
+
     Input port:
         control: u, shape (p,).
 
@@ -43,7 +46,8 @@ class DaePlant(ParameterizedSystem):
         constraint_force: v, shape (m,); direct feedthrough from `control` where beta is not zero.
         constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, constraint-major, shape
             (sum r_i,); zero on N*.
-        controlled_output: z, shape (p,); direct feedthrough where n* = m beta is not zero.
+        controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
+            zero.
 
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
     The default state is the consistent one next to `system.nominal_state`.
@@ -53,11 +57,12 @@ class DaePlant(ParameterizedSystem):
 
     Args:
         system: The system (1)-(3).
-        structure: The structure of the system; found if None.
+        structure: The structure of the system, by `find_constraint_structure` or
+            `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
 
     Raises:
-        AssumptionError: The system violates an assumption of the theory.
+        AssumptionError: The system violates one of Assumptions (1)-(3).
         ModelError: This is no system, or the structure is that of another one.
         InconsistentStateError: A simulation starts from a state that is off N*.
         SingularityError: A(x) is singular on the way; the exception has time and state.
@@ -68,9 +73,13 @@ class DaePlant(ParameterizedSystem):
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
-        self, system: DaeSystem, *, structure: Structure | None = None, project: bool = True
+        self,
+        system: DaeSystem,
+        *,
+        structure: ConstraintStructure | None = None,
+        project: bool = True,
     ) -> None:
-        structure = structure_of("DaePlant", system, structure)
+        structure = constraint_structure_of("DaePlant", system, structure)
         signals = {"state": system.state_signals, "control": system.control_signals}
         super().__init__(system, system.parameter_values, signals)
         self.structure = structure
@@ -80,7 +89,9 @@ class DaePlant(ParameterizedSystem):
         output = system.l + ca.mtimes(system.m, force)
         self._force_needs_control = elimination.beta.nnz() > 0
         self._output_needs_control = elimination.n_star.nnz() > 0
-        self.dynamics = structure.trace("dynamics", derivatives.expand(derivatives.rate), True)
+        self._is_controlled = system.num_controls > 0
+        rate = derivatives.expand(derivatives.rate)
+        self.dynamics = structure.trace("dynamics", rate, self._is_controlled)
         self._force = structure.trace("constraint force", force, self._force_needs_control)
         self._output = structure.trace("controlled output", output, self._output_needs_control)
 
@@ -105,7 +116,7 @@ class DaePlant(ParameterizedSystem):
         )
         self.DeclareVectorOutputPort(
             "controlled_output",
-            system.num_controls,
+            system.num_outputs,
             weakly(self._calc_output),
             by_control if self._output_needs_control else by_state,
         )
@@ -139,7 +150,7 @@ class DaePlant(ParameterizedSystem):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         derivatives.get_mutable_vector().SetFromVector(
-            self._evaluate(self.dynamics, context, needs_control=True)
+            self._evaluate(self.dynamics, context, self._is_controlled)
         )
 
     def _evaluate(

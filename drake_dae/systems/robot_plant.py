@@ -3,7 +3,7 @@
 from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.arguments import checked
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
@@ -35,7 +35,11 @@ class RobotPlant(DaePlant):
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
-        self, model: RobotModel, *, structure: Structure | None = None, project: bool = True
+        self,
+        model: RobotModel,
+        *,
+        structure: ConstraintStructure | None = None,
+        project: bool = True,
     ) -> None:
         super().__init__(model.dae, structure=structure, project=project)
         self.model = model

@@ -449,8 +449,6 @@ def test_given_states_must_be_in_the_domain():
 
 
 def test_systems_that_are_not_well_formed():
-    with pytest.raises(ModelError, match="no control inputs"):
-        analyze(system_of(1, f=lambda x: 0, h=lambda x: ca.SX(1, 0), l=lambda x: ca.SX(0, 1)))
     pendulum = PROBLEMS["pendulum"]().system
     with pytest.raises(InconsistentStateError, match="no consistent state found near"):
         analyze(changed(pendulum, k=pendulum.k + 1.0))  # x^2 + y^2 = 0.64 - 2

@@ -3,6 +3,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from problems import (
     PROBLEMS,
     changed,
@@ -14,9 +15,11 @@ from problems import (
     system_of,
 )
 
+from drake_dae.analysis.analyze import analyze
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure import relative_degrees
+from drake_dae.dae.structure.constrained import find_constraint_structure
 from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
@@ -734,11 +737,53 @@ def test_infinite_matrices_are_no_singularity():
     assert structure.output_degrees == (1,)
 
 
-def test_no_controls():
-    with pytest.raises(ModelError, match="no control inputs"):
-        find_structure(
-            system_of(1, f=lambda x: 0, h=lambda x: ca.SX(1, 0), l=lambda x: ca.SX(0, 1))
+def test_a_law_needs_as_many_outputs_as_controls():
+    with pytest.raises(ModelError, match="no control input, so there is nothing to steer"):
+        find_structure(system_of(1, f=lambda x: 0))
+    for outputs, l in ((0, None), (2, lambda x: x[:2])):  # noqa: E741
+        system = system_of(3, f=lambda x: 0 * x, h=lambda x: [1, 0, 0], l=l)
+        with pytest.raises(ModelError, match=f"{outputs} controlled outputs and 1 controls; the"):
+            find_structure(system)
+
+
+def test_constraints_alone_decide_how_a_system_moves():
+    """The same degrees, A(x) and rate as with outputs; B(x) may be singular, or not square."""
+    x = ca.SX.sym("x", 4)
+    pendulum = {
+        "state": x,
+        "f": ca.vertcat(x[2], x[3], 0, -9.81),
+        "g": ca.vertcat(0, 0, x[0], x[1]),
+        "k": (ca.sumsqr(x[:2]) - 1) / 2,
+        "nominal_state": [1.0, 0.0, 0.0, 0.0],
+    }
+    h = ca.vertcat(0, 0, -x[1], x[0])
+    whole = find_structure(DaeSystem(**pendulum, h=h, l=x[0] * x[3] - x[1] * x[2], m=[0]))
+    others = {
+        "nothing": {"h": ca.SX(4, 0), "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
+        "control alone": {"h": h, "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
+        "the constraint as an output": {"h": h, "l": ca.sumsqr(x[:2]), "m": [0]},
+        "two outputs": {"h": h, "l": x[:2], "m": [[0], [1]]},
+    }
+    state = whole.manifold.project([0.6, 0.8, 0.4, -0.3])
+    for name, fields in others.items():
+        found = find_constraint_structure(DaeSystem(**pendulum, **fields))
+        assert (found.constraint_degrees, found.index) == ((2,), 3), name
+        elimination = found.elimination
+        values = found.system.trace("values", {"f": elimination.f_star, "v": elimination.alpha})
+        expected = whole.system.trace(
+            "values", {"f": whole.elimination.f_star, "v": whole.elimination.alpha}
         )
+        for one, other in zip(values(state, []), expected(state, []), strict=True):
+            assert_allclose(one, other, atol=1e-14)  # The same operations.
+    analysis = analyze(DaeSystem(**pendulum, **others["nothing"]))
+    assert [str(a.finding) for a in analysis.assumptions] == ["satisfied"] * 3 + [
+        "not examined"
+    ] * 2
+    assert (
+        analysis.assumptions[3].reason == "there is no control input, so there is nothing to steer"
+    )
+    assert analysis.constraint_structure.constraint_degrees == (2,)
+    assert not analysis.problems
 
 
 def test_parameters_take_part_with_their_defaults():

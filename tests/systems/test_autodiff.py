@@ -145,7 +145,7 @@ def test_plants(name):
 @pytest.mark.parametrize("name", PLANTS)
 def test_controllers(name):
     plant, state, _ = plant_of(name)
-    system = TrackingController(TrackingLaw(plant.dae, poles(-3.0), structure=plant.structure))
+    system = TrackingController(TrackingLaw(plant.dae, poles(-3.0)))
     reference = np.random.default_rng(3).standard_normal(len(system.law.reference_signals))
     inputs = {"estimated_state": state, "reference": reference}
     check_gradient(system, inputs)

@@ -205,3 +205,62 @@ def test_parameters_that_make_no_sense_are_refused():
 def test_what_is_no_system_is_refused():
     with pytest.raises(ModelError, match="DaePlant: system must be a DaeSystem, got None"):
         DaePlant(None)
+
+
+def pendulum(**fields):
+    """A mass on a rod of length 1 in Cartesian coordinates, without control or outputs."""
+    given = {
+        "f": lambda x: [x[2], x[3], 0, -9.81],
+        "g": lambda x: [[0], [0], [x[0]], [x[1]]],
+        "k": lambda x: (x[0] ** 2 + x[1] ** 2 - 1) / 2,
+        "nominal_state": [1.0, 0.0, 0.0, 0.0],
+        "name": "pendulum",
+    }
+    return DaeSystem.from_functions(["x", "y", "vx", "vy"], **(given | fields))
+
+
+def test_a_mechanism_that_nobody_steers_keeps_its_energy():
+    """Over 10 s to 1e-10, its residual to round-off, and the multiplier is that of the pendulum.
+
+    The energy is 9.81 J/kg at most; accuracy 1e-12 of a fifth-order method in 10 s leaves some
+    1e-11 of it. v = g y - |velocity|^2 on the circle of radius 1.
+    """
+    plant = DaePlant(pendulum())
+    simulator = Simulator(plant)
+    config = error_controlled(1e-12)
+    config.integration_scheme = "runge_kutta5"
+    ApplySimulatorConfig(config, simulator)
+    simulator.AdvanceTo(10.0)
+    simulator.AdvancePendingEvents()
+    context = simulator.get_context()
+    _, y, vx, vy = plant.state(context)
+    assert abs((vx**2 + vy**2) / 2 + 9.81 * y) < 1e-10
+    assert np.max(np.abs(plant.GetOutputPort("constraint_residual").Eval(context))) < 1e-12
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    np.testing.assert_allclose(force, [9.81 * y - vx**2 - vy**2], rtol=1e-12)
+    assert plant.GetOutputPort("controlled_output").Eval(context).size == 0
+    converted = plant.ToAutoDiffXd()
+    rate = converted.EvalTimeDerivatives(converted.CreateDefaultContext()).get_vector()
+    assert rate.size() == 4
+
+
+def test_outputs_that_no_law_could_steer_are_simulated():
+    """B(x) is singular, or not square: z = (the constraint, the tension) with one control."""
+    plant = DaePlant(
+        pendulum(
+            h=lambda x: [0, 0, -x[1], x[0]],
+            l=lambda x: [x[0] ** 2 + x[1] ** 2, 0],
+            m=lambda x: [[0], [1]],
+        )
+    )
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [2.0])
+    plant.set_consistent_state(context, [0.6, 0.8, 0.4, -0.3])
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    np.testing.assert_allclose(
+        plant.GetOutputPort("controlled_output").Eval(context), [1.0, force[0]], rtol=1e-14
+    )
+    control = plant.GetInputPort("control").get_index()
+    assert plant.HasDirectFeedthrough(
+        control, plant.GetOutputPort("controlled_output").get_index()
+    ) == (plant.HasDirectFeedthrough(control, plant.GetOutputPort("constraint_force").get_index()))

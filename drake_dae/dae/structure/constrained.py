@@ -1,52 +1,169 @@
 """What the constraints alone decide of a system: Assumptions (1)-(3), N*, and (9)-(14)."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.region import Region
-from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
-from drake_dae.dae.structure.relative_degrees import constraint_chains
+from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
+from drake_dae.trace.functions import TracedFunction
 
 
-@dataclass(frozen=True, eq=False)
-class Constrained:
-    """What the constraints alone decide of a system, by Assumptions (1) and (3).
+@checked(ModelError)
+@dataclass(frozen=True, eq=False, repr=False)
+class ConstraintStructure:
+    """What the constraints alone decide of a system, by Assumptions (1)-(3): how it moves.
+
+    Simulation needs no more: neither controls nor controlled outputs.
 
     Attributes:
-        degrees: r_1, ..., r_m.
-        samples: The consistent states at which numbers are decided.
+        system: The system.
+        constraint_degrees: r_1, ..., r_m.
+        manifold: N* (4).
         derivatives: The time derivatives along the motion on N*.
         elimination: Equations (9)-(14) as expressions; not finite where A(x) is singular.
-        margin: The margin of A(x); None without constraints.
+        states: The consistent states at which numbers were decided, shape (samples, n).
+        constraint_margin: The margin of A(x), Assumption (2); None without constraints.
     """
 
-    degrees: tuple[int, ...]
-    samples: Samples
+    system: DaeSystem
+    constraint_degrees: tuple[int, ...]
+    manifold: Manifold
     derivatives: Derivatives
     elimination: Elimination
-    margin: Margin | None
+    states: FloatArray
+    constraint_margin: Margin | None
+
+    def __repr__(self) -> str:
+        degrees = f"r={self.constraint_degrees}, index={self.index}"
+        return f"ConstraintStructure({self.system.name!r}, {degrees})"
+
+    @property
+    def index(self) -> int:
+        """max r_i + 1, the index of the DAE; 0 without constraints."""
+        return max(self.constraint_degrees) + 1 if self.constraint_degrees else 0
+
+    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
+        """An expression on N* as a function of state, control and parameters.
+
+        Args:
+            name: What it is, for messages.
+            value: An expression of the state and of the control `derivatives.control`.
+            needs_control: Whether the function takes the control; without one it is put to 0.
+
+        Returns:
+            A function with the output "value", and with A(x) as the matrix that must be regular.
+        """
+        control = self.derivatives.control
+        inputs = {"control": control}
+        if not needs_control:
+            value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(control.numel()))
+        pivot = self.elimination.pivot
+        return self.system.trace(name, {"value": value}, inputs, pivot, "A(x) of Assumption (2)")
+
+
+@checked(ModelError)
+def find_constraint_structure(
+    system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
+) -> ConstraintStructure:
+    """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3).
+
+    Args:
+        system: The system (1)-(3); it may be without controls and outputs, and B(x) singular.
+        spread, count, seed: How states are drawn, as for `find_structure`.
+
+    Raises:
+        AssumptionError: One of Assumptions (1)-(3) is violated; the exception has the state where.
+        InconsistentStateError: There is no consistent state near the nominal one.
+        ModelError: A function is not finite at the nominal state, the mass matrix is not symmetric
+            and positive definite, or count or spread make no sense.
+    """
+    found, samples = examine_constraints(system, guesses(system, spread, count, seed))
+    violation = constraint_violation(found)
+    if violation:
+        raise violation.error()
+    # Rows of n* that are zero but for round-off are no feedthrough.
+    _, n_star = eliminated_at(samples, found.elimination)
+    acts = np.any([value for value, _ in n_star], axis=(0, 2))
+    rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
+    feedthrough = ca.sparsify(ca.mtimes(rows, found.elimination.n_star))
+    return replace(found, elimination=replace(found.elimination, n_star=feedthrough))
+
+
+def constraint_structure_of(
+    owner: str, system: DaeSystem, structure: ConstraintStructure | None
+) -> ConstraintStructure:
+    """The constraint structure of a system, as given, or found where it is not known yet.
+
+    Args:
+        owner: Who needs it, for messages.
+        system: The system (1)-(3).
+        structure: The structure, or that with the outputs; None to find it.
+
+    Raises:
+        AssumptionError, InconsistentStateError: There is none; see `find_constraint_structure`.
+        ModelError: The structure is none, or that of another system.
+    """
+    if structure is None:
+        return find_constraint_structure(system)
+    if not isinstance(structure, ConstraintStructure):
+        raise ModelError(
+            f"{owner}: structure must be what find_structure or find_constraint_structure returns, "
+            f"got {type(structure).__name__}"
+        )
+    check_same_system(owner, system, structure)
+    return structure
+
+
+def check_same_system(owner: str, system: DaeSystem, structure: ConstraintStructure) -> None:
+    """Refuses the structure of another system.
+
+    Raises:
+        ModelError: It is.
+    """
+    if structure.system is not system:
+        raise ModelError(
+            f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
+            f"'{system.name}'; leave it out, or find that of this one"
+        )
+
+
+def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
+    """The states near which consistent ones are sought, shape (count + 1, n).
+
+    Raises:
+        AssumptionError, ModelError: The system or an argument makes no sense.
+    """
+    check_system(system)
+    check_whole_number(f"{system.name}: count", count, 1)
+    check_whole_number(f"{system.name}: seed", seed, 0)
+    return draw(system, spread, count, seed)
 
 
 def examine_constraints(
     system: DaeSystem, guesses: FloatArray, region: Region | None = None
-) -> Constrained:
+) -> tuple[ConstraintStructure, Samples]:
     """Finds r_1, ..., r_m and A(x) of a system that `check_system` takes.
 
     Args:
         system: The system (1)-(3).
         guesses: States near which consistent ones are sought, shape (count, n).
         region: Where the consistent states must be; None for anywhere.
+
+    Returns:
+        The structure, and the consistent states with the numbers at them.
 
     Raises:
         AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
@@ -59,33 +176,36 @@ def examine_constraints(
     _check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
-    margin = find_margin(samples, elimination.constraint_matrix) if chains else None
-    degrees = tuple(len(chain) for chain in chains)
-    return Constrained(degrees, samples, derivatives, elimination, margin)
+    found = ConstraintStructure(
+        system=system,
+        constraint_degrees=tuple(len(chain) for chain in chains),
+        manifold=samples.manifold,
+        derivatives=derivatives,
+        elimination=elimination,
+        states=samples.states,
+        constraint_margin=(find_margin(samples, elimination.constraint_matrix) if chains else None),
+    )
+    return found, samples
 
 
 def check_system(system: DaeSystem) -> None:
-    """Refuses a system in which there is nothing to steer, or too much to keep.
+    """Refuses a system in which there is too much to keep, or no mass matrix.
 
     Raises:
         AssumptionError: There are more constraints than states.
-        ModelError: There is no control input, or the mass matrix is not symmetric and positive
-            definite.
+        ModelError: The mass matrix is not symmetric and positive definite.
     """
-    if system.num_controls == 0:
-        raise ModelError(f"{system.name}: no control inputs, so there is nothing to steer")
     _check_mass_matrix(system, system.nominal_state[None])
     if system.num_constraints > system.num_states:
         names = tuple(signal.name for signal in system.constraint_output_signals)
         raise Violation(2, Cause.COUNT, names).error()
 
 
-def constraint_violation(
-    system: DaeSystem, degrees: Sequence[int], margin: Margin | None
-) -> Violation | None:
+def constraint_violation(found: ConstraintStructure) -> Violation | None:
     """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
     causes = ((1, Cause.CONSTRAINT_DEGREE), (2, Cause.CONSTRAINT_RANK))
-    return rank_violation(margin, system.constraint_output_signals, degrees, *causes)
+    signals, degrees = found.system.constraint_output_signals, found.constraint_degrees
+    return rank_violation(found.constraint_margin, signals, degrees, *causes)
 
 
 def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:

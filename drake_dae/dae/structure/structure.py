@@ -1,46 +1,38 @@
 """What kind of system it is: relative degrees, index, Assumptions (1)-(5) with their margins."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import casadi as ca
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import Booleans, FloatArray, check_whole_number
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination
+from drake_dae.arrays import Booleans
 from drake_dae.dae.layout import Layout
-from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.margins import Margin, find_margin
-from drake_dae.dae.states.samples import draw
+from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.structure.constrained import (
-    Constrained,
-    check_system,
+    ConstraintStructure,
+    check_same_system,
     constraint_violation,
     examine_constraints,
+    guesses,
 )
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization
-from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
-class Structure:
-    """The structure that the paper assumes, found for one system.
+class Structure(ConstraintStructure):
+    """The structure that the paper assumes, by Assumptions (1)-(5), found for one system.
 
     Attributes:
-        system: The system.
-        constraint_degrees: r_1, ..., r_m.
         output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
             enters the output at once (the paper's outputs s + 1, ..., p).
-        manifold: N* (4).
-        derivatives: The time derivatives along the motion on N*.
-        elimination: Equations (9)-(14) as expressions.
         output_chains: The chain l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output.
         highest_derivatives: z_i^(mu_i) in terms of the unknowns of `derivatives`, shape (p, 1).
         drift: a(x) of (28), L_f*^mu_i l*_i in the order of the outputs, shape (p, 1).
@@ -48,25 +40,16 @@ class Structure:
         chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
         round_off: Which entries of B(x) are zero but for round-off at all of many states, shape
             (p, p). A column of nothing else would be scaled up to the size of the others.
-        states: The consistent states at which numbers were decided, shape (samples, n).
-        constraint_margin: The margin of A(x), Assumption (2); None without constraints.
         control_margin: The margin of B(x), Assumption (5).
     """
 
-    system: DaeSystem
-    constraint_degrees: tuple[int, ...]
     output_degrees: tuple[int, ...]
-    manifold: Manifold
-    derivatives: Derivatives
-    elimination: Elimination
     output_chains: tuple[tuple[ca.SX, ...], ...]
     highest_derivatives: ca.SX
     drift: ca.SX
     control_matrix: ca.SX
     chains_need_force: bool
     round_off: Booleans
-    states: FloatArray
-    constraint_margin: Margin | None
     control_margin: Margin
 
     def __repr__(self) -> str:
@@ -82,11 +65,6 @@ class Structure:
     def output_order(self) -> tuple[int, ...]:
         """The outputs in the paper's order (15): those with mu_i >= 1 first."""
         return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))
-
-    @property
-    def index(self) -> int:
-        """max r_i + 1, the index of the DAE; 0 without constraints."""
-        return max(self.constraint_degrees) + 1 if self.constraint_degrees else 0
 
     @property
     def num_dynamic_outputs(self) -> int:
@@ -121,24 +99,6 @@ class Structure:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot
 
-    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
-        """An expression on N* as a function of state, control and parameters.
-
-        Args:
-            name: What it is, for messages.
-            value: An expression of the state and of the control `derivatives.control`.
-            needs_control: Whether the function takes the control; without one it is put to 0.
-
-        Returns:
-            A function with the output "value", and with A(x) as the matrix that must be regular.
-        """
-        control = self.derivatives.control
-        inputs = {"control": control}
-        if not needs_control:
-            value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(control.numel()))
-        pivot = self.elimination.pivot
-        return self.system.trace(name, {"value": value}, inputs, pivot, "A(x) of Assumption (2)")
-
 
 @checked(ModelError)
 def find_structure(
@@ -159,8 +119,9 @@ def find_structure(
     Raises:
         AssumptionError: An assumption is violated; the exception has the state where.
         InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: There is no control input, a function is not finite at the nominal state, the
-            mass matrix is not symmetric and positive definite, or count or spread make no sense.
+        ModelError: The outputs are not as many as the controls, or there are none, a function is
+            not finite at the nominal state, the mass matrix is not symmetric and positive definite,
+            or count or spread make no sense.
     """
     structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
     if violation:
@@ -187,11 +148,7 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
             f"{owner}: structure must be what find_structure returns, got "
             f"{type(structure).__name__}"
         )
-    if structure.system is not system:
-        raise ModelError(
-            f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
-            f"'{system.name}'; leave it out, or pass find_structure of this one"
-        )
+    check_same_system(owner, system, structure)
     return structure
 
 
@@ -208,19 +165,36 @@ def examine_structure(
             output has no degree.
         InconsistentStateError, ModelError: There is no structure to find; see `find_structure`.
     """
-    check_system(system)
-    check_whole_number(f"{system.name}: count", count, 1)
-    check_whole_number(f"{system.name}: seed", seed, 0)
-    constrained = examine_constraints(system, draw(system, spread, count, seed))
-    violation = constraint_violation(system, constrained.degrees, constrained.margin)
+    _check_square(system)
+    constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
+    violation = constraint_violation(constrained)
     if violation:
         raise violation.error()
-    structure = examine_outputs(constrained)
+    structure = examine_outputs(constrained, samples)
     degrees, margin = structure.output_degrees, structure.control_margin
     return structure, control_violation(system, degrees, margin)
 
 
-def examine_outputs(constrained: Constrained) -> Structure:
+def why_not_square(system: DaeSystem) -> str:
+    """Why there is no law (28) for a system, by counting alone; empty if there may be one."""
+    p, q = system.num_controls, system.num_outputs
+    if p == 0:
+        return "there is no control input, so there is nothing to steer"
+    if p != q:
+        return (
+            f"there are {q} controlled outputs and {p} controls; the law (28) inverts B(x), so it "
+            "needs as many outputs as controls"
+        )
+    return ""
+
+
+def _check_square(system: DaeSystem) -> None:
+    why = why_not_square(system)
+    if why:
+        raise ModelError(f"{system.name}: {why}. To simulate it, `DaePlant` needs neither")
+
+
+def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
     """Finds mu_1, ..., mu_p and B(x), where A(x) is regular.
 
     Raises:
@@ -228,7 +202,7 @@ def examine_outputs(constrained: Constrained) -> Structure:
             B(x) is left to `control_violation`.
         ModelError: A function is not finite.
     """
-    samples, elimination = constrained.samples, constrained.elimination
+    elimination = constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)
     degrees = tuple(len(chain) for chain in outputs.chains)
     # Rows of n* that are zero but for round-off are no feedthrough.
@@ -236,21 +210,17 @@ def examine_outputs(constrained: Constrained) -> Structure:
         ca.SX(1, samples.system.num_controls) if degree else elimination.n_star[i, :]
         for i, degree in enumerate(degrees)
     ]
+    known = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
+    known["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
     return Structure(
-        system=samples.system,
-        constraint_degrees=constrained.degrees,
+        **known,
         output_degrees=degrees,
-        manifold=samples.manifold,
-        derivatives=constrained.derivatives,
-        elimination=replace(elimination, n_star=ca.vertcat(*n_star)),
         output_chains=outputs.chains,
         highest_derivatives=outputs.highest_derivatives,
         drift=outputs.drift,
         control_matrix=outputs.control_matrix,
         chains_need_force=outputs.need_force,
         round_off=outputs.round_off,
-        states=samples.states,
-        constraint_margin=constrained.margin,
         control_margin=find_margin(samples, outputs.control_matrix, outputs.round_off),
     )
 
