@@ -18,6 +18,7 @@ from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import add_live_view
+from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
@@ -41,6 +42,7 @@ class ClosedLoop:
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
+        exogenous: The generator of the exogenous signals for the law, or None.
     """
 
     diagram: Diagram
@@ -51,6 +53,7 @@ class ClosedLoop:
     scene_graph: SceneGraph | None
     sensor: ForceSensor | None
     noise: RandomSource | None
+    exogenous: ReferenceGenerator | None = None
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.loggers)})"
@@ -84,8 +87,13 @@ class ClosedLoop:
 
     def predicted_error(self, record: Record) -> FloatArray:
         """The error (30), (31) that theory predicts for a record's start, shape (k, p)."""
-        return self.controller.law.predicted_error(
-            record.time - record.time[0], record["state"][0], record["reference"][0]
+        law = self.controller.law
+        parameters = law.system.parameter_values
+        if self.exogenous is not None:
+            moving = self.exogenous.reference(record.time[0])
+            parameters[self.controller.exogenous_places] = moving
+        return law.predicted_error(
+            record.time - record.time[0], record["state"][0], record["reference"][0], parameters
         )
 
 
@@ -95,6 +103,7 @@ def make_closed_loop(
     law: TrackingLaw,
     references: Sequence[Reference],
     *,
+    exogenous: Sequence[Reference] = (),
     sensor: ForceSensor | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
@@ -106,6 +115,8 @@ def make_closed_loop(
         system: A `RobotPlant`, or any `DaePlant`.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order.
+        exogenous: The exogenous signals of the plant, which its law knows too, as references that
+            together cover all entries of w, in their order; without any nothing moves.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
             force is connected as it is, where that closes no algebraic loop.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
@@ -139,6 +150,8 @@ def make_closed_loop(
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
 
+    moving = [_add_exogenous(builder, block, exogenous) for block in (plant, controller)]
+
     noise = None
     if law.measured_force:
         noise = _add_force_feedback(builder, plant, controller, sensor)
@@ -147,6 +160,7 @@ def make_closed_loop(
 
     # Every signal under its own name: exported, and logged once per step.
     dae = plant.dae
+    loggers = {}
     named = {
         "state": (plant, dae.state_signals),
         "constraint_force": (plant, dae.constraint_input_signals),
@@ -157,7 +171,11 @@ def make_closed_loop(
     }
     if law.measured_force and sensor is not None:
         named["measured_force"] = (sensor, dae.constraint_input_signals)
-    loggers = {}
+    if moving[0] is not None:
+        signals = plant.exogenous_layout.reference_signals(dae.exogenous_signals)
+        builder.ExportOutput(moving[0].get_output_port(), "exogenous")
+        sink = LogVectorOutput(moving[0].get_output_port(), builder, {TriggerType.kPerStep})
+        loggers["exogenous"] = (sink, signals)
     for name, (owner, signals) in named.items():
         port = owner.GetOutputPort(name)
         builder.ExportOutput(port, name)
@@ -172,7 +190,9 @@ def make_closed_loop(
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")
-    return ClosedLoop(diagram, plant, controller, reference, loggers, scene_graph, sensor, noise)
+    return ClosedLoop(
+        diagram, plant, controller, reference, loggers, scene_graph, sensor, noise, moving[1]
+    )
 
 
 def _add(builder: DiagramBuilder, block: Block) -> Block:
@@ -183,6 +203,29 @@ def _add(builder: DiagramBuilder, block: Block) -> Block:
         raise WiringError(
             f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
         ) from None
+
+
+def _add_exogenous(
+    builder: DiagramBuilder, block: ParameterizedSystem, exogenous: Sequence[Reference]
+) -> ReferenceGenerator | None:
+    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
+
+    Raises:
+        WiringError: The references are not as many as the signals.
+    """
+    names = [signal.name for signal in block.dae.exogenous_signals]
+    size = sum(reference.size for reference in exogenous)
+    if exogenous and size != len(names):
+        raise WiringError(
+            f"the references of exogenous signals cover {size}, '{block.dae.name}' has "
+            f"{len(names)}: {', '.join(names) or 'none'}"
+        )
+    if not exogenous:
+        return None
+    generator = builder.AddSystem(ReferenceGenerator(exogenous, block.exogenous_layout.degrees))
+    generator.set_name(f"{block.get_name()}_exogenous")
+    builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
+    return generator
 
 
 def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:

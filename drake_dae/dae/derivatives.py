@@ -5,7 +5,8 @@ expanding f* and differentiating the whole, the equations of the motion are diff
 
     E x' = f + g v + h u,    c' = 0,
 
-with c the last derivatives L_f^(r_i - 1) k_i of the constraints. Each order brings new unknowns
+with c the last derivatives L_f^(r_i - 1) k_i of the constraints; where there are exogenous signals,
+they and their derivatives move, too. Each order brings new unknowns
 (x'', v'), (x''', v''), ... that solve a linear system with one and the same matrix,
 
     [[E, -g], [dc/dx, 0]] (x^(k+1), v^(k)) = what is known of the orders before,
@@ -181,9 +182,13 @@ class Derivatives:
         balance = ca.mtimes(system.mass_matrix, rate) - system.f
         balance -= ca.mtimes(system.g, self.constraint_input)
         constraint_rate = ca.jtimes(constraint, system.state, rate)
+        if system.exogenous:
+            constraint_rate += system.exogenous_rate(constraint)
         if system.implicit is None:
             return balance, constraint_rate
         shorter = ca.vertcat(*system.implicit(rate, self.constraint_input))
+        if system.exogenous:  # Of constraints that move, `implicit` knows the state's part alone.
+            shorter = ca.vertcat(shorter[: system.num_states], constraint_rate)
         longer = ca.vertcat(balance, constraint_rate)
         if shorter.shape != longer.shape or not _agree(
             system, shorter, longer, self._symbols[1], self.control
@@ -199,7 +204,8 @@ class Derivatives:
 
     def _total_derivative(self, expression: ca.SX) -> ca.SX:
         moving = self._symbols[: len(self._rates)]
-        return ca.jtimes(expression, ca.vertcat(*moving), ca.densify(ca.vertcat(*self._rates)))
+        rate = ca.jtimes(expression, ca.vertcat(*moving), ca.densify(ca.vertcat(*self._rates)))
+        return rate + self.system.exogenous_rate(expression) if self.system.exogenous else rate
 
     def _add_order(self) -> None:
         following = self._next_unknown()

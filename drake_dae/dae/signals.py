@@ -33,10 +33,17 @@ class Signal:
         return Signal(self.name + "'" * order, (self.unit or "1") + per_time)
 
 
+DERIVATIVES = 10
+"""How many derivatives of an exogenous parameter there are symbols for; long chains need 8."""
+
+
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Parameter:
     """A number, or a vector of numbers, that a study changes without tracing again.
+
+    An exogenous one is a signal w(t) that nobody here steers, but whose derivatives are known, as
+    those of a reference are: where a surface is that moves, a known load, time.
 
     Attributes:
         name: Its name, unique in its system, for example "link1.mass".
@@ -45,6 +52,8 @@ class Parameter:
         positive: Whether only positive numbers make sense, as for a mass.
         symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
             not given.
+        exogenous: Whether it moves.
+        derivatives: The symbols of w', w'', ..., each of shape (k, 1), if it moves.
 
     Raises:
         ModelError: The value is not finite, or the symbol does not fit it.
@@ -55,6 +64,8 @@ class Parameter:
     unit: str = ""
     positive: bool = False
     symbol: ca.SX = field(default=None)
+    exogenous: bool = False
+    derivatives: tuple[ca.SX, ...] = field(init=False, default=(), repr=False)
 
     def __post_init__(self) -> None:
         value = np.atleast_1d(numbers(f"parameter '{self.name}'", self.value))
@@ -72,6 +83,17 @@ class Parameter:
                 f"the symbol of parameter '{self.name}' must be a CasADi SX column of "
                 f"{value.size} symbols, as its value has; got {self.symbol}"
             )
+
+        orders = range(1, DERIVATIVES + 1) if self.exogenous else ()
+        rates = tuple(ca.SX.sym(self.name + "'" * order, value.size) for order in orders)
+        object.__setattr__(self, "derivatives", rates)
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of its entries."""
+        if self.value.size == 1:
+            return (Signal(self.name, self.unit),)
+        return signals([f"{self.name}[{i}]" for i in range(self.value.size)], self.unit)
 
     def check(self, value: FloatArray) -> None:
         """Refuses values that make no sense for the parameter.

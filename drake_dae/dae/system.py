@@ -26,6 +26,11 @@ class DaeSystem:
 
         x' = f(x) + g(x) v + h(x) u,    0 = k(x),    z = l(x) + m(x) v.
 
+    All functions may also depend on exogenous signals w(t), which nobody here steers and whose
+    derivatives are known: they are parameters with `exogenous=True`. In section 2, L_f then becomes
+    the total derivative D = L_f + sum_j (d/dw^(j)) w^(j+1); degrees, A, B and (9)-(28) keep their
+    form, and N* moves.
+
     With a mass matrix E the first is E(x) x' = f + g v + h u, and what the paper calls f, g, h is
     E^-1 f, E^-1 g, E^-1 h (see `explicit`). Giving E, as a robot has it in M(q), costs far fewer
     operations than giving its inverse.
@@ -140,6 +145,7 @@ class DaeSystem:
         k: Callable[..., Any] | None = None,
         m: Callable[..., Any] | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
+        exogenous: Sequence[str] = (),
         **labels: Any,
     ) -> Self:
         """Builds a system from Python functions of the state.
@@ -154,6 +160,7 @@ class DaeSystem:
             f, g, h, k, l, m: The functions of (1)-(3). Without constraints leave out g, k and m;
                 without controls h; without controlled outputs l and m.
             parameters: Name -> default; a name must be a Python identifier.
+            exogenous: The names of those parameters that move, as signals w(t).
             labels: The remaining fields of the class.
 
         Raises:
@@ -161,6 +168,9 @@ class DaeSystem:
         """
         owner = labels.get("name", "system")
         own = {"state", "parameters", "state_signals", *"fghklm"}
+        for name in exogenous:
+            if name not in (parameters or {}):
+                raise ModelError(f"{owner}: {unknown_name('parameter', name, parameters or {})}")
         known = [item.name for item in fields(cls) if item.name not in own]
         for label in labels:
             if label not in known:
@@ -176,7 +186,7 @@ class DaeSystem:
             raise ModelError(f"{owner}: a system needs at least one state")
         x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
         defined = tuple(
-            Parameter(name, numbers(f"parameter '{name}'", value))
+            Parameter(name, numbers(f"parameter '{name}'", value), exogenous=name in exogenous)
             for name, value in (parameters or {}).items()
         )
         arguments: list[Any] = [x]
@@ -232,19 +242,74 @@ class DaeSystem:
         """The number of controlled outputs; that of the controls where there is a law (28)."""
         return int(self.l.numel())
 
-    @property
+    @cached_property
     def parameter_symbol(self) -> ca.SX:
-        """The symbols of all parameters, below each other."""
-        return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters])
+        """The symbols of all parameters, below each other; then w', w'', ... of those that move."""
+        rates = [rate for p in self.exogenous for rate in p.derivatives]
+        return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters], *rates)
 
     @property
     def parameter_values(self) -> FloatArray:
-        """The defaults of all parameters, in the order of `parameter_symbol`."""
+        """The defaults of all parameters, in the order of `parameter_symbol`: nothing moves."""
         return self._defaults.copy()
 
     @cached_property
     def _defaults(self) -> FloatArray:
-        return np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
+        values = np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
+        return np.pad(values, (0, self.parameter_symbol.numel() - values.size))
+
+    @property
+    def exogenous(self) -> tuple[Parameter, ...]:
+        """The parameters that move, w."""
+        return tuple(p for p in self.parameters if p.exogenous)
+
+    @property
+    def exogenous_signals(self) -> tuple[Signal, ...]:
+        """Names and units of the entries of w."""
+        return tuple(signal for p in self.exogenous for signal in p.signals)
+
+    def exogenous_rate(self, expression: ca.SX) -> ca.SX:
+        """The part sum_j (d/dw^(j)) w^(j+1) of the time derivative of an expression, shape (k, 1).
+
+        Raises:
+            ModelError: The expression needs more derivatives of w than there are.
+        """
+        rate = ca.SX(expression.numel(), 1)
+        for p in self.exogenous:
+            known = (p.symbol, *p.derivatives)
+            if ca.depends_on(expression, known[-1]):
+                raise ModelError(
+                    f"{self.name}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
+                    "needed"
+                )
+            rate += ca.jtimes(expression, ca.vertcat(*known[:-1]), ca.vertcat(*known[1:]))
+        return rate
+
+    def exogenous_degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
+        """How many derivatives of each entry of w some expressions depend on."""
+        every = ca.veccat(*expressions)
+        degrees: list[int] = []
+        for p in self.exogenous:
+            for i in range(p.value.size):
+                orders = [k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])]
+                degrees.append(max(orders, default=0))
+        return tuple(degrees)
+
+    def exogenous_places(self, degrees: Sequence[int]) -> list[int]:
+        """Where W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) stands in `parameter_symbol`.
+
+        Args:
+            degrees: d_1, d_2, ..., one for each entry of w.
+        """
+        following = sum(p.value.size for p in self.parameters)
+        places, left = [], iter(degrees)
+        for p in self.exogenous:
+            size, first = p.value.size, self.parameter_slice(p.name).start
+            for i in range(size):
+                rates = range(next(left))
+                places += [first + i, *(following + order * size + i for order in rates)]
+            following += size * len(p.derivatives)
+        return places
 
     @property
     def nominal_spread(self) -> FloatArray:

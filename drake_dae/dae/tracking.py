@@ -46,6 +46,7 @@ class TrackingLaw:
         function: The law as (state, reference, measured_force, parameters) -> control and
             tracking_error, with `all_parameters`; without measured force there is no such input.
         measured_force: How the measurement enters; None without one.
+        exogenous_degrees: How many derivatives of each entry of w the law needs.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
@@ -90,6 +91,7 @@ class TrackingLaw:
         # By the model; what the control reaches at once is as wanted.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
+        self.exogenous_degrees = self.system.exogenous_degrees(control, output)
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         return TracedFunction(
             f"{self.system.name} tracking law",

@@ -18,6 +18,8 @@ from pydrake.systems.framework import (
     BasicVector_,
     Context,
     ContinuousState,
+    DependencyTicket,
+    InputPort,
     LeafSystem,
     LeafSystem_,
     SystemScalarConverter,
@@ -25,6 +27,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.layout import Layout
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -155,7 +158,14 @@ class ParameterizedSystem(DifferentiableSystem):
     """A LeafSystem whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
     So a study changes numbers in a context without tracing again, and a controller can be given
-    other numbers than its plant.
+    other numbers than its plant. Those parameters that move, the exogenous signals w, come through
+    an input port `exogenous` with the derivatives that the block needs, stacked as references are:
+    w_1, w_1', ..., w_2, ...; `exogenous_layout` tells how many. Without a wire they stand still at
+    their parameters' values.
+
+    Attributes:
+        exogenous_layout: How the port's entries are stacked.
+        exogenous_places: Where they stand among the parameters.
 
     Args:
         dae: The system.
@@ -171,7 +181,36 @@ class ParameterizedSystem(DifferentiableSystem):
         super().__init__()
         self.dae = dae
         self._signals = signals
+        self._exogenous: InputPort | None = None
+        self.exogenous_layout = Layout(())
+        self.exogenous_places: list[int] = []
         self.DeclareNumericParameter(BasicVector(values))
+
+    def _declare_exogenous(self, degrees: Sequence[int]) -> set[DependencyTicket]:
+        """Declares the input port of the exogenous signals, if there are any.
+
+        Args:
+            degrees: How many derivatives of each entry of w the block's functions need.
+
+        Returns:
+            What all parameters depend on.
+        """
+        tickets = {self.all_parameters_ticket()}
+        if degrees:
+            self.exogenous_layout = Layout(tuple(degrees))
+            self.exogenous_places = self.dae.exogenous_places(degrees)
+            size = self.exogenous_layout.reference_size
+            self._exogenous = self.DeclareVectorInputPort("exogenous", size)
+            tickets.add(self.input_port_ticket(self._exogenous.get_index()))
+        return tickets
+
+    def _values(self, context: Context) -> FloatArray:
+        """All parameters, those that move as the input port says; not to be changed."""
+        values = context.get_numeric_parameter(0).value()
+        if self._exogenous is not None and self._exogenous.HasValue(context):
+            values = values.copy()
+            values[self.exogenous_places] = self._exogenous.Eval(context)
+        return values
 
     def _checked(
         self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
@@ -183,7 +222,7 @@ class ParameterizedSystem(DifferentiableSystem):
             NonFiniteError: A value is not finite, likewise.
         """
         try:
-            return function.checked(state, *inputs, context.get_numeric_parameter(0).value())
+            return function.checked(state, *inputs, self._values(context))
         except InvalidValueError as error:
             time = context.get_time()
             raise simulation_error(error.failure, time, state, self._signals) from None
@@ -244,6 +283,7 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             state = context.get_continuous_state_vector().CopyToVector()
             self.DeclareContinuousState(BasicVector_[AutoDiffXd](state))
             self._rate = formulas["derivative"]
+        self._places = getattr(original, "exogenous_places", [])
         tickets = {
             "time": self.time_ticket(),
             "state": self.xc_ticket(),
@@ -265,7 +305,7 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
                 name,
                 port.size(),
                 weakly(self._calc_output, formulas[name]),
-                {tickets[source] for source in formulas[name].sources},
+                {tickets[source] for source in _read(formulas[name].sources, self._places)},
             )
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
@@ -281,7 +321,10 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         if name == "state":
             return context.get_continuous_state_vector().CopyToVector()
         if name == "parameters":
-            return context.get_numeric_parameter(0).CopyToVector()
+            values = context.get_numeric_parameter(0).CopyToVector()
+            if self._places and self.GetInputPort("exogenous").HasValue(context):
+                values[self._places] = self.GetInputPort("exogenous").Eval(context)
+            return values
         return self.GetInputPort(name).Eval(context)
 
     def _evaluate(self, formula: Formula, context: Context) -> Any:
@@ -297,3 +340,8 @@ class _AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             slope = formula.slope(moving, time, *arguments)
             total = slope @ np.vstack([gradients[i] for i in moving])
         return InitializeAutoDiff(value, total).reshape(-1)
+
+
+def _read(sources: Sequence[str], places: Sequence[int]) -> set[str]:
+    """What a formula's sources read: where parameters move, they come from a port as well."""
+    return {*sources, *(["exogenous"] if places and "parameters" in sources else [])}

@@ -28,6 +28,8 @@ class TrackingController(ParameterizedSystem):
         estimated_state: x, shape (n,).
         reference: R, output-major, r_i, ..., r_i^(mu_i); shape (sum (mu_i + 1),).
         measured_force: The constraint force from a sensor, shape (m,); if the law takes it.
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
 
     Output ports:
         control: u, shape (p,).
@@ -66,6 +68,7 @@ class TrackingController(ParameterizedSystem):
         if law.measured_force:
             sizes["measured_force"] = dae.num_constraints
         self._input_ports = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
+        self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources

@@ -38,8 +38,10 @@ class DaePlant(ParameterizedSystem):
     Assumptions (1)-(3) are all it asks for: there may be no controls, no controlled outputs, other
     numbers of them, or outputs that the control does not reach. A port of size 0 needs no wire.
 
-    Input port:
+    Input ports:
         control: u, shape (p,).
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
 
     Output ports:
         state: x, shape (n,).
@@ -99,7 +101,9 @@ class DaePlant(ParameterizedSystem):
             BasicVector(structure.manifold.project(system.nominal_state))
         )
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
-        by_state = {self.xc_ticket(), self.all_parameters_ticket()}
+        residual = structure.manifold.residual_expression
+        degrees = system.exogenous_degrees(rate, force, output, residual)
+        by_state = self._by_state = {self.xc_ticket()} | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
         self.DeclareStateOutputPort("state", state_index)
         self.DeclareVectorOutputPort(
@@ -144,7 +148,8 @@ class DaePlant(ParameterizedSystem):
         Raises:
             InconsistentStateError: None is found near the guess.
         """
-        state = self.structure.manifold.project(guess, self.parameters(context))
+        self.check_context(context)
+        state = self.structure.manifold.project(guess, self._values(context))
         self.set_state(context, state)
         return state
 
@@ -183,14 +188,13 @@ class DaePlant(ParameterizedSystem):
     def _calc_residual(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(
             self.structure.manifold.residual(
-                context.get_continuous_state_vector().CopyToVector(),
-                context.get_numeric_parameter(0).value(),
+                context.get_continuous_state_vector().CopyToVector(), self._values(context)
             )
         )
 
     def _check_start(self, context: Context) -> EventStatus:
         manifold = self.structure.manifold
-        state, parameters = self.state(context), self.parameters(context)
+        state, parameters = self.state(context), self._values(context)
         if manifold.is_consistent(state, parameters):
             return EventStatus.DidNothing()
         residual = manifold.residual(state, parameters)
@@ -208,7 +212,7 @@ class DaePlant(ParameterizedSystem):
     def _project(self, context: Context, state: State) -> EventStatus:
         x = context.get_continuous_state_vector().CopyToVector()
         try:
-            x = self.structure.manifold.project(x, context.get_numeric_parameter(0).value())
+            x = self.structure.manifold.project(x, self._values(context))
         except InconsistentStateError as error:
             time = context.get_time()
             raise SimulationError(

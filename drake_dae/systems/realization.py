@@ -34,8 +34,10 @@ class StateRealization(ParameterizedSystem):
     is the inverse of Phi, by Newton's method, in every evaluation, and that Phi must stay
     regular along the motion. `DaePlant` needs neither of them.
 
-    Input port:
+    Input ports:
         control: u, shape (p,).
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
 
     Output ports:
         state: x, shape (n,).
@@ -77,6 +79,7 @@ class StateRealization(ParameterizedSystem):
         if normal_form.completion.numel():
             moving = derivatives.expand(derivatives.rate)
             rate = ca.jtimes(normal_form.completion, dae.state, moving)
+            rate += dae.exogenous_rate(normal_form.completion)
         rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
         force = derivatives.expand(derivatives.constraint_input)
         self._force_needs_control = elimination.beta.nnz() > 0
@@ -88,7 +91,9 @@ class StateRealization(ParameterizedSystem):
         start = structure.states[0]
         state_index = self.DeclareContinuousState(BasicVector(self._coordinates(start, None)))
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
-        by_state = {self.xc_ticket(), self.all_parameters_ticket()}
+        chain = ca.vertcat(structure.manifold.residual_expression, structure.chain)
+        degrees = dae.exogenous_degrees(rates, force, direct, chain, normal_form.completion)
+        by_state = {self.xc_ticket()} | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
         # Drake hands the value before to the calculation: Newton's method starts there.
         # Its number, since Drake's entry would keep this system for ever.
@@ -123,7 +128,8 @@ class StateRealization(ParameterizedSystem):
             InconsistentStateError: The state is off N*; `manifold.project` finds one that is not.
             ModelError: The shape is wrong.
         """
-        x, p = self.dae.state_vector(state), self.parameters(context)
+        self.check_context(context)
+        x, p = self.dae.state_vector(state), self._values(context)
         manifold = self.normal_form.structure.manifold
         if not manifold.is_consistent(x, p):
             residual = manifold.residual(x, p)
@@ -155,7 +161,7 @@ class StateRealization(ParameterizedSystem):
 
     def _calc_state(self, context: Context, value: AbstractValue) -> None:
         coordinates = context.get_continuous_state_vector().CopyToVector()
-        last, p = value.get_value(), self.parameters(context)
+        last, p = value.get_value(), self._values(context)
         if not np.all(np.isfinite(coordinates)):
             raise NonFiniteError(
                 f"{self.dae.name}: the coordinates {coordinates} are not finite at t = "

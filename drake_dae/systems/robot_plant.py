@@ -64,14 +64,14 @@ class RobotPlant(DaePlant):
                 "joint_torque",
                 model.joint_force.numel(),
                 weakly(self._calc_joint_torque),
-                {self.xc_ticket(), self.all_parameters_ticket()},
+                self._by_state,
             )
 
     def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self.state(context)[part])
 
     def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._joint_force(self.state(context), self.parameters(context))[0])
+        output.SetFromVector(self._joint_force(self.state(context), self._values(context))[0])
 
     def _formulas(self) -> dict[str, Formula]:
         state = self.dae.state

@@ -70,7 +70,10 @@ def constraint_chains(
         if stuck:
             raise Violation(2, Cause.NO_FORCE, tuple(names[i] for i in stuck)).error()
         for i in still:
-            chains[i].append(lie_derivative(chains[i][-1], f, x))
+            following = lie_derivative(chains[i][-1], f, x)
+            if system.exogenous:
+                following += system.exogenous_rate(chains[i][-1])
+            chains[i].append(following)
         undecided = still
     return chains
 
