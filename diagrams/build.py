@@ -88,6 +88,7 @@ def wire_scenario(
             force_gain=force.gain,
         )
     references = _references(scenario.references, law)
+    exogenous = _exogenous(scenario, law)
 
     # The diagram.
     with at("force" if force.is_measured else "start.positions"):
@@ -95,6 +96,7 @@ def wire_scenario(
             RobotPlant(model, structure=structure),
             law,
             references,
+            exogenous=exogenous,
             sensor=sensor,
             scene_graph=scene_graph,
             meshcat=meshcat,
@@ -136,6 +138,24 @@ def _references(references: Sequence[Reference], law: TrackingLaw) -> Sequence[R
     return references
 
 
+def _exogenous(scenario: Scenario, law: TrackingLaw) -> list[Reference]:
+    """How each parameter moves that does, in the order of the system, each smooth enough."""
+    moving: list[Reference] = []
+    degrees = list(law.exogenous_degrees)
+    for parameter in law.system.exogenous:
+        key, references = f"exogenous.{parameter.name}", scenario.exogenous[parameter.name]
+        size = sum(reference.size for reference in references)
+        if size != parameter.value.size:
+            text = f"{size} values, but the parameter has {parameter.value.size}"
+            raise ScenarioError((key, text))
+        for index, reference in enumerate(references):
+            with at(f"{key}.{index}"):
+                reference.derivatives(degrees[: reference.size])
+            del degrees[: reference.size]
+        moving += references
+    return moving
+
+
 def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Context) -> None:
     """Sets parameters, state and sensor of a context."""
     plant = loop.plant
@@ -143,7 +163,7 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
     with at("plant_parameters"):
         for name, numbers in scenario.plant_parameters.items():
             plant.set_parameter(own, name, numbers)
-    parameters = plant.parameters(own)
+    parameters = plant.current_parameters(own)
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
     positions, forces = np.split(wanted, [len(model.position_signals)])
     with at("start"):

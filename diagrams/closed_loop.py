@@ -186,7 +186,8 @@ def make_closed_loop(
     if isinstance(plant, RobotPlant):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
         if meshcat is not None:
-            add_live_view(builder, plant, scene_graph, meshcat)
+            source = moving[0].get_output_port() if moving[0] is not None else None
+            add_live_view(builder, plant, scene_graph, meshcat, source)
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")

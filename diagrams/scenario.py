@@ -93,6 +93,8 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not.
+        exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
+            for example.
         gains: The gains of the tracking law (28).
         references: The references, in the order of the outputs, the forces last.
         start: Where the robot starts.
@@ -108,6 +110,7 @@ class Scenario:
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
+    exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     gains: Gains = field(default_factory=parts.Poles)
     references: list[Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)

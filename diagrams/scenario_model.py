@@ -51,8 +51,10 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     outputs = _outputs(scenario.outputs, constraints, links)
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
+    _check_exogenous(scenario.exogenous, links, constraints, stages)
     with at("actuation" if stages else "outputs"):
-        return RobotModel(links, constraints, outputs, guess, name, stages)
+        moving = tuple(scenario.exogenous)
+        return RobotModel(links, constraints, outputs, guess, name, stages, moving)
 
 
 def scenario_structure(model: RobotModel) -> Structure:
@@ -217,6 +219,22 @@ def _outputs(
 def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
     each("actuation", stages, lambda stage: stage.attach(links))
     return stages
+
+
+@at("exogenous")
+def _check_exogenous(
+    names: Iterable[str],
+    links: Links,
+    constraints: Sequence[Constraint],
+    stages: Sequence[Stage],
+) -> None:
+    """Refuses to move what is no parameter."""
+    attached = [stage.attach(links).parameters for stage in stages]
+    groups = [links.parameters, *(c.parameters for c in constraints), *attached]
+    known = [parameter.name for group in groups for parameter in group]
+    for name in names:
+        if name not in known:
+            raise ModelError(unknown_name("parameter", name, known))
 
 
 @at("start.positions")

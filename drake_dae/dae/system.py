@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from math import isfinite
 from types import SimpleNamespace
-from typing import Any, Self
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -147,7 +147,7 @@ class DaeSystem:
         parameters: Mapping[str, ArrayLike] | None = None,
         exogenous: Sequence[str] = (),
         **labels: Any,
-    ) -> Self:
+    ) -> "DaeSystem":
         """Builds a system from Python functions of the state.
 
         Each function is called once with a CasADi column x, and, if there are `parameters`, with
@@ -168,9 +168,6 @@ class DaeSystem:
         """
         owner = labels.get("name", "system")
         own = {"state", "parameters", "state_signals", *"fghklm"}
-        for name in exogenous:
-            if name not in (parameters or {}):
-                raise ModelError(f"{owner}: {unknown_name('parameter', name, parameters or {})}")
         known = [item.name for item in fields(cls) if item.name not in own]
         for label in labels:
             if label not in known:
@@ -186,7 +183,7 @@ class DaeSystem:
             raise ModelError(f"{owner}: a system needs at least one state")
         x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
         defined = tuple(
-            Parameter(name, numbers(f"parameter '{name}'", value), exogenous=name in exogenous)
+            Parameter(name, numbers(f"parameter '{name}'", value))
             for name, value in (parameters or {}).items()
         )
         arguments: list[Any] = [x]
@@ -196,7 +193,8 @@ class DaeSystem:
         values = {key: call(owner, key, given, arguments) for key, given in functions.items()}
         if values["h"].shape[0] == 1 and x.numel() != 1:
             values["h"] = values["h"].T
-        return cls(state=x, **values, parameters=defined, state_signals=named, **labels)
+        system = cls(state=x, **values, parameters=defined, state_signals=named, **labels)
+        return system.with_exogenous(exogenous) if exogenous else system
 
     @cached_property
     def explicit(self) -> "DaeSystem":
@@ -262,6 +260,19 @@ class DaeSystem:
     def exogenous(self) -> tuple[Parameter, ...]:
         """The parameters that move, w."""
         return tuple(p for p in self.parameters if p.exogenous)
+
+    def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
+        """The same system, some of whose parameters move.
+
+        Raises:
+            ModelError: No parameter has that name.
+        """
+        known = [p.name for p in self.parameters]
+        for name in names:
+            if name not in known:
+                raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
+        changed = [replace(p, exogenous=True) if p.name in names else p for p in self.parameters]
+        return replace(self, parameters=tuple(changed))
 
     @property
     def exogenous_signals(self) -> tuple[Signal, ...]:

@@ -48,6 +48,8 @@ class RobotModel:
             structure is examined; `links.default_positions` if None.
         name: The robot's name in messages.
         actuation: The stages from the joints toward the motor; none is rigid joints.
+        exogenous: The names of parameters that move, "wall.position" for example, as signals w
+            with known derivatives; see `DaeSystem`.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
@@ -70,6 +72,7 @@ class RobotModel:
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
+        exogenous: Sequence[str] = (),
     ) -> None:
         self.links = links
         self.constraints = tuple(constraints)
@@ -86,7 +89,8 @@ class RobotModel:
             links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
         )
         nominal = self._nominal(nominal_positions)
-        self.dae = self._equations(bound, h_1, driven, nominal)
+        self.dae = self._equations(bound, h_1, driven, nominal).with_exogenous(exogenous)
+        self._check_exogenous()
         self._check_mass_matrix(nominal)
         self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
         self._balance = Balance(self.dae, links.q, links.v)
@@ -102,6 +106,7 @@ class RobotModel:
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
+        exogenous: Sequence[str] = (),
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -109,7 +114,7 @@ class RobotModel:
             ModelError: The plant has what cannot be represented; the message names it.
         """
         links = MultibodyExpressions(plant)
-        return cls(links, constraints, positions, nominal_positions, name, actuation)
+        return cls(links, constraints, positions, nominal_positions, name, actuation, exogenous)
 
     @property
     def position_signals(self) -> tuple[Signal, ...]:
@@ -178,6 +183,17 @@ class RobotModel:
                 "has fewer actuators than joints"
             )
         return state
+
+    def _check_exogenous(self) -> None:
+        """Refuses to move what restricts velocities alone: its own rate would lack a part."""
+        moving = {p.name for p in self.dae.exogenous}
+        for constraint in self.constraints:
+            names = [p.name for p in constraint.parameters if p.name in moving]
+            if names and not constraint.residual(self.links).numel():
+                raise ModelError(
+                    f"{self.name}: '{names[0]}' cannot move, since '{constraint.name}' restricts "
+                    "velocities alone"
+                )
 
     def _check_outputs(self, m: int, count: int) -> None:
         """Refuses outputs that, with the m constraint forces, are not as many as the actuators."""

@@ -66,28 +66,36 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
     states = _interpolated(record, "state", times)
     forces = _interpolated(record, "constraint_force", times)
     desired = _interpolated(record, "desired_output", times)
-    course = [loads(state, force) for state, force in zip(states, forces, strict=True)]
+    values = np.tile(parameters, (len(times), 1))
+    if "exogenous" in record.signals:
+        values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
+    course = [
+        loads(state, force, own) for state, force, own in zip(states, forces, values, strict=True)
+    ]
     arrows.measure(course)
 
     # What stands still: what it touches, where it went, and where the reference wanted it.
     draw_surroundings(meshcat, model, loads, states[0], parameters)
     _draw_paths(meshcat, loads, np.array([load.points for load in course]), "actual")
-    wanted = _desired_states(model, states, desired, parameters)
+    wanted = _desired_states(model, states, desired, values)
     if wanted:
         none = np.zeros(model.dae.num_constraints)
-        points = np.array([loads(state, none).points for state in wanted])
+        points = np.array(
+            [loads(x, none, own).points for x, own in zip(wanted, values, strict=False)]
+        )
         _draw_paths(meshcat, loads, points, "desired")
 
     # What moves: the links and the arrows, frame by frame.
     replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    for time, state, load in zip(times, states, course, strict=True):
+    for time, state, load, own in zip(times, states, course, values, strict=True):
         if links is not None and replay is not None:
             replay.SetTime(time)
             link_state = links.get_input_port()
             link_state.FixValue(replay, state[: link_state.size()])
             links.ForcedPublish(replay)
         arrows.draw(load, time)
+        arrows.place(own, time)
     meshcat.StopRecording()
     meshcat.PublishRecording()
     return meshcat.StaticHtml()
@@ -106,14 +114,20 @@ def _interpolated(record: Record, name: str, times: FloatArray) -> FloatArray:
 
 
 def _desired_states(
-    model: RobotModel, states: FloatArray, desired: FloatArray, parameters: FloatArray
+    model: RobotModel, states: FloatArray, desired: FloatArray, values: FloatArray
 ) -> list[FloatArray]:
-    """Link states at rest with the desired outputs, as long as they are within reach."""
+    """Link states at rest with the desired outputs, as long as they are within reach.
+
+    Args:
+        model: The robot.
+        states, desired, values: x, z and the parameters at each moment, one row each.
+    """
     nq, nv = model.links.q.numel(), model.links.v.numel()
     guess, found = states[0, :nq], []
     try:
-        for row in desired[:, : len(model.position_signals)]:
-            guess = model.configuration(row, guess, parameters)
+        wanted = desired[:, : len(model.position_signals)]
+        for row, own in zip(wanted, values, strict=True):
+            guess = model.configuration(row, guess, own)
             found.append(np.concatenate([guess, np.zeros(nv)]))
     except InconsistentStateError:
         pass  # The reference leaves what the robot can reach: its path ends there.

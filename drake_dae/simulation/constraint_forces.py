@@ -12,11 +12,13 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system import DaeSystem
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.surface import axes_along
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.trace.functions import TracedFunction
 
 _FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
@@ -79,16 +81,20 @@ class ConstraintLoads:
         self._parameters = model.dae.parameter_vector(parameters).copy()
         self._sizes = links.q.numel(), links.v.numel()
 
-    def __call__(self, state: FloatArray, constraint_force: ArrayLike) -> Loads:
+    def __call__(
+        self, state: FloatArray, constraint_force: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Loads:
         """The loads at one moment.
 
         Args:
             state: x, or the link state (q, v) that it begins with.
             constraint_force: lambda, shape (m,).
+            parameters: Values of all parameters at that moment, where some move.
         """
         nq, nv = self._sizes
         q, v = state[:nq], state[nq : nq + nv]
-        found = self._function(q, v, constraint_force, self._parameters)
+        values = self._parameters if parameters is None else parameters
+        found = self._function(q, v, constraint_force, values)
         return Loads(*(columns.reshape(3, -1, order="F").T for columns in found))
 
 
@@ -109,7 +115,7 @@ class ForceArrows:
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
         self.largest_force = self.largest_moment = 1e-6
-        self._meshcat = meshcat
+        self._meshcat, self._model = meshcat, model
         self._loads = ConstraintLoads(model)
         pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
         for constraint, with_moment in pairs:
@@ -132,6 +138,20 @@ class ForceArrows:
             if with_moment:
                 turned = moment / self.largest_moment
                 self._draw_arrow(path_of(constraint, "moment"), point, turned, time)
+
+    def place(self, parameters: FloatArray, time: float) -> None:
+        """Puts what moves where it is now.
+
+        Args:
+            parameters: Values of all parameters.
+            time: The time in a recording, s.
+        """
+        dae = self._model.dae
+        moving = {p.name for p in dae.exogenous}
+        for constraint in self._model.constraints:
+            if not moving.isdisjoint(p.name for p in constraint.parameters):
+                stands = constraint.placement(own_values(constraint, dae, parameters))
+                self._meshcat.SetTransform(path_of(constraint, "surface"), stands, time)
 
     def measure(self, course: Sequence[Loads]) -> None:
         """Makes the arrows so short that none of these loads has one that is too long."""
@@ -158,29 +178,46 @@ class ConstraintForceVisualizer(LeafSystem):
     Input ports:
         link_state: (q, v).
         constraint_force: lambda, shape (m,).
+        exogenous: What the plant reads at its port of that name, if there is anything that moves.
 
     Args:
         arrows: What draws them.
-        model: The robot.
+        plant: The robot.
         period: Time between pictures in s.
     """
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(self, arrows: ForceArrows, model: RobotModel, period: float) -> None:
+    def __init__(self, arrows: ForceArrows, plant: RobotPlant, period: float) -> None:
         super().__init__()
         self.set_name("constraint_force_visualizer")
+        model = self._model = plant.model
         self._arrows, self._loads = arrows, ConstraintLoads(model)
+        self._values, self._places = model.dae.parameter_values, plant.exogenous_places
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
         self._force = self.DeclareVectorInputPort("constraint_force", model.dae.num_constraints)
+        self._exogenous = self.DeclareVectorInputPort("exogenous", len(self._places))
         self.DeclarePeriodicPublishEvent(period, 0.0, weakly(self._publish))
         self.DeclareForcedPublishEvent(weakly(self._publish))
 
     def _publish(self, context: Context) -> EventStatus:
-        state, force = self._link_state.Eval(context), self._force.Eval(context)
-        self._arrows.draw(self._loads(state, force), context.get_time())
+        state, force, time = (
+            self._link_state.Eval(context),
+            self._force.Eval(context),
+            context.get_time(),
+        )
+        if self._places and self._exogenous.HasValue(context):
+            self._values[self._places] = self._exogenous.Eval(context)
+            self._arrows.place(self._values, time)
+        self._arrows.draw(self._loads(state, force, self._values), time)
         return EventStatus.Succeeded()
+
+
+def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -> FloatArray:
+    """The values of a constraint's parameters, below each other, among all of a system."""
+    own = [parameters[dae.parameter_slice(p.name)] for p in constraint.parameters]
+    return np.concatenate([np.zeros(0), *own])
 
 
 def path_of(constraint: Constraint, what: str) -> str:

@@ -11,7 +11,7 @@ from pydrake.geometry import (
     Rgba,
     SceneGraph,
 )
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arguments import checked
@@ -22,6 +22,7 @@ from drake_dae.simulation.constraint_forces import (
     ConstraintForceVisualizer,
     ConstraintLoads,
     ForceArrows,
+    own_values,
     path_of,
 )
 from drake_dae.systems.robot_plant import RobotPlant
@@ -54,7 +55,11 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
 
 
 def add_live_view(
-    builder: DiagramBuilder, plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat
+    builder: DiagramBuilder,
+    plant: RobotPlant,
+    scene_graph: SceneGraph | None,
+    meshcat: Meshcat,
+    exogenous: OutputPort | None = None,
 ) -> None:
     """Adds what draws a robot `FRAME_RATE` times a second while its diagram runs.
 
@@ -63,12 +68,15 @@ def add_live_view(
         plant: The robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
         meshcat: Where to draw.
+        exogenous: What the plant reads at its port of that name, if anything.
     """
     period = 1.0 / FRAME_RATE
     arrows = draw_scene(plant, meshcat)
-    forces = builder.AddSystem(ConstraintForceVisualizer(arrows, plant.model, period))
+    forces = builder.AddSystem(ConstraintForceVisualizer(arrows, plant, period))
     for name in ("link_state", "constraint_force"):
         builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
+    if exogenous is not None:
+        builder.Connect(exogenous, forces.GetInputPort("exogenous"))
     links = view_of_links(plant, scene_graph, meshcat, period)
     if links is not None:
         builder.AddSystem(links)
@@ -141,12 +149,13 @@ def draw_surroundings(
     _, size = scene_extent(model, loads, state)
     points = loads(state, np.zeros(model.dae.num_constraints)).points
     for constraint, point in zip(loads.constraints, points, strict=True):
-        own = [parameters[model.dae.parameter_slice(p.name)] for p in constraint.parameters]
-        picture = constraint.picture(np.concatenate([np.zeros(0), *own]), point, size)
+        own = own_values(constraint, model.dae, parameters)
+        picture = constraint.picture(own, point, size)
         if picture is not None:
-            path = path_of(constraint, "surface")
-            meshcat.SetObject(path, picture.form, rgba=_SURFACE_COLOR)
-            meshcat.SetTransform(path, picture.pose)
+            path, stands = path_of(constraint, "surface"), constraint.placement(own)
+            meshcat.SetObject(f"{path}/form", picture.form, rgba=_SURFACE_COLOR)
+            meshcat.SetTransform(f"{path}/form", stands.inverse() @ picture.pose)
+            meshcat.SetTransform(path, stands)
 
 
 def scene_extent(

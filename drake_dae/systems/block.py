@@ -233,6 +233,11 @@ class ParameterizedSystem(DifferentiableSystem):
         values = context.get_numeric_parameter(0).value()
         return np.array(values[: self.dae.parameter_values.size])
 
+    def current_parameters(self, context: Context) -> FloatArray:
+        """All parameters as `parameters`, those that move as they are at the context's time."""
+        self.check_context(context)
+        return np.array(self._values(context)[: self.dae.parameter_values.size])
+
     def get_parameter(self, context: Context, name: str) -> FloatArray:
         """A parameter by name, shape (k,).
 

@@ -196,9 +196,12 @@ def test_a_parameter_moves_the_surface():
     loop.plant.set_consistent_state(own, state)
     simulate(loop.diagram, context, scenario.duration, scenario.integrator)
     page = make_animation(loop, loop.record(context), context)
-    wall = objects(page)["/contact/wall/surface"]["geometries"][0]
+    wall = objects(page)["/contact/wall/surface/form"]["geometries"][0]
     thickness = min(wall[key] for key in ("width", "height", "depth"))
-    assert transforms(page)["/contact/wall/surface"][0, 3] == pytest.approx(1.1 + thickness / 2)
+    stands = (
+        transforms(page)["/contact/wall/surface"] @ transforms(page)["/contact/wall/surface/form"]
+    )
+    assert stands[0, 3] == pytest.approx(1.1 + thickness / 2)
     arrow = animation(page)["/contact/wall/force", "position"]
     np.testing.assert_allclose(arrow.values[:, 0], 1.1, atol=1e-3)
 
@@ -356,7 +359,7 @@ def test_a_surface_without_a_shape_is_drawn(surface):
     plant = parse("two_link_arm")
     model = RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])
     _, page = shown_at_rest(model, np.array([10.0]))
-    points = vertices(objects(page)["/contact/it/surface"])
+    points = vertices(objects(page)["/contact/it/surface/form"])
     points += transforms(page)["/contact/it/surface"][:3, 3]
     assert len(points) > 500
     offset = ca.SX.sym("offset", 3)

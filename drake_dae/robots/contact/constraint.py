@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import casadi as ca
+from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -49,7 +50,10 @@ class Constraint(ABC):
        where they act at no point, as between the angles of two joints.
     7. `coordinates` tell where the robot is along what the constraint leaves free, one row for
        each of `coordinate_signals`; there may be none.
-    8. `picture` is what there is to see where the robot touches, if there is anything.
+    8. `picture` is what there is to see where the robot touches, if there is anything; `placement`
+       tells where its parameters put it.
+    9. Its parameters may move (see `RobotModel`) if it has a `residual`; `rate` is then that part
+       of its derivative which velocities make.
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
@@ -105,12 +109,20 @@ class Constraint(ABC):
             f"'{self.name}' has no coordinates along it; use PointCoordinates or an expression"
         )
 
+    def placement(self, values: FloatArray) -> RigidTransform:
+        """Where what the robot touches stands in the world.
+
+        Args:
+            values: The values of its parameters, below each other.
+        """
+        return RigidTransform()
+
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
         """What is to be seen where the robot touches, or None.
 
         Args:
             values: The values of its parameters, below each other.
-            point: Where its forces act now, in m, shape (3,).
+            point: Where its forces act now, in the world, m, shape (3,).
             size: How large a piece is of interest, m.
         """
         return None

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.geometry import Shape, SurfaceTriangle, TriangleSurfaceMesh
 from pydrake.math import RigidTransform
 
@@ -22,10 +21,9 @@ class Picture:
     form: Shape | TriangleSurfaceMesh
     pose: RigidTransform
 
-    def moved(self, offset: ArrayLike) -> "Picture":
-        """The same elsewhere, by an offset in the world, m, shape (3,)."""
-        place = self.pose.translation() + np.asarray(offset, dtype=float)
-        return Picture(self.form, RigidTransform(self.pose.rotation(), place))
+    def moved(self, pose: RigidTransform) -> "Picture":
+        """The same elsewhere: as if what is the world to it stood at a pose."""
+        return Picture(self.form, pose @ self.pose)
 
 
 def mesh_of_grid(points: FloatArray) -> TriangleSurfaceMesh:

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_axes
@@ -12,7 +13,7 @@ from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint
 from drake_dae.robots.contact.picture import Picture
-from drake_dae.robots.contact.surface import Surface, Vector
+from drake_dae.robots.contact.surface import Surface, Vector, rotation_of
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 
 
@@ -23,25 +24,33 @@ class PointOnSurface(Constraint):
 
     The constraint force is the normal force of the surface on the robot in N; positive pushes the
     robot to the free side, and a unilateral contact can only push. The parameter "<name>.position"
-    is where the surface stands.
+    is where the surface stands, and "<name>.rpy" how it is turned about that place; where they are
+    exogenous (see `RobotModel`), the surface moves.
 
     Attributes:
         frame: Name of the frame.
-        surface: A surface that stands in the world.
+        surface: A surface in the world.
         point: The point in the frame, m, shape (3,).
-        name: The name of the constraint, before those of its force and its parameter.
+        name: The name of the constraint, before those of its force and its parameters.
+        rpy: Roll, pitch and yaw by which the surface is turned, rad, shape (3,): about the fixed
+            axes x, y, z in this order, as in Drake. None for a surface that nobody turns, which
+            has no such parameter.
     """
 
     frame: str
     surface: Surface
     point: Vector = (0.0, 0.0, 0.0)
     name: str = "surface"
+    rpy: Vector | None = None
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
     can_only_push: ClassVar[tuple[bool, ...]] = (True,)
 
     def __post_init__(self) -> None:
         position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
-        object.__setattr__(self, "parameters", (position,))
+        turns = []
+        if self.rpy is not None:
+            turns.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
+        object.__setattr__(self, "parameters", (position, *turns))
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -57,8 +66,13 @@ class PointOnSurface(Constraint):
         return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
 
     def offset(self, frames: Frames) -> ca.SX:
-        """The point relative to where the surface stands, m, shape (3, 1)."""
-        return frames.position(self.frame, self.point) - self.parameters[0].symbol
+        """The point relative to the surface as it stands, in its axes, m, shape (3, 1)."""
+        offset = frames.position(self.frame, self.point) - self.parameters[0].symbol
+        return ca.mtimes(self._rotation().T, offset) if self.rpy is not None else offset
+
+    def _rotation(self) -> ca.SX:
+        """How the surface is turned, shape (3, 3)."""
+        return rotation_of(self.parameters[1].symbol)
 
     def residual(self, frames: Frames) -> ca.SX:
         return self.surface.distance(self.offset(frames))
@@ -68,11 +82,18 @@ class PointOnSurface(Constraint):
 
     def application(self, kinematics: Kinematics) -> Application:
         normal = self.surface.unit_normal(self.offset(kinematics))
+        if self.rpy is not None:
+            normal = ca.mtimes(self._rotation(), normal)
         return Application(kinematics.position(self.frame, self.point), normal, ca.SX(3, 1))
 
+    def placement(self, values: FloatArray) -> RigidTransform:
+        rotation = RollPitchYaw(values[3:]) if values.size > 3 else RollPitchYaw(np.zeros(3))
+        return RigidTransform(rotation, values[:3])
+
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
-        picture = self.surface.picture(point - values, size)
-        return None if picture is None else picture.moved(values)
+        stands = self.placement(values)
+        picture = self.surface.picture(stands.inverse() @ point, size)
+        return None if picture is None else picture.moved(stands)
 
 
 @checked(ModelError)

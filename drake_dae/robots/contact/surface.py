@@ -149,3 +149,15 @@ def axes_along(direction: ArrayLike) -> FloatArray:
     z = np.asarray(direction, dtype=float)
     x, _ = tangents(z)
     return np.column_stack([x, np.cross(z, x), z])
+
+
+def rotation_of(rpy: ca.SX) -> ca.SX:
+    """The rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of Drake's RollPitchYaw, shape (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = (ca.vertsplit(part) for part in (ca.cos(rpy), ca.sin(rpy)))
+    return ca.blockcat(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
