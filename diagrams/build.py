@@ -88,7 +88,7 @@ def wire_scenario(
             force_gain=force.gain,
         )
     references = _references(scenario.references, law)
-    exogenous = _exogenous(scenario, law)
+    exogenous = exogenous_references(scenario, law)
 
     # The diagram.
     with at("force" if force.is_measured else "start.positions"):
@@ -138,8 +138,12 @@ def _references(references: Sequence[Reference], law: TrackingLaw) -> Sequence[R
     return references
 
 
-def _exogenous(scenario: Scenario, law: TrackingLaw) -> list[Reference]:
-    """How each parameter moves that does, in the order of the system, each smooth enough."""
+def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference]:
+    """How each parameter moves that does, in the order of the system, each smooth enough.
+
+    Raises:
+        ScenarioError: There are too few or too many, or one is not smooth enough.
+    """
     moving: list[Reference] = []
     degrees = list(law.exogenous_degrees)
     for parameter in law.system.exogenous:

@@ -9,7 +9,7 @@ from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.build import wire_scenario
+from drake_dae.diagrams.build import exogenous_references, wire_scenario
 from drake_dae.diagrams.feasibility_report import Feasibility, SignalRange
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import scenario_model, scenario_structure
@@ -50,9 +50,17 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         return Feasibility(analyze(model.dae), scenario.duration)
     loop, context = wire_scenario(scenario, model, structure)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
-    times, is_resolved = sample_times(reference, begin, begin + scenario.duration)
+
+    def signals(time: float) -> FloatArray:
+        moving = [] if loop.exogenous is None else [loop.exogenous.reference(time)]
+        return np.concatenate([reference(time), *moving])
+
+    times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
     start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    analysis = analyze(model.dae, reference=reference, times=times, start=start)
+    exogenous = exogenous_references(scenario, loop.controller.law)
+    analysis = analyze(
+        model.dae, reference=reference, times=times, start=start, exogenous=exogenous
+    )
     return Feasibility(
         analysis, scenario.duration, is_resolved=is_resolved, **_ranges(analysis, model)
     )

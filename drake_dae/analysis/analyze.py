@@ -17,6 +17,7 @@ from drake_dae.analysis.reference_check import check_reference
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.dae.references import Reference
 from drake_dae.dae.states.margins import Margin, find_margin, is_regular
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Violation
@@ -55,6 +56,7 @@ def analyze(
     reference: Callable[[float], FloatArray] | None = None,
     times: ArrayLike | None = None,
     start: ArrayLike | None = None,
+    exogenous: Sequence[Reference] = (),
     count: int = 50,
     seed: int = 0,
 ) -> Analysis:
@@ -77,6 +79,8 @@ def analyze(
         times: Times in s at which the reference is examined, increasing, shape (k,).
         start: State near which the motion along the reference starts, shape (n,); the first
             examined state if None; only with a reference.
+        exogenous: How the exogenous signals move along the reference; all else is examined with
+            these signals at rest at their parameters' values.
         count: How many random states are drawn.
         seed: The seed of the random numbers.
 
@@ -135,7 +139,8 @@ def analyze(
     layout = analysis.structure.layout
     with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion tells when.
         check_reference(system, layout, reference, times)
-    motion = dynamics.motion(reference, times, samples.states[0] if start is None else start)
+    guess = samples.states[0] if start is None else start
+    motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
     rest, outputs = samples.states[0], None
     if motion.times.size:
         # The state does not tell outputs with mu_i = 0: they are as the reference begins.

@@ -44,9 +44,17 @@ def follow(
     reference: Reference,
     times: FloatArray,
     guess: FloatArray,
-    parameters: FloatArray,
+    parameters: Callable[[float], FloatArray],
 ) -> PinnedMotion:
-    """The motion on Z(R(t)) from a state next to a guess; see `ZeroDynamics.motion`."""
+    """The motion on Z(R(t)) from a state next to a guess; see `ZeroDynamics.motion`.
+
+    Args:
+        pinned: The system with its outputs pinned.
+        reference: The function t -> R(t).
+        times: Times in s, increasing, shape (k,).
+        guess: A state near the first one, shape (n,).
+        parameters: The function t -> values of all parameters.
+    """
     points: list[Point] = []
     ending = None
     try:
@@ -90,7 +98,7 @@ class _Pursuit:
         self,
         pinned: PinnedOutputs,
         reference: Reference,
-        parameters: FloatArray,
+        parameters: Callable[[float], FloatArray],
         times: list[float],
         guess: FloatArray,
     ) -> None:
@@ -103,11 +111,11 @@ class _Pursuit:
         self._time = times[0]
         goal, when = self._goal(self._time), f"t = {self._time:.6g} s"
         try:
-            start = pinned.state(goal, guess, parameters)
+            start = pinned.state(goal, guess, parameters(self._time))
         except InconsistentStateError as error:
             ending = Ending(Cause.NO_START, self._time, f"{error} ({when})")
             raise _MotionEnd(ending) from error
-        self._last = pinned.point(start, goal, parameters)
+        self._last = pinned.point(start, goal, parameters(self._time))
         if pinned.regularity(self._last) is not Regularity.REGULAR:
             text = (
                 f"{self._name}: at the start, {when}, x = {show(start)}, A(x) or B(x) is singular, "
@@ -173,10 +181,11 @@ class _Pursuit:
         """An integrator of x' = f* + h* u from the last point."""
 
         def rate(time: float, state: FloatArray) -> FloatArray:
-            return self._pinned.rate(state, self._goal(time), self._parameters)
+            return self._pinned.rate(state, self._goal(time), self._parameters(time))
 
         def slopes(time: float, state: FloatArray) -> FloatArray:
-            matrix = self._pinned.slopes(state, self._goal(time), self._parameters)[0]
+            goal, parameters = self._goal(time), self._parameters(time)
+            matrix = self._pinned.slopes(state, goal, parameters)[0]
             if not np.all(np.isfinite(matrix)):
                 raise self._end(time - self._time)
             return matrix
@@ -221,12 +230,12 @@ class _Pursuit:
                 f"{self._name}: after {STEPS} steps the motion is at t = {self._time:.6g} s; it is "
                 "too fast to be followed so far",
             )
-        goal = self._goal(time)
-        found, converged = self._pinned.project(state, goal, self._parameters)
+        goal, parameters = self._goal(time), self._parameters(time)
+        found, converged = self._pinned.project(state, goal, parameters)
         near = JUMP * np.maximum(1.0, np.abs(last.state)) + np.abs(state - last.state)
         if not converged or np.any(np.abs(found - state) > near):
             return False
-        point = self._pinned.point(found, goal, self._parameters)
+        point = self._pinned.point(found, goal, parameters)
         regular = self._pinned.regularity(point) is Regularity.REGULAR
         if not regular or point.signs != last.signs:
             return False
@@ -253,9 +262,9 @@ class _Pursuit:
                 f"{show(last.state)}: the reference jumps, or the domain of the system ends",
             )
         ahead = min(ahead, self._times[-1] - self._time)
-        goal = self._goal(self._time + ahead)
+        goal, parameters = self._goal(self._time + ahead), self._parameters(self._time + ahead)
         beyond = any(
-            self._pinned.project(guess, goal, self._parameters)[1]
+            self._pinned.project(guess, goal, parameters)[1]
             for guess in (last.state, last.state + ahead * last.rate)
         )
         matrix, smallest = "AB"[which], f"smallest singular value {last.margins[which]:.2g}"

@@ -5,11 +5,14 @@ that is 0, the reference alone determines the motion. All is done in the state x
 on the choice of xi in (22).
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.dae import references
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
@@ -78,6 +81,7 @@ class ZeroDynamics:
         times: ArrayLike,
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
+        exogenous: Sequence[references.Reference] = (),
     ) -> PinnedMotion:
         """The motion on Z(R(t)) from a state next to the guess, as far as it exists.
 
@@ -89,8 +93,11 @@ class ZeroDynamics:
             times: Times in s, increasing, shape (k,).
             guess: A state near the first one; it decides which of several solutions is followed.
             parameters: Values of all parameters.
+            exogenous: How the exogenous signals move, as for `make_closed_loop`; without any they
+                stand still.
 
         Raises:
+            ReferenceSignalError: An exogenous signal is not smooth enough.
             ModelError: A shape is wrong, or the times do not increase. Any other failure is told by
                 the motion that comes back; see `PinnedMotion.ending`.
         """
@@ -98,7 +105,7 @@ class ZeroDynamics:
         if grid.size == 0 or np.any(np.diff(grid) <= 0.0):
             raise ModelError(f"{self.system.name}: times must increase, got {times!r}")
         start, p = self._guess(guess), self.system.parameter_vector(parameters)
-        return follow(self._pinned, reference, grid, start, p)
+        return follow(self._pinned, reference, grid, start, self._moving(p, exogenous))
 
     def equilibrium(
         self,
@@ -210,6 +217,31 @@ class ZeroDynamics:
         values, errors = linearized_eigenvalues(self._pinned, sizes, rest, goal, p)
         place = f"at the equilibrium with {self._pinned.describe(goal)}"
         return judge(values, errors, rest, place)
+
+    def _moving(
+        self, parameters: FloatArray, exogenous: Sequence[references.Reference]
+    ) -> Callable[[float], FloatArray]:
+        """The function t -> values of all parameters."""
+        if not exogenous:
+            return lambda time: parameters
+        structure, system = self.structure, self.system
+        residual, v = structure.manifold.residual_expression, structure.elimination.alpha
+        matrices = (structure.control_matrix, structure.elimination.constraint_matrix)
+        degrees = system.exogenous_degrees(residual, structure.chain, structure.drift, v, *matrices)
+        given = sum(reference.size for reference in exogenous)
+        if given != len(degrees):
+            raise ModelError(
+                f"{system.name}: exogenous covers {given} signals, the system has {len(degrees)}"
+            )
+        signals = references.stack_references(exogenous, degrees)
+        places = system.exogenous_places(degrees)
+
+        def at(time: float) -> FloatArray:
+            values = parameters.copy()
+            values[places] = signals(time)
+            return values
+
+        return at
 
     def _vector(self, what: str, value: ArrayLike, size: int | None = None) -> FloatArray:
         return vector(f"{self.system.name}: {what}", np.ravel(value), size)
