@@ -12,6 +12,7 @@ from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
@@ -173,10 +174,27 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
     with at("start"):
         guess = start_guess(scenario.start.positions, model.links)
         q = _configuration(model, positions, guess, parameters)
-        plant.set_consistent_state(own, model.rest_state(q, forces, parameters))
+        state = model.rest_state(q, forces, parameters)
+        if model.dae.exogenous:
+            state = _in_motion(loop, context, wanted, state)
+        plant.set_consistent_state(own, state)
     if loop.sensor is not None:
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), forces)
         loop.set_seed(context, scenario.force.seed)
+
+
+def _in_motion(
+    loop: ClosedLoop, context: Context, wanted: FloatArray, guess: FloatArray
+) -> FloatArray:
+    """The state whose outputs move as their references do, but for their errors.
+
+    Where something moves, nothing that touches it is at rest.
+    """
+    law, controller = loop.controller.law, loop.controller
+    goal = loop.reference.reference(context.get_time())
+    goal[law.layout.lowest] = wanted
+    parameters = controller.current_parameters(controller.GetMyContextFromRoot(context))
+    return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, parameters)
 
 
 @at("start.errors")

@@ -183,6 +183,8 @@ class Matrices:
 class Start:
     """A start at rest, on the constraints, with given errors of the outputs.
 
+    Where a scenario has `exogenous` signals, the robot starts in motion with its references.
+
     Attributes:
         positions: Joint name -> position near which the robot starts, in rad or m; the robot's
             default where not given.

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
 from typing import Self
 
 import casadi as ca
@@ -159,8 +158,6 @@ class RobotModel:
     ) -> FloatArray:
         """The state at rest in a configuration with given constraint forces.
 
-        Where a constraint moves, v are the smallest velocities that keep it.
-
         What the stages need to hold the robot there (shaft positions, currents, actuator forces)
         is solved for: v = 0, v' = 0, s' = 0.
 
@@ -185,23 +182,7 @@ class RobotModel:
                 f"{show(q)} with forces {load}; {left:.2g} N m is left. It "
                 "has fewer actuators than joints"
             )
-        if self.dae.exogenous:
-            rate, slope = self._carried(q, values)
-            nv = self.links.v.numel()
-            state[q.size : q.size + nv] = -np.linalg.pinv(slope.reshape(rate.size, nv)) @ rate
         return state
-
-    @cached_property
-    def _carried(self) -> TracedFunction:
-        """phi' at v = 0 where phi moves, and its slope J, as a function of q and parameters."""
-        kinematics = self.links.kinematics()
-        holonomic = [c for c in self.constraints if c.residual(kinematics).numel()]
-        bound = ConstraintSet(holonomic)
-        phi = kinematics.value(bound.residual(kinematics))
-        slope = ca.jacobian(kinematics.value(bound.rate(kinematics)), self.links.v)
-        outputs = {"rate": self.dae.exogenous_rate(phi), "slope": slope}
-        inputs = {"q": self.links.q, "parameters": self.dae.parameter_symbol}
-        return TracedFunction(f"{self.name} carried", inputs, outputs, often=False)
 
     def _check_exogenous(self) -> None:
         """Refuses to move what restricts velocities alone: its own rate would lack a part."""
