@@ -151,7 +151,9 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
         q = _configuration(model, positions, guess, parameters)
         plant.set_consistent_state(own, model.rest_state(q, forces, parameters))
     if loop.sensor is not None:
-        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), forces)
+        force = np.zeros(model.dae.num_constraints)
+        force[list(model.steered)] = forces
+        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
         loop.set_seed(context, scenario.force.seed)
 
 
