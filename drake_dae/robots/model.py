@@ -203,7 +203,7 @@ class RobotModel:
         if m > nu:
             raise ModelError(
                 f"{self.name}: {m} constraint forces are outputs, but {nu} actuators can steer "
-                f"{nu} outputs; name in `forces` those that shall be outputs, take constraints "
+                f"{nu} outputs; name in `forces` those that are outputs, take constraints "
                 "away, or add actuators"
             )
         if count + m != nu:

@@ -1,13 +1,11 @@
 """Couplers and rods: from a plant, and what they do, by Drake and by hand."""
 
-import re
-
 import casadi as ca
 import numpy as np
 import pytest
 from arms import fixed_step
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     PrismaticJoint,
     RevoluteJoint,
@@ -120,6 +118,28 @@ def test_gears_of_a_plant_are_couplers():
     np.testing.assert_allclose(q, [0.3, -3.0 * 0.3 + 0.25], atol=1e-12)
 
 
+@pytest.mark.parametrize("leader", [0, 1, 2])
+def test_fingers_that_all_mirror_one_finger_have_couplers_of_their_own(leader):
+    """q_i + q_leader = offset_i says the same about both; the names differ, and so do the laws."""
+    plant = MultibodyPlant(0.0)
+    inertia = SpatialInertia.SolidSphereWithMass(0.3, 0.05)
+    joints = []
+    for k in range(3):
+        body = plant.AddRigidBody(f"finger{k}", inertia)
+        frames = plant.world_frame(), body.body_frame()
+        joints.append(plant.AddJoint(RevoluteJoint(f"hinge{k}", *frames, [0, 0, 1])))
+    plant.AddJointActuator("motor", joints[leader])
+    others = [k for k in range(3) if k != leader]
+    for k in others:
+        plant.AddCouplerConstraint(joints[k], joints[leader], -1.0, 0.1 * k)
+    plant.Finalize()
+    outputs = [JointPositions([f"hinge{leader}"])]
+    model = RobotModel.from_multibody(plant, [], outputs, forces=[])
+    q = model.configuration([0.7], np.zeros(3))
+    np.testing.assert_allclose(q[others], 0.1 * np.array(others) - 0.7, atol=1e-12)
+    assert len({constraint.name for constraint in model.constraints}) == 2
+
+
 def test_rods_of_a_plant_are_fixed_distances():
     """Behind the constraints that are given."""
 
@@ -161,54 +181,6 @@ def test_what_a_plant_has_besides_is_refused(add, message):
 
 
 # What they do.
-
-
-def accelerations(plant, q, v, u, wrenches, frames):
-    """v' of a continuous MultibodyPlant, with wrenches at the origins of frames, by Drake."""
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    plant.SetVelocities(context, v)
-    plant.get_actuation_input_port().FixValue(context, u)
-    applied = []
-    for name, wrench in zip(frames, wrenches.reshape(-1, 6), strict=True):
-        frame = plant.GetFrameByName(name)
-        force = ExternallyAppliedSpatialForce()
-        force.body_index = frame.body().index()
-        force.p_BoBq_B = frame.GetFixedPoseInBodyFrame().translation()
-        force.F_Bq_W = type(force.F_Bq_W)(wrench[:3], wrench[3:])
-        applied.append(force)
-    plant.get_applied_spatial_force_input_port().FixValue(context, applied)
-    return plant.EvalTimeDerivatives(context).CopyToVector()[q.size :]
-
-
-def frames_of(block):
-    return [signal.name.split(".")[1] for signal in block.wrench_signals[::6]]
-
-
-def test_wrenches_of_a_coupler_are_what_drake_lacks():
-    """A continuous MultibodyPlant, which knows no coupler, moves as the robot does when the
-    wrenches of the port act on it; 1e-9 on accelerations of up to 1e2 is round-off."""
-    plant = parsed(gripper())
-    free = MultibodyPlant(0.0)
-    Parser(free).AddModelsFromString(re.sub("<mimic.*?/>", "", gripper()), "urdf")
-    free.Finalize()
-    model = RobotModel.from_multibody(plant, [], [JointPositions(["arm"])])
-    block = RobotPlant(model)
-    context = block.CreateDefaultContext()
-    random = np.random.default_rng(0)
-    for _ in range(3):
-        arm, left, arm_rate, rate = random.uniform(-0.5, 0.5, 4)
-        q = np.array([arm, left, 0.05 - 0.7 * left])
-        v = np.array([arm_rate, rate, -0.7 * rate])
-        u = random.uniform(-20.0, 20.0, 2)
-        block.set_state(context, [*q, *v])
-        block.GetInputPort("control").FixValue(context, u)
-        wrenches = block.GetOutputPort("constraint_wrenches").Eval(context)
-        ours = block.EvalTimeDerivatives(context).CopyToVector()[3:]
-        drake = accelerations(free, q, v, u, wrenches, frames_of(block))
-        np.testing.assert_allclose(ours, drake, rtol=1e-9, atol=1e-9)
-        assert ours[2] == pytest.approx(-0.7 * ours[1], abs=1e-10)
-        assert abs(drake - accelerations(free, q, v, u, np.zeros(0), [])).max() > 1.0
 
 
 def geared(ratio=-3.0):

@@ -1,6 +1,6 @@
-"""Constraints, a surface and a stage that the package does not know, each one class in `members`.
+"""Members of the families in simulations and closed loops, compared with closed forms.
 
-They are simulated and controlled as those of the package are, and compared with closed forms.
+Most of them the package does not know: each of these is one class in `members`.
 """
 
 import casadi as ca

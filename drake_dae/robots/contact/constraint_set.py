@@ -54,9 +54,9 @@ class ConstraintSet:
             return tuple(range(len(names)))
         for name in forces:
             if name not in names:
-                raise ModelError(f"forces: {unknown_name('constraint force', name, names)}")
+                raise ModelError(unknown_name("constraint force", name, names))
         if len(set(forces)) < len(forces):
-            raise ModelError(f"forces names one twice: {', '.join(forces)}")
+            raise ModelError(f"a constraint force is named twice: {', '.join(forces)}")
         return tuple(names.index(name) for name in forces)
 
     def parts(self) -> Iterator[tuple[Constraint, slice]]:

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import brief
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint
@@ -55,8 +56,8 @@ class JointCoupler(Constraint):
             raise ModelError(f"'{self.follower}' cannot follow itself; name another leader")
         if self.ratio == 0.0:
             raise ModelError("ratio must not be zero; weld the joint if it shall not move")
-        if self.unit not in ("rad", "m"):
-            raise ModelError(f"unit must be 'rad' or 'm', got '{self.unit}'")
+        if not isinstance(self.unit, str) or self.unit not in ("rad", "m"):
+            raise ModelError(f"unit must be 'rad' or 'm', got {brief(self.unit)}")
         ratio = Parameter(f"{self.name}.ratio", np.array([self.ratio]))
         offset = Parameter(f"{self.name}.offset", np.array([self.offset]), self.unit)
         object.__setattr__(self, "parameters", (ratio, offset))

@@ -8,6 +8,7 @@ from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
 
+from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.couplers import JointCoupler
@@ -51,22 +52,28 @@ def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
         raise ModelError(
             f"the plant has a constraint that is not supported ({error}); leave it out of the plant"
         ) from None
+    followers: set[Signal] = set()
     index = {variable.get_id(): i for i, variable in enumerate(q)}
     for binding in program.GetAllConstraints():
         row = binding.evaluator()
-        if not isinstance(row, LinearEqualityConstraint):
+        if not isinstance(row, LinearEqualityConstraint) or binding.variables().size != 2:
             continue
-        first, second = (links.position_signals[index[v.get_id()]] for v in binding.variables())
-        of_first, of_second = np.asarray(row.GetDenseA(), dtype=float).reshape(2)
-        # The follower is the one with the factor 1.
-        if of_first == 1.0:
-            follower, leader, factor = first, second, of_second
-        else:
-            follower, leader, factor = second, first, of_first
-        name = f"{follower.name}_coupler"
-        offset = float(row.lower_bound()[0])
+        names = [links.position_signals[index[v.get_id()]] for v in binding.variables()]
+        factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
+        # The follower has the factor 1. Where both have it, either may; nobody follows twice.
+        able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
+        place = next((i for i in able if names[i] not in followers), able[0])
+        follower, leader = names[place], names[1 - place]
+        followers.add(follower)
         unit: Literal["rad", "m"] = "m" if follower.unit == "m" else "rad"
-        yield JointCoupler(follower.name, leader.name, -float(factor), offset, unit, name)
+        yield JointCoupler(
+            follower.name,
+            leader.name,
+            -factors[1 - place] / factors[place],
+            float(row.lower_bound()[0]) / factors[place],
+            unit,
+            f"{follower.name}_coupler",
+        )
 
 
 def _rods(plant: MultibodyPlant) -> Iterator[FixedDistance]:
