@@ -42,7 +42,15 @@ Surface = Annotated[
     Choice(_WRITTEN),
 ]
 Constraint = Annotated[
-    contact.PointOnSurface | parts.WeldedFrames | contact.CoincidentPoints,
+    contact.PointOnSurface
+    | parts.WeldedFrames
+    | contact.CoincidentPoints
+    | contact.FixedDistance
+    | contact.JointCoupler
+    | contact.AxisNormalToSurface
+    | contact.Blade
+    | contact.RollingWheel
+    | contact.RollingBall,
     Choice({**_WRITTEN, surface.Surface: Surface}),
 ]
 Output = Annotated[
@@ -88,8 +96,11 @@ class Scenario:
     Attributes:
         description: One line for `drake-dae list`.
         robot: The file that the robot is read from.
-        constraints: What it touches or holds; a form without a tag is a PointOnSurface.
+        constraints: What it touches or holds; a form without a tag is a PointOnSurface. Those that
+            the robot's file has, as mimic joints, follow them.
         outputs: Position outputs; the constraint forces follow them.
+        forces: Names of the constraint forces that are outputs; all where left out. Forces that
+            nobody can or shall steer, as those of wheels and of mimic joints, stay out: [] is none.
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not.
@@ -107,6 +118,7 @@ class Scenario:
     robot: parts.Robot
     constraints: list[Constraint] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
+    forces: list[str] | None = None
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)

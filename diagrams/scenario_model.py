@@ -21,6 +21,8 @@ from drake_dae.diagrams.scenario_parts import Robot, Written, made
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
 from drake_dae.robots.contact import Constraint
+from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.contact.plant_constraints import plant_constraints
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.model import RobotModel
@@ -51,10 +53,19 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     outputs = _outputs(scenario.outputs, constraints, links)
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
+    _check_forces(scenario.forces, constraints, links)
     _check_exogenous(scenario.exogenous, links, constraints, stages)
     with at("actuation" if stages else "outputs"):
-        moving = tuple(scenario.exogenous)
-        return RobotModel(links, constraints, outputs, guess, name, stages, moving)
+        return RobotModel(
+            links,
+            constraints,
+            outputs,
+            guess,
+            name,
+            stages,
+            scenario.forces,
+            tuple(scenario.exogenous),
+        )
 
 
 def scenario_structure(model: RobotModel) -> Structure:
@@ -98,6 +109,7 @@ def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
             f"'{Path(robot.file).name}' has no actuators; in a URDF, give each driven joint a "
             "<transmission>"
         )
+    plant_constraints(links)
     return links
 
 
@@ -197,13 +209,28 @@ def _constraints(
     forms: Sequence[Constraint | Written[Constraint]], links: Links
 ) -> list[Constraint]:
     constraints = each("constraints", forms, lambda form: made(form, ()))
-    each("constraints", constraints, lambda constraint: constraint.residual(links))
-    names = [constraint.name for constraint in constraints]
-    for index, name in enumerate(names):
-        if not name or name in names[:index]:
+    each("constraints", constraints, lambda constraint: _try(constraint, links))
+    taken = [constraint.name for constraint in plant_constraints(links)]
+    for index, constraint in enumerate(constraints):
+        name = constraint.name
+        if not name or name in taken:
             key = f"constraints.{index}.name"
             raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
+        taken.append(name)
     return constraints
+
+
+def _try(constraint: Constraint, links: Links) -> None:
+    """Writes a constraint's equations, so that what it names is looked for."""
+    if constraint.residual(links).numel() < len(constraint.force_signals):
+        constraint.rate(links.kinematics())
+
+
+@at("forces")
+def _check_forces(
+    forces: Sequence[str] | None, constraints: Sequence[Constraint], links: Links
+) -> None:
+    ConstraintSet([*constraints, *plant_constraints(links)]).places(forces)
 
 
 def _outputs(

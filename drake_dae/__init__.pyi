@@ -34,8 +34,14 @@ from .errors import DrakeDaeError as DrakeDaeError
 from .robots.actuation.dc_motors import DcMotors as DcMotors
 from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
+from .robots.contact.alignment import AxisNormalToSurface as AxisNormalToSurface
+from .robots.contact.couplers import JointCoupler as JointCoupler
 from .robots.contact.points import CoincidentPoints as CoincidentPoints
+from .robots.contact.points import FixedDistance as FixedDistance
 from .robots.contact.points import PointOnSurface as PointOnSurface
+from .robots.contact.rolling import Blade as Blade
+from .robots.contact.rolling import RollingBall as RollingBall
+from .robots.contact.rolling import RollingWheel as RollingWheel
 from .robots.contact.surfaces import Cylinder as Cylinder
 from .robots.contact.surfaces import Ellipsoid as Ellipsoid
 from .robots.contact.surfaces import ImplicitSurface as ImplicitSurface

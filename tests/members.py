@@ -3,57 +3,18 @@
 They show what it takes to add one, and keep the contracts as those of the package do.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 
 from drake_dae import PointOnSurface
-from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.dae.signals import Signal
 from drake_dae.robots.actuation.numbers import diagonal_parameter
 from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.contact.constraint import Application, Constraint
 from drake_dae.robots.contact.surface import Surface
-
-
-@dataclass(frozen=True)
-class FixedDistance(Constraint):
-    """A rod without mass between a point of frame A and a point of frame B.
-
-    Positive is its thrust in N, by which it pushes the points apart.
-    """
-
-    frame_a: str
-    point_a: tuple
-    frame_b: str
-    point_b: tuple
-    length: float
-    name: str = "rod"
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False)
-
-    def __post_init__(self):
-        own = Parameter(f"{self.name}.length", self.length, "m", positive=True)
-        object.__setattr__(self, "parameters", (own,))
-
-    @property
-    def force_signals(self):
-        return (Signal(f"{self.name}.thrust", "N"),)
-
-    @property
-    def residual_signals(self):
-        return (Signal(f"{self.name}.stretch", "m"),)
-
-    def _apart(self, frames):
-        start = frames.position(self.frame_a, self.point_a)
-        return frames.position(self.frame_b, self.point_b) - start
-
-    def residual(self, frames):
-        return ca.norm_2(self._apart(frames)) - self.parameters[0].symbol
-
-    def application(self, kinematics):
-        apart = self._apart(kinematics)
-        point = kinematics.position(self.frame_b, self.point_b)
-        return Application(point, apart / ca.norm_2(apart), ca.SX(3, 1))
 
 
 @dataclass(frozen=True)
@@ -62,6 +23,7 @@ class RubbingPoint(PointOnSurface):
 
     friction: float = 0.3
     speed: float = 0.05
+    is_ideal: ClassVar[bool] = False
 
     def _sliding(self, kinematics):
         """s = v_t / sqrt(|v_t|^2 + speed^2), shape (3, 1)."""
@@ -75,44 +37,20 @@ class RubbingPoint(PointOnSurface):
         pushed = super().reaction(kinematics, constraint_force)
         return pushed + kinematics.push(self.frame, rubbing, self.point)
 
-    def application(self, kinematics):
-        own = super().application(kinematics)
+    def applications(self, kinematics):
+        (own,) = super().applications(kinematics)
         rubbing = -self.friction * self._sliding(kinematics)
-        return Application(own.point, own.force_axes + rubbing, own.moment_axes)
+        return (Application(own.point, own.force_axes + rubbing, own.moment_axes, self.frame),)
 
 
 @dataclass(frozen=True)
-class Skate(Constraint):
-    """The origin of a frame does not move along the frame's y axis: no constraint on positions."""
-
-    frame: str
-    name: str = "skate"
-
-    @property
-    def force_signals(self):
-        return (Signal(f"{self.name}.side_force", "N"),)
-
-    @property
-    def residual_signals(self):
-        return (Signal(f"{self.name}.side_speed", "m/s"),)
-
-    def rate(self, kinematics):
-        return ca.dot(kinematics.rotation(self.frame)[:, 1], kinematics.velocity(self.frame))
-
-    def application(self, kinematics):
-        sideways = kinematics.rotation(self.frame)[:, 1]
-        return Application(kinematics.position(self.frame), sideways, ca.SX(3, 1))
-
-
-@dataclass(frozen=True)
-class Coupler(Constraint):
-    """Two joints turn together, q_i + ratio q_j = offset; its moment acts at no point."""
+class Mirror(Constraint):
+    """Two angles turn against each other, q_i + q_j = sum; its moment acts at no known frame."""
 
     first: int
     second: int
-    ratio: float
-    offset: float
-    name: str = "coupler"
+    sum: float
+    name: str = "mirror"
 
     @property
     def force_signals(self):
@@ -123,10 +61,10 @@ class Coupler(Constraint):
         return (Signal(f"{self.name}.slip", "rad"),)
 
     def residual(self, frames):
-        return frames.q[self.first] + self.ratio * frames.q[self.second] - self.offset
+        return frames.q[self.first] + frames.q[self.second] - self.sum
 
-    def application(self, kinematics):
-        return None
+    def applications(self, kinematics):
+        return ()
 
 
 @dataclass(frozen=True)

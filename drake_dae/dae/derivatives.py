@@ -139,9 +139,12 @@ class Derivatives:
         if ca.depends_on(matrix, unknowns):
             return None
         blocks = []
+        waiting = list(range(unknowns.numel()))
         for rows, columns in _diagonal_blocks(matrix.sparsity()):
-            own = unknowns[columns]
-            known = ca.substitute(equations[rows], own, ca.SX.zeros(own.numel()))
+            own, ahead = unknowns[columns], unknowns[waiting]
+            # What is solved for later may stand here with a slope that cancels.
+            known = ca.substitute(equations[rows], ahead, ca.SX.zeros(ahead.numel()))
+            waiting = [column for column in waiting if column not in columns]
             factors = Factorization(ca.densify(matrix[rows, columns]))
             blocks.append((own, factors.solve(-known), factors.pivot))
         # From the control back to what it needs: the rest moves, but nobody asks for it.

@@ -19,6 +19,7 @@ from drake_dae.robots.actuation.chain import ActuationChain, chain
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.contact.plant_constraints import plant_constraints
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.outputs import PositionOutput
@@ -34,34 +35,40 @@ class RobotModel:
         0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
 
     with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T; one
-    that restricts velocities alone has its rate in place of phi. With rigid joints tau = u; stages
-    of actuation put their own dynamics between u and tau: E s' = drift(q, v, s) + drive u,
-    tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the constraint
-    input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many position
-    outputs as there are actuators less constraints.
+    that restricts velocities alone has its rate in place of phi, and r = 1. With rigid joints
+    tau = u; stages of actuation put their own dynamics between u and tau: E s' = drift(q, v, s) +
+    drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the
+    constraint input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many
+    position outputs as actuators less constraints. Where fewer forces can or shall be steered, as
+    those of wheels and of mimic joints, `forces` names these: z_2 = S lambda, and there are as many
+    position outputs as actuators less these. All of lambda is on the plant's port nevertheless.
 
     Args:
         links: The links, which provide M, H and the frames.
-        constraints: The constraints phi, one below the other; a robot without moves freely.
+        constraints: The constraints phi, one below the other; a robot without moves freely. Those
+            of the links' MultibodyPlant follow them: see `plant_constraints`.
         positions: The position outputs h_1, one below the other.
         nominal_positions: A configuration of the robot at work, shape (nq,), near which the
             structure is examined; `links.default_positions` if None.
         name: The robot's name in messages.
         actuation: The stages from the joints toward the motor; none is rigid joints.
+        forces: Names of the constraint forces that are outputs, in their order; all if None.
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, constraints, positions, name: The arguments.
+        links, positions, name: The arguments.
+        constraints: The constraints, with those of the plant.
+        steered: Which of the constraint forces are outputs, in their order: the rows of S.
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
         control_limits: The largest |u| per actuator, infinite where there is none or where u is
             no joint force.
 
     Raises:
-        ModelError: There are too many or too few outputs, M is not positive definite, or stages
-            do not fit.
+        ModelError: There are too many or too few outputs, M is not positive definite, stages do not
+            fit, or the plant has a constraint that cannot be read.
     """
 
     def __init__(
@@ -72,15 +79,17 @@ class RobotModel:
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
+        forces: Sequence[str] | None = None,
         exogenous: Sequence[str] = (),
     ) -> None:
         self.links = links
-        self.constraints = tuple(constraints)
+        self.constraints = (*constraints, *plant_constraints(links))
         self.positions = tuple(positions)
         self.name = name
         bound = ConstraintSet(self.constraints)
+        self.steered = bound.places(forces)
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
-        self._check_outputs(bound.size, h_1.numel())
+        self._check_outputs(len(self.steered), h_1.numel())
         driven = chain(actuation, links)
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
@@ -93,7 +102,7 @@ class RobotModel:
         self._check_exogenous()
         self._check_mass_matrix(nominal)
         self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
-        self._balance = Balance(self.dae, links.q, links.v)
+        self._balance = Balance(self.dae, links.q, links.v, self.steered)
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
@@ -106,6 +115,7 @@ class RobotModel:
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
+        forces: Sequence[str] | None = None,
         exogenous: Sequence[str] = (),
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
@@ -114,12 +124,14 @@ class RobotModel:
             ModelError: The plant has what cannot be represented; the message names it.
         """
         links = MultibodyExpressions(plant)
-        return cls(links, constraints, positions, nominal_positions, name, actuation, exogenous)
+        return cls(
+            links, constraints, positions, nominal_positions, name, actuation, forces, exogenous
+        )
 
     @property
     def position_signals(self) -> tuple[Signal, ...]:
         """Names and units of z_1."""
-        return self.dae.output_signals[: self.dae.num_controls - self.dae.num_constraints]
+        return self.dae.output_signals[: self.dae.num_controls - len(self.steered)]
 
     def configuration(
         self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
@@ -127,7 +139,7 @@ class RobotModel:
         """q = psi(z_1) of (58): the consistent configuration with given position outputs.
 
         Args:
-            outputs: z_1, shape (nu - m,); None leaves them free.
+            outputs: z_1, shape (nu - k,) where k forces are outputs; None leaves them free.
             guess: Where Newton's method starts, shape (nq,).
             parameters: Values of all parameters; the defaults if None.
 
@@ -159,11 +171,11 @@ class RobotModel:
         """The state at rest in a configuration with given constraint forces.
 
         What the stages need to hold the robot there (shaft positions, currents, actuator forces)
-        is solved for: v = 0, v' = 0, s' = 0.
+        is solved for, with the forces that are no outputs: v = 0, v' = 0, s' = 0.
 
         Args:
             positions: q, shape (nq,), on the constraints.
-            forces: lambda, shape (m,).
+            forces: The constraint forces that are outputs, z_2, shape (k,): lambda if all are.
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
@@ -174,7 +186,7 @@ class RobotModel:
         """
         values = self.dae.parameter_vector(parameters)
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
-        load = vector(f"{self.name}: forces", forces, self.dae.num_constraints)
+        load = vector(f"{self.name}: forces", forces, len(self.steered))
         state, left = self._balance.rest(q, load, values)
         if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
@@ -189,14 +201,15 @@ class RobotModel:
         moving = {p.name for p in self.dae.exogenous}
         for constraint in self.constraints:
             names = [p.name for p in constraint.parameters if p.name in moving]
-            if names and not constraint.residual(self.links).numel():
+            rows = constraint.residual(self.links).numel()
+            if names and rows < len(constraint.force_signals):
                 raise ModelError(
                     f"{self.name}: '{names[0]}' cannot move, since '{constraint.name}' restricts "
-                    "velocities alone"
+                    "velocities"
                 )
 
     def _check_outputs(self, m: int, count: int) -> None:
-        """Refuses outputs that, with the m constraint forces, are not as many as the actuators."""
+        """Refuses outputs that, with m constraint forces, are not as many as the actuators."""
         actuation = self.links.actuation_matrix
         nu = actuation.shape[1]
         rank = int(np.linalg.matrix_rank(actuation)) if nu else 0
@@ -209,7 +222,8 @@ class RobotModel:
         if m > nu:
             raise ModelError(
                 f"{self.name}: {m} constraint forces are outputs, but {nu} actuators can steer "
-                f"{nu} outputs; take constraints away, or add actuators"
+                f"{nu} outputs; name in `forces` those that are outputs, take constraints "
+                "away, or add actuators"
             )
         if count + m != nu:
             names = [s.name for p in self.positions for s in p.signals(self.links)]
@@ -248,6 +262,8 @@ class RobotModel:
             return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
         position_signals = tuple(s for p in self.positions for s in p.signals(links))
+        force_signals = bound.force_signals
+        S = ca.SX.eye(m)[list(self.steered), :]
         return DaeSystem(
             state=ca.vertcat(links.q, links.v, driven.state),
             mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
@@ -255,18 +271,18 @@ class RobotModel:
             g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
             h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(B, driven.direct), driven.drive),
             k=bound.constraint_output(links.kinematics()),  # (44)
-            l=ca.vertcat(h_1, ca.SX(m, 1)),  # (45)
-            m=ca.vertcat(ca.SX(nu - m, m), ca.SX.eye(m)),
+            l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
+            m=ca.vertcat(ca.SX(nu - S.shape[0], m), S),
             parameters=(*links.parameters, *driven.parameters, *bound.parameters),
             state_signals=(
                 *links.position_signals,
                 *links.velocity_signals,
                 *driven.state_signals,
             ),
-            constraint_input_signals=bound.force_signals,
+            constraint_input_signals=force_signals,
             constraint_output_signals=bound.residual_signals,
             control_signals=driven.control_signals,
-            output_signals=(*position_signals, *bound.force_signals),
+            output_signals=(*position_signals, *(force_signals[i] for i in self.steered)),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
             implicit=implicit,
@@ -283,7 +299,7 @@ class RobotModel:
         """The state at rest on the constraints: shafts off them would strain the springs."""
         with suppress(InconsistentStateError):
             nominal = self.configuration(None, nominal)
-        forces = np.zeros(self.dae.num_constraints)
+        forces = np.zeros(len(self.steered))
         return self._balance.rest(nominal, forces, self.dae.parameter_values)[0]
 
     def _check_mass_matrix(self, nominal: FloatArray) -> None:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arguments import checked, result_of
-from drake_dae.arrays import check_axes, unknown_name
+from drake_dae.arrays import check_axes
 from drake_dae.dae.expressions import as_expression
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.surface import Vector
+from drake_dae.robots.links.kinematics import position_index
 from drake_dae.robots.links.links import Links
 
 
@@ -128,11 +129,7 @@ class JointPositions(PositionOutput):
     joints: Sequence[str]
 
     def expression(self, links: Links) -> ca.SX:
-        names = [signal.name for signal in links.position_signals]
-        for joint in self.joints:
-            if joint not in names:
-                raise ModelError(unknown_name("joint position", joint, names))
-        return links.q[[names.index(joint) for joint in self.joints]]
+        return links.q[[position_index(links, joint) for joint in self.joints]]
 
     def signals(self, links: Links) -> tuple[Signal, ...]:
         units = {signal.name: signal.unit for signal in links.position_signals}

@@ -1,5 +1,7 @@
 """Where a robot can stand (58), and what holds it there: two problems for Newton's method."""
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
@@ -57,15 +59,17 @@ class Balance:
     Args:
         dae: The robot's system, with the state (q, v, s).
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
+        given: Which entries of lambda are given; the others are solved for as well.
     """
 
-    def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX) -> None:
+    def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX, given: Sequence[int]) -> None:
         links = q.numel() + v.numel()
         control = ca.SX.sym("u", dae.num_controls)
         force = ca.SX.sym("lambda", dae.num_constraints)
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
         balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
-        unknown = ca.vertcat(dae.state[links:], control)
+        free = [i for i in range(dae.num_constraints) if i not in given]
+        unknown = ca.vertcat(dae.state[links:], control, force[free])
         self._unknowns = unknown.numel()
         self._stages = dae.num_states - links
         self._still = np.zeros(v.numel())
@@ -73,8 +77,8 @@ class Balance:
             f"{dae.name} equilibrium",
             {
                 "q": q,
-                "constraint_force": force,
-                "s, u": unknown,
+                "constraint_force": force[list(given)],
+                "s, u, free forces": unknown,
                 "parameters": dae.parameter_symbol,
             },
             {"balance": balance, "gradient": ca.jacobian(balance, unknown)},
@@ -87,7 +91,7 @@ class Balance:
 
         Args:
             q: Positions, shape (nq,).
-            constraint_force: lambda, shape (m,).
+            constraint_force: The entries of lambda that are given.
             parameters: Values of all parameters.
         """
 

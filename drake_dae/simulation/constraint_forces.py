@@ -61,7 +61,7 @@ class ConstraintLoads:
         acting = [
             (constraint, part, application)
             for constraint, part in bound.parts()
-            if (application := constraint.application(kinematics)) is not None
+            for application in constraint.applications(kinematics)[:1]
         ]
         self.constraints: Sequence[Constraint] = [constraint for constraint, _, _ in acting]
         self.with_moment = [a.moment_axes.nnz() > 0 for _, _, a in acting]

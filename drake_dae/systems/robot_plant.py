@@ -1,10 +1,12 @@
 """A RobotModel as a LeafSystem."""
 
+import casadi as ca
 from pydrake.systems.framework import BasicVector, Context
 
 from drake_dae.arguments import checked
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
+from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
@@ -19,6 +21,12 @@ class RobotPlant(DaePlant):
     Output ports:
         link_state: (q, v) of the links, shape (nq + nv,), as Drake's MultibodyPlant orders it.
         joint_torque: What the stages deliver to the joints, N m (N), shape (nu,); with any stage.
+        constraint_wrenches: What each constraint does to each of its frames: 6 numbers, the moment
+            in N m and the force in N as in Drake's SpatialForce, in the world, the force at the
+            frame's origin. Frame B comes before A, and feels what the class of the constraint
+            calls positive; A feels the opposite at the same point. Their power is zero where the
+            constraint is ideal. `wrench_signals` tells the names,
+            "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
 
     A stage of actuation shows its state at ports of its own, which its class names: `motor_state`
     of `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
@@ -30,6 +38,10 @@ class RobotPlant(DaePlant):
         model: The robot.
         structure: The structure of `model.dae`; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
+
+    Attributes:
+        model: The robot.
+        wrench_signals: Names and units of `constraint_wrenches`.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -58,6 +70,7 @@ class RobotPlant(DaePlant):
                 weakly(self._calc_part, part),
                 {self.xc_ticket()},
             )
+        self._add_wrenches()
         if model.joint_force is not None:
             self._joint_force = model.dae.trace("joint torque", {"value": model.joint_force})
             self.DeclareVectorOutputPort(
@@ -66,6 +79,26 @@ class RobotPlant(DaePlant):
                 weakly(self._calc_joint_torque),
                 self._by_state,
             )
+
+    def _add_wrenches(self) -> None:
+        model, dae = self.model, self.dae
+        force = ca.SX.sym("force", dae.num_constraints)
+        bound = ConstraintSet(model.constraints)
+        wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
+        inputs = {"state": dae.state, "force": force, "parameters": dae.parameter_symbol}
+        self._wrenches = TracedFunction("constraint wrenches", inputs, {"value": wrenches})
+        self._wrench_formula = wrenches, force
+        tickets = set(self._by_state)
+        if self._force_needs_control:
+            tickets.add(self.input_port_ticket(self._control_port.get_index()))
+        size, calc = len(self.wrench_signals), weakly(self._calc_wrenches)
+        self.DeclareVectorOutputPort("constraint_wrenches", size, calc, tickets)
+
+    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
+        force = self._evaluate(self._force, context, self._force_needs_control)
+        state = context.get_continuous_state_vector().CopyToVector()
+        values = self._wrenches.evaluate(state, force, self._values(context))[0]
+        output.SetFromVector(values)
 
     def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self.state(context)[part])
@@ -76,6 +109,13 @@ class RobotPlant(DaePlant):
     def _formulas(self) -> dict[str, Formula]:
         state = self.dae.state
         formulas = super()._formulas()
+        wrenches, force = self._wrench_formula
+        derivatives = self.structure.derivatives
+        acting = ca.substitute(wrenches, force, derivatives.expand(derivatives.constraint_input))
+        formulas["constraint_wrenches"] = TracedFormula(
+            self.structure.trace("constraint wrenches", acting, self._force_needs_control),
+            signals=self._signals,
+        )
         for name, part in self._parts.items():
             function = TracedFunction(name, {"state": state}, {"value": state[part]})
             formulas[name] = TracedFormula(function)

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, fixed_step, parse
-from members import Coupler, Saddle
+from members import Mirror, Saddle
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
@@ -415,7 +415,7 @@ def test_force_and_moment_of_a_weld_are_drawn():
     assert "/contact/grasp/surface" not in objects(page)
 
 
-@pytest.mark.parametrize("constraints", [[], [Coupler(0, 1, 0.5, 0.4)]])
+@pytest.mark.parametrize("constraints", [[], [Mirror(0, 1, -0.4)]])
 def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
     """A free one, and one whose constraint force is a moment between joints."""
     plant = parse("two_link_arm")

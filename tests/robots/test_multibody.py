@@ -592,14 +592,6 @@ def revolute(name, parent, child):
     return RevoluteJoint(name, parent, child, [0, 0, 1])
 
 
-def with_constraint():
-    plant = one_body(revolute, time_step=1e-3, finalize=False)
-    body = plant.GetBodyByName("box")
-    plant.AddBallConstraint(plant.world_body(), [0, 0, 0], body, [0, 0, 0])
-    plant.Finalize()
-    return plant
-
-
 def with_bushing():
     plant = one_body(revolute, finalize=False)
     frames = plant.world_frame(), plant.GetFrameByName("box")
@@ -630,7 +622,6 @@ def with_hinge():
             lambda: one_body(lambda *args: WeldJoint(*args, RigidTransform())),
             r"no joint that moves",
         ),
-        (with_constraint, r"1 constraint\(s\), which Drake ignores.*RobotModel as `constraints`"),
         (with_bushing, r"LinearBushingRollPitchYaw.*supported are .*LinearSpringDamper"),
         (with_hinge, r"DoorHinge, which is not supported"),
     ],

@@ -1,6 +1,6 @@
-"""Constraints, a surface and a stage that the package does not know, each one class in `members`.
+"""Members of the families in simulations and closed loops, compared with closed forms.
 
-They are simulated and controlled as those of the package are, and compared with closed forms.
+Most of them the package does not know: each of these is one class in `members`.
 """
 
 import casadi as ca
@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import scipy.integrate
 from arms import arm, consistent_states, fixed_step, numbers, parse
-from members import FixedDistance, RubbingPoint, Saddle, Skate, TorqueLag
+from members import RubbingPoint, Saddle, TorqueLag
 
 from drake_dae import (
     AxisCoordinates,
+    Blade,
     ConstantReference,
     ExpressionOutput,
+    FixedDistance,
     FlexibleJoints,
     JointPositions,
     LinkExpressions,
@@ -201,7 +203,7 @@ def test_a_skate_on_a_slope_goes_along_a_cycloid():
         frames={"blade": (turned, ca.vertcat(q[0], q[1], 0.0))},
     )
     along = ExpressionOutput(lambda links: links.q[0], [Signal("x", "m")])
-    model = RobotModel(links, [Skate("blade")], [along, JointPositions(["q2"])])
+    model = RobotModel(links, [Blade("blade")], [along, JointPositions(["q2"])])
     structure = find_structure(model.dae)
     assert structure.constraint_degrees == (1,)
     assert structure.output_degrees == (2, 2, 0)

@@ -34,6 +34,7 @@ def test_ports():
         "constraint_residual": 2,
         "controlled_output": 2,
         "link_state": 4,
+        "constraint_wrenches": 12,
     }
     assert plant.num_output_ports() == len(sizes)
     for name, size in sizes.items():
@@ -45,7 +46,7 @@ def test_ports():
 def test_direct_feedthrough_is_exact():
     """With rigid joints the force feeds through; z = x of the pendulum does not."""
     for plant, through in (
-        (two_link(), {"constraint_force", "controlled_output"}),
+        (two_link(), {"constraint_force", "constraint_wrenches", "controlled_output"}),
         (DaePlant(hanging_pendulum()), {"constraint_force"}),
     ):
         control = plant.GetInputPort("control").get_index()

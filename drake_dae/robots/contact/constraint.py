@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import casadi as ca
 from pydrake.math import RigidTransform
@@ -18,17 +19,22 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 class Application:
     """Where constraint forces act: F = force_axes @ lambda and M = moment_axes @ lambda.
 
-    All vectors are in the world. Whatever the robot touches gets the opposite.
+    All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
+    opposite on A at the same point.
 
     Attributes:
         point: Where F acts, in m, shape (3, 1).
         force_axes: The force in N for a unit of each constraint force, shape (3, m).
         moment_axes: The moment in N m for a unit of each constraint force, shape (3, m).
+        frame_b: Name of frame B, which feels F and M.
+        frame_a: Name of frame A, which feels the opposite.
     """
 
     point: ca.SX
     force_axes: ca.SX
     moment_axes: ca.SX
+    frame_b: str
+    frame_a: str = "world"
 
 
 @checked(ModelError)
@@ -37,31 +43,37 @@ class Constraint(ABC):
 
     1. A constraint is written in `Kinematics` (its position part in `Frames`) and the symbols of
        its own `parameters`; it is smooth wherever the robot may be, and has no state.
-    2. `residual` is phi(q), zero where the constraint holds, one row for each of
-       `residual_signals`. One that restricts velocities alone (nonholonomic) has no rows here, and
-       gives a `rate` of its own.
-    3. `rate` is linear in velocities, shape (m, 1), and the derivative of `residual` if there is
-       one. Where the constraint holds, lambda . rate is the power of the constraint forces without
-       friction: lambda is a force in N where the rate is a velocity in m/s.
+    2. `residual` is phi(q), shape (k, 1), zero where the constraint holds. Positions are kept by
+       the first k of the m rows; the others restrict velocities alone (nonholonomic, r = 1).
+    3. `rate` is linear in velocities, shape (m, 1), and stays zero; its first k rows are the
+       derivative of `residual`. One with k < m gives a `rate` of its own. Where the constraint
+       holds, lambda . rate is the power of the constraint forces without friction: lambda is a
+       force in N where the rate is a velocity in m/s.
     4. `reaction` is linear in lambda: the gradient of that power with respect to the velocities.
        What lambda does besides, as friction, is added to it.
     5. Where `can_only_push` says that the constraint cannot pull, a positive lambda pushes.
-    6. `application` is the force and the moment of `reaction` where they act, for pictures; None
-       where they act at no point, as between the angles of two joints.
+    6. `applications` are the forces and moments of `reaction`, each on one frame, and the opposite
+       on another: of these the plant's port `constraint_wrenches` is made. There are none where
+       nobody knows at which frames they act, as between two angles in textbook equations. Pictures
+       show the first.
     7. `coordinates` tell where the robot is along what the constraint leaves free, one row for
        each of `coordinate_signals`; there may be none.
     8. `picture` is what there is to see where the robot touches, if there is anything; `placement`
        tells where its parameters put it.
-    9. Its parameters may move (see `RobotModel`) if it has a `residual`; `rate` is then that part
-       of its derivative which velocities make.
+    9. Where the constraint holds and stands still, the power of its wrenches on both frames
+       together is zero; it may be negative where `is_ideal` is false, as with friction.
+    10. Its parameters may move (see `RobotModel`) if k = m; `rate` is then that part of the
+        derivative which velocities make.
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
         parameters: Its numbers that change without tracing again.
+        is_ideal: Whether its forces take no power.
     """
 
     name: str
     parameters: tuple[Parameter, ...] = ()
+    is_ideal: ClassVar[bool] = True
 
     @property
     @abstractmethod
@@ -71,10 +83,10 @@ class Constraint(ABC):
     @property
     @abstractmethod
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of phi, or of the rate if there is no phi."""
+        """Names and units of phi, and then of the rows of the rate that are none of phi."""
 
     def residual(self, frames: Frames) -> ca.SX:
-        """phi(q), shape (m, 1); shape (0, 1) if velocities alone are restricted."""
+        """phi(q), shape (k, 1) with k <= m; k = 0 if velocities alone are restricted."""
         return ca.SX(0, 1)
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
@@ -91,8 +103,8 @@ class Constraint(ABC):
         return (False,) * len(self.force_signals)
 
     @abstractmethod
-    def application(self, kinematics: Kinematics) -> Application | None:
-        """Where the constraint forces act, or None."""
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        """Where and on what the constraint forces act."""
 
     @property
     def coordinate_signals(self) -> tuple[Signal, ...]:

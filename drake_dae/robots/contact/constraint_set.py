@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from drake_dae.arrays import unknown_name
 from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.links.links import Links
@@ -41,6 +43,22 @@ class ConstraintSet:
         """The parameters of all constraints."""
         return tuple(p for c in self.constraints for p in c.parameters)
 
+    def places(self, forces: Sequence[str] | None) -> tuple[int, ...]:
+        """Where constraint forces stand, by their names; of all if None.
+
+        Raises:
+            ModelError: There is no such force, or one is named twice.
+        """
+        names = [signal.name for signal in self.force_signals]
+        if forces is None:
+            return tuple(range(len(names)))
+        for name in forces:
+            if name not in names:
+                raise ModelError(unknown_name("constraint force", name, names))
+        if len(set(forces)) < len(forces):
+            raise ModelError(f"a constraint force is named twice: {', '.join(forces)}")
+        return tuple(names.index(name) for name in forces)
+
     def parts(self) -> Iterator[tuple[Constraint, slice]]:
         """Each constraint, and where its constraint forces stand."""
         start = 0
@@ -50,19 +68,21 @@ class ConstraintSet:
             start = stop
 
     def residual(self, frames: Frames) -> ca.SX:
-        """phi(q) of those that restrict positions, shape (k, 1)."""
+        """phi(q) of the rows that restrict positions, shape (k, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[c.residual(frames) for c in self.constraints])
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
-        """phi'(q, v), and the rates of those that restrict velocities alone, shape (m, 1)."""
+        """phi'(q, v), and the rates of rows that restrict velocities alone, shape (m, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[c.rate(kinematics) for c in self.constraints])
 
     def constraint_output(self, kinematics: Kinematics) -> ca.SX:
-        """k of (2), shape (m, 1): phi, or the rate where there is no phi."""
+        """k of (2), shape (m, 1): phi, and the rate of rows that restrict velocities alone."""
         rows = [ca.SX(0, 1)]
         for constraint in self.constraints:
             residual = constraint.residual(kinematics)
-            rows.append(residual if residual.numel() else constraint.rate(kinematics))
+            rows.append(residual)
+            if residual.numel() < len(constraint.force_signals):
+                rows.append(constraint.rate(kinematics)[residual.numel() :])
         return kinematics.value(ca.vertcat(*rows))
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
@@ -71,6 +91,41 @@ class ConstraintSet:
         for constraint, part in self.parts():
             total += constraint.reaction(kinematics, constraint_force[part])
         return total
+
+    def wrenches(
+        self, kinematics: Kinematics, constraint_force: ca.SX
+    ) -> tuple[ca.SX, tuple[Signal, ...]]:
+        """What each constraint does to each of its frames, and names and units of that.
+
+        A wrench is a moment in N m and a force in N, as in Drake's SpatialForce, both in the world,
+        the force at the frame's origin. Those of one constraint on one frame are added.
+
+        Args:
+            kinematics: What the constraints are written in.
+            constraint_force: lambda, shape (m, 1).
+
+        Returns:
+            The wrenches of the first constraint on its frames, B before A, then those of the
+            others, 6 rows each, in terms of q, v and parameters; and their signals,
+            "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
+        """
+        rows, names = [ca.SX(0, 1)], []
+        for constraint, part in self.parts():
+            own: dict[str, ca.SX] = {}
+            for application in constraint.applications(kinematics):
+                force, moment = (
+                    ca.mtimes(axes, constraint_force[part])
+                    for axes in (application.force_axes, application.moment_axes)
+                )
+                for frame, sign in ((application.frame_b, 1.0), (application.frame_a, -1.0)):
+                    lever = application.point - kinematics.position(frame)
+                    wrench = ca.vertcat(moment + ca.cross(lever, force), force)
+                    own[frame] = own.get(frame, ca.SX(6, 1)) + sign * wrench
+            rows += own.values()
+            names += [f"{constraint.name}.{frame}" for frame in own]
+        parts = (("mx", "N m"), ("my", "N m"), ("mz", "N m"), ("fx", "N"), ("fy", "N"), ("fz", "N"))
+        signals = tuple(Signal(f"{name}.{part}", unit) for name in names for part, unit in parts)
+        return kinematics.value(ca.vertcat(*rows)), signals
 
     def force_matrix(self, links: Links) -> ca.SX:
         """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""

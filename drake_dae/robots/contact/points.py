@@ -1,4 +1,4 @@
-"""Points that stay on a surface, or on each other."""
+"""Points that stay on a surface, on each other, or at a distance from each other."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -80,11 +80,12 @@ class PointOnSurface(Constraint):
     def coordinates(self, frames: Frames) -> ca.SX:
         return self.surface.coordinates(self.offset(frames))
 
-    def application(self, kinematics: Kinematics) -> Application:
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         normal = self.surface.unit_normal(self.offset(kinematics))
         if self.rpy is not None:
             normal = ca.mtimes(self._rotation(), normal)
-        return Application(kinematics.position(self.frame, self.point), normal, ca.SX(3, 1))
+        point = kinematics.position(self.frame, self.point)
+        return (Application(point, normal, ca.SX(3, 1), self.frame),)
 
     def placement(self, values: FloatArray) -> RigidTransform:
         rotation = RollPitchYaw(values[3:]) if values.size > 3 else RollPitchYaw(np.zeros(3))
@@ -137,10 +138,69 @@ class CoincidentPoints(Constraint):
         apart = point_b - frames.position(self.frame_a, self.point_a)
         return apart[self._rows]
 
-    def application(self, kinematics: Kinematics) -> Application:
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         point = kinematics.position(self.frame_b, self.point_b)
-        return Application(point, ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes)))
+        axes = ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes))
+        return (Application(point, *axes, self.frame_b, self.frame_a),)
 
     @property
     def _rows(self) -> list[int]:
         return ["xyz".index(axis) for axis in self.axes]
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class FixedDistance(Constraint):
+    """A rod without mass, with a ball joint at each end, between points of frames A and B:
+
+        phi(q) = |p_WB(q) - p_WA(q)| - length.
+
+    The constraint force is the thrust in N: positive pushes the points apart, so that A exerts it
+    on B away from A, and B the opposite on A; negative is the pull of the rod. The parameter
+    "<name>.length" is its length.
+
+    It is no way to keep two points together: at length zero phi has no gradient. Use
+    `CoincidentPoints` there, and `PointOnSurface` for a point that moves on a sphere that stands in
+    the world. A rope, which can only pull, is no rod.
+
+    Attributes:
+        frame_a: Name of frame A, for example "world".
+        point_a: The point in frame A, m, shape (3,).
+        frame_b: Name of frame B, on another body.
+        point_b: The point in frame B, m, shape (3,).
+        length: The distance of the points, m, positive.
+        name: The name of the constraint, before those of its force and its parameter.
+    """
+
+    frame_a: str
+    point_a: Vector
+    frame_b: str
+    point_b: Vector
+    length: float
+    name: str = "rod"
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        length = Parameter(f"{self.name}.length", np.array([self.length]), "m", positive=True)
+        object.__setattr__(self, "parameters", (length,))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.thrust", "N"),)
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.stretch", "m"),)
+
+    def residual(self, frames: Frames) -> ca.SX:
+        return ca.norm_2(self._apart(frames)) - self.parameters[0].symbol
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        apart = self._apart(kinematics)
+        point = kinematics.position(self.frame_b, self.point_b)
+        away = apart / ca.norm_2(apart)
+        return (Application(point, away, ca.SX(3, 1), self.frame_b, self.frame_a),)
+
+    def _apart(self, frames: Frames) -> ca.SX:
+        start = frames.position(self.frame_a, self.point_a)
+        return frames.position(self.frame_b, self.point_b) - start

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture, mesh_of_grid
@@ -37,11 +37,14 @@ class Surface(ABC):
     3. `coordinates` tell where on the surface a point is, one row for each of
        `coordinate_signals`; with the distance they tell the point, but for poles. A surface may
        have none.
-    4. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
+    4. `has_exact_distance` where the distance is so beside the surface, too: its gradient is one
+       long there. Balls roll on such surfaces alone.
+    5. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
        with a shape of its own gives that.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
+    has_exact_distance: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -161,3 +164,27 @@ def rotation_of(rpy: ca.SX) -> ca.SX:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def triple(name: str, value: ArrayLike) -> Vector:
+    """Three finite numbers as a tuple.
+
+    Raises:
+        ModelError: They are not.
+    """
+    array = vector(name, value, 3)
+    return (float(array[0]), float(array[1]), float(array[2]))
+
+
+def unit_vector(name: str, value: ArrayLike) -> Vector:
+    """A direction of any length, made one long.
+
+    Raises:
+        ModelError: It is not three finite numbers, or zero.
+    """
+    array = np.array(triple(name, value))
+    length = float(np.linalg.norm(array))
+    if length == 0.0:
+        raise ModelError(f"{name} must not be zero")
+    # A unit vector stays as it is, so that what was saved reads back equal.
+    return triple(name, array if abs(length - 1.0) < 1e-15 else array / length)

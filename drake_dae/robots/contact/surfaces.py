@@ -11,12 +11,19 @@ from pydrake import geometry
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_dae.arguments import checked, result_of
-from drake_dae.arrays import positive, vector
+from drake_dae.arrays import positive
 from drake_dae.dae.expressions import as_expression
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture, mesh_of_grid
-from drake_dae.robots.contact.surface import Surface, Vector, axes_along, tangents
+from drake_dae.robots.contact.surface import (
+    Surface,
+    Vector,
+    axes_along,
+    tangents,
+    triple,
+    unit_vector,
+)
 
 
 @checked(ModelError)
@@ -32,10 +39,11 @@ class Plane(Surface):
     point: Vector
     normal: Vector
     coordinate_signals: ClassVar = (Signal("along", "m"), Signal("across", "m"))
+    has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", _vector("point", self.point))
-        object.__setattr__(self, "normal", _unit("normal", self.normal))
+        object.__setattr__(self, "point", triple("point", self.point))
+        object.__setattr__(self, "normal", unit_vector("normal", self.normal))
 
     @property
     def position(self) -> Vector:
@@ -74,10 +82,11 @@ class Sphere(Surface):
     axis: Vector = (0.0, 0.0, 1.0)
     inside: bool = False
     coordinate_signals: ClassVar = (Signal("longitude", "rad"), Signal("latitude", "rad"))
+    has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _vector("center", self.center))
-        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        object.__setattr__(self, "center", triple("center", self.center))
+        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
         positive("radius", self.radius)
 
     @property
@@ -114,10 +123,11 @@ class Cylinder(Surface):
     radius: float
     inside: bool = False
     coordinate_signals: ClassVar = (Signal("angle", "rad"), Signal("along", "m"))
+    has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", _vector("point", self.point))
-        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        object.__setattr__(self, "point", triple("point", self.point))
+        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
         positive("radius", self.radius)
 
     @property
@@ -158,8 +168,8 @@ class Ellipsoid(Surface):
     coordinate_signals: ClassVar = (Signal("longitude", "rad"), Signal("latitude", "rad"))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _vector("center", self.center))
-        object.__setattr__(self, "semi_axes", _vector("semi_axes", self.semi_axes))
+        object.__setattr__(self, "center", triple("center", self.center))
+        object.__setattr__(self, "semi_axes", triple("semi_axes", self.semi_axes))
         for length in self.semi_axes:
             positive("semi_axes", length)
 
@@ -201,10 +211,11 @@ class Torus(Surface):
     minor_radius: float
     inside: bool = False
     coordinate_signals: ClassVar = (Signal("ring_angle", "rad"), Signal("tube_angle", "rad"))
+    has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", _vector("center", self.center))
-        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        object.__setattr__(self, "center", triple("center", self.center))
+        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
         positive("minor_radius", self.minor_radius)
         positive("major_radius", self.major_radius)
         if not self.major_radius > self.minor_radius:
@@ -251,7 +262,7 @@ class ImplicitSurface(Surface):
     point: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", _vector("point", self.point))
+        object.__setattr__(self, "point", triple("point", self.point))
 
     @property
     def position(self) -> Vector:
@@ -282,17 +293,3 @@ def _components(axis: Vector, offset: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 def _side(distance: ca.SX, inside: bool) -> ca.SX:
     return -distance if inside else distance
-
-
-def _vector(name: str, value: ArrayLike) -> Vector:
-    array = vector(name, value, 3)
-    return (float(array[0]), float(array[1]), float(array[2]))
-
-
-def _unit(name: str, value: ArrayLike) -> Vector:
-    array = np.array(_vector(name, value))
-    length = float(np.linalg.norm(array))
-    if length == 0.0:
-        raise ModelError(f"{name} must not be zero")
-    # A unit vector stays as it is, so that what was saved reads back equal.
-    return _vector(name, array if abs(length - 1.0) < 1e-15 else array / length)

@@ -68,7 +68,8 @@ class WeldedFrames(Constraint):
         shift = ca.mtimes(R_AW, offset) - self.parameters[0].symbol
         return ca.vertcat(shift, 2 * skew / (1 + ca.trace(E)))
 
-    def application(self, kinematics: Kinematics) -> Application:
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         R_WA, none = kinematics.rotation(self.frame_a), ca.SX(3, 3)
         point = kinematics.position(self.frame_b)
-        return Application(point, ca.horzcat(R_WA, none), ca.horzcat(none, R_WA))
+        axes = ca.horzcat(R_WA, none), ca.horzcat(none, R_WA)
+        return (Application(point, *axes, self.frame_b, self.frame_a),)

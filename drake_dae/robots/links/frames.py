@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,8 +15,24 @@ from pydrake.multibody.tree import Frame, FrameIndex
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.joints import constant_pose
+from drake_dae.robots.links.joints import ElementaryJoints, constant_pose, elementary_joints
 from drake_dae.robots.links.tree import Link, link_poses
+
+
+@dataclass(frozen=True, eq=False)
+class OneJoint:
+    """A joint with one position.
+
+    Attributes:
+        child, parent: Names of its bodies' frames.
+        frame: Its frame on the child.
+        elementary: What it is made of; directions are the same in its frames on both bodies.
+    """
+
+    child: str
+    parent: str
+    frame: Frame
+    elementary: ElementaryJoints
 
 
 class PlantFrames:
@@ -68,6 +85,20 @@ class PlantFrames:
         """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
         return link_poses(self._links)
 
+    def joint_at(self, position: int) -> "OneJoint | None":
+        """The joint whose only position stands at an index of q; None if it has several."""
+        plant = self._plant
+        for index in plant.GetJointIndices():
+            joint = plant.get_joint(index)
+            if joint.num_positions() == 1 and joint.position_start() == position:
+                return OneJoint(
+                    frame_name(plant, joint.child_body().body_frame()),
+                    frame_name(plant, joint.parent_body().body_frame()),
+                    joint.frame_on_child(),
+                    elementary_joints(plant, joint),
+                )
+        return None
+
     def _by_name(self, name: str) -> Frame:
         plant = self._plant
         if name == "world":
@@ -104,6 +135,15 @@ def check_point(point: ArrayLike) -> FloatArray:
     if offset.shape != (3,) or not np.all(np.isfinite(offset)):
         raise ModelError(f"a point has 3 finite coordinates, got {point!r}")
     return offset
+
+
+def frame_name(plant: MultibodyPlant, frame: Frame) -> str:
+    """The name by which `PlantFrames` finds a frame."""
+    if frame is plant.world_frame():
+        return "world"
+    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
+    is_unique = [other.name() for other in frames].count(frame.name()) == 1
+    return str(frame.name()) if is_unique else scoped_name(plant, frame)
 
 
 def scoped_name(plant: MultibodyPlant, item: Any) -> str:

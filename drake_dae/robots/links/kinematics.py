@@ -8,6 +8,10 @@ from typing import Any, Protocol, Self
 import casadi as ca
 from numpy.typing import ArrayLike
 
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+
 ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -22,11 +26,46 @@ class Frames(Protocol):
     def q(self) -> ca.SX:
         """Generalized positions, symbols, shape (nq, 1)."""
 
+    @property
+    def position_signals(self) -> tuple[Signal, ...]:
+        """Names and units of q."""
+
     def rotation(self, frame: Any) -> ca.SX:
         """R_WF, shape (3, 3): the orientation of a frame in the world."""
 
     def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
         """p_W in m, shape (3, 1): where a point that is fixed in a frame is in the world."""
+
+
+def position_index(frames: Frames, name: str) -> int:
+    """Where a name stands among the generalized positions.
+
+    Raises:
+        ModelError: There is none of that name.
+    """
+    names = [signal.name for signal in frames.position_signals]
+    if name not in names:
+        raise ModelError(unknown_name("joint position", name, names))
+    return names.index(name)
+
+
+@dataclass(frozen=True, eq=False)
+class JointAxis:
+    """What a unit of the generalized force of a joint is, in the world.
+
+    Attributes:
+        child, parent: Names of the bodies' frames: the child feels the force and the moment, the
+            parent the opposite.
+        point: Where the force acts, in m, shape (3, 1).
+        force: In N for a unit of the generalized force, shape (3, 1); zero of a joint that turns.
+        moment: In N m for a unit of the generalized force, shape (3, 1).
+    """
+
+    child: str
+    parent: str
+    point: ca.SX
+    force: ca.SX
+    moment: ca.SX
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +108,17 @@ class Kinematics(ABC):
        expression e of positions and velocities.
     4. `reaction(power)` are the forces whose power that is: for a power that is linear in
        velocities, tau . v = power with the generalized force tau that `Links` makes of them.
+    5. `joint_axis` of a position is how the joint pushes that it belongs to; None where the joint
+       has several positions, or where nobody knows.
 
     Attributes:
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
+        position_signals: Names and units of q.
         acceleration: v', shape (nv, 1).
     """
 
     q: ca.SX
+    position_signals: tuple[Signal, ...]
     v: ca.SX
     acceleration: ca.SX
 
@@ -106,6 +149,10 @@ class Kinematics(ABC):
     @abstractmethod
     def value(self, expression: ca.SX) -> ca.SX:
         """The expression in terms of q, v, `acceleration` and parameters alone."""
+
+    def joint_axis(self, position: str) -> JointAxis | None:
+        """How the joint of a position pushes, by the position's name."""
+        return None
 
     def push(
         self, frame: Any, force: ca.SX, point: ArrayLike = ORIGIN, moment: ca.SX | None = None

@@ -43,7 +43,8 @@ class MultibodyExpressions:
     in link frames (Featherstone, Rigid Body Dynamics Algorithms, 2008). H holds the Coriolis and
     centrifugal forces, gravity, joint damping, and the springs RevoluteSpring, PrismaticSpring
     and LinearSpringDamper; M holds the reflected inertia of the rotors. Contact, locked joints
-    and the PD controllers of actuators are no part of them: u is what the joints feel.
+    and the PD controllers of actuators are no part of them: u is what the joints feel. Nor are the
+    plant's constraints, as mimic joints: `RobotModel` takes these from the plant.
 
     All data comes from the plant and is in SI units (m, kg, s, rad, N, N m); q, v and u have
     Drake's order. On construction M, N and every part of H are compared with the plant's own
@@ -70,8 +71,8 @@ class MultibodyExpressions:
         default_positions: The plant's default configuration, shape (nq,).
 
     Raises:
-        ModelError: The plant is not finalized, cannot move, or has a constraint, joint or force
-            element that is not supported; or the comparison with the plant failed.
+        ModelError: The plant is not finalized, cannot move, or has a joint or force element that
+            is not supported; or the comparison with the plant failed.
     """
 
     def __init__(self, plant: MultibodyPlant) -> None:
@@ -135,7 +136,14 @@ class MultibodyExpressions:
             acceleration = ca.SX.sym("acceleration", self.v.numel())
         moving = link_kinematics(self._links, self.v, acceleration, self._gravity)
         return TreeKinematics(
-            self._frames, self.q, self.v, acceleration, self.velocity_map, moving, self._gravity
+            self._frames,
+            self.q,
+            self.v,
+            acceleration,
+            self.position_signals,
+            self.velocity_map,
+            moving,
+            self._gravity,
         )
 
     def generalized_force(self, kinematics: TreeKinematics, reaction: Reaction) -> ca.SX:
@@ -271,12 +279,6 @@ def _check_support(plant: MultibodyPlant) -> None:
     """Refuses a plant that has no equations here."""
     if not plant.is_finalized():
         raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
-    if plant.num_constraints() > 0:
-        raise ModelError(
-            f"the plant has {plant.num_constraints()} constraint(s), which Drake ignores in "
-            "continuous time; leave them out of the plant and hand them to RobotModel as "
-            "`constraints`"
-        )
     for index in plant.GetJointIndices():
         check_joint(plant.get_joint(index))
     check_force_elements(plant)

@@ -159,6 +159,7 @@ class TextbookKinematics(Kinematics):
 
     def __init__(self, links: LinkExpressions, acceleration: ca.SX) -> None:
         self.q, self.v, self.acceleration = links.q, links.v, acceleration
+        self.position_signals = links.position_signals
         self._links = links
         self._moving = ca.vertcat(links.q, links.v)
         self._rate = ca.vertcat(ca.mtimes(links.velocity_map, links.v), acceleration)

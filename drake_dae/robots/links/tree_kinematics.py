@@ -12,8 +12,15 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.tree import Frame
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
 from drake_dae.robots.links.frames import PlantFrames, check_point, position_of
-from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
+from drake_dae.robots.links.kinematics import (
+    ORIGIN,
+    JointAxis,
+    Kinematics,
+    Reaction,
+    position_index,
+)
 from drake_dae.robots.links.recursions import LinkKinematics
 
 Wrench = tuple[ca.SX, ca.SX]
@@ -39,7 +46,7 @@ class TreeKinematics(Kinematics):
 
     Args:
         frames: The plant's frames.
-        q, v, acceleration: The symbols and expressions of `Kinematics`.
+        q, v, acceleration, position_signals: As in `Kinematics`.
         velocity_map: N, shape (nq, nv).
         moving: How each link moves, with gravity in its acceleration.
         gravity: Gravity in the world, m/s^2, shape (3,).
@@ -54,11 +61,13 @@ class TreeKinematics(Kinematics):
         q: ca.SX,
         v: ca.SX,
         acceleration: ca.SX,
+        position_signals: tuple[Signal, ...],
         velocity_map: ca.SX,
         moving: Sequence[LinkKinematics],
         gravity: FloatArray,
     ) -> None:
         self.q, self.v, self.acceleration = q, v, acceleration
+        self.position_signals = position_signals
         self.moving = moving
         self._frames = frames
         self._position_rate = ca.mtimes(velocity_map, v)
@@ -107,6 +116,16 @@ class TreeKinematics(Kinematics):
                 moment += ca.cross(own.rotation[:, k], slope[:, k])
             wrenches[frame] = (ca.gradient(power, own.velocity), moment)
         return Reaction(ca.sparsify(ca.gradient(power, self.v)), wrenches)
+
+    def joint_axis(self, position: str) -> JointAxis | None:
+        joint = self._frames.joint_at(position_index(self, position))
+        if joint is None:
+            return None
+        last = joint.elementary.sequence[-1]  # Of a screw, the turn.
+        along = self.rotation(joint.frame) @ ca.SX(joint.elementary.rotation @ last.directions)
+        none = ca.SX(3, 1)
+        axes = (none, along) if last.is_turn else (along, none)
+        return JointAxis(joint.child, joint.parent, self.position(joint.frame), *axes)
 
     def value(self, expression: ca.SX) -> ca.SX:
         pairs = [pair for entry in self._symbols.values() for pair in self._values(*entry)]

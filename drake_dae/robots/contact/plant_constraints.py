@@ -1,0 +1,91 @@
+"""Constraints that a MultibodyPlant has already: mimic joints, couplers, rods."""
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
+
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.contact.couplers import JointCoupler
+from drake_dae.robots.contact.points import FixedDistance
+from drake_dae.robots.contact.surface import triple
+from drake_dae.robots.links.frames import frame_name
+from drake_dae.robots.links.links import Links
+
+
+def plant_constraints(links: Links) -> tuple[Constraint, ...]:
+    """The constraints of the plant that links come from; none if they come from none.
+
+    Couplers, which mimic joints are, become a `JointCoupler` "<follower>_coupler", and rods of
+    AddDistanceConstraint a `FixedDistance` "rod0", "rod1", ... Drake's plants keep them in discrete
+    time alone; these keep them in continuous time too.
+
+    Raises:
+        ModelError: The plant has others, or a rod with a stiffness.
+    """
+    plant = links.plant
+    if plant is None or plant.num_constraints() == 0:
+        return ()
+    found = (*_couplers(plant, links), *_rods(plant))
+    others = plant.num_constraints() - len(found)
+    if others:
+        raise ModelError(
+            f"the plant has {others} constraint(s) that cannot be read back from it; leave them "
+            "out of the plant and hand them to RobotModel as `constraints`: a ball constraint is "
+            "CoincidentPoints, a weld constraint WeldedFrames"
+        )
+    return found
+
+
+def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
+    """q_0 - ratio q_1 = offset, which Drake tells as a row of a mathematical program."""
+    program = MathematicalProgram()
+    q = program.NewContinuousVariables(plant.num_positions(), "q")
+    try:
+        AddMultibodyPlantConstraints(plant, q, program, plant.CreateDefaultContext())
+    except RuntimeError as error:
+        raise ModelError(
+            f"the plant has a constraint that is not supported ({error}); leave it out of the plant"
+        ) from None
+    followers: set[Signal] = set()
+    index = {variable.get_id(): i for i, variable in enumerate(q)}
+    for binding in program.GetAllConstraints():
+        row = binding.evaluator()
+        if not isinstance(row, LinearEqualityConstraint) or binding.variables().size != 2:
+            continue
+        names = [links.position_signals[index[v.get_id()]] for v in binding.variables()]
+        factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
+        # The follower has the factor 1. Where both have it, either may; nobody follows twice.
+        able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
+        place = next((i for i in able if names[i] not in followers), able[0])
+        follower, leader = names[place], names[1 - place]
+        followers.add(follower)
+        unit: Literal["rad", "m"] = "m" if follower.unit == "m" else "rad"
+        yield JointCoupler(
+            follower.name,
+            leader.name,
+            -factors[1 - place] / factors[place],
+            float(row.lower_bound()[0]) / factors[place],
+            unit,
+            f"{follower.name}_coupler",
+        )
+
+
+def _rods(plant: MultibodyPlant) -> Iterator[FixedDistance]:
+    every = plant.GetDefaultDistanceConstraintParams()
+    for number, key in enumerate(sorted(every, key=lambda key: key.get_value())):
+        rod = every[key]
+        bodies = [plant.get_body(index) for index in (rod.bodyA(), rod.bodyB())]
+        start, end = (frame_name(plant, body.body_frame()) for body in bodies)
+        if np.isfinite(rod.stiffness()):
+            raise ModelError(
+                f"the distance constraint between '{start}' and '{end}' has a stiffness of "
+                f"{rod.stiffness():g} N/m: that is a spring and no rod; add a LinearSpringDamper"
+            )
+        point_a, point_b = (triple("a point", point) for point in (rod.p_AP(), rod.p_BQ()))
+        yield FixedDistance(start, point_a, end, point_b, rod.distance(), f"rod{number}")
