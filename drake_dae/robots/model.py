@@ -131,7 +131,7 @@ class RobotModel:
     @property
     def position_signals(self) -> tuple[Signal, ...]:
         """Names and units of z_1."""
-        return self.dae.output_signals[: self.dae.num_controls - len(self.steered)]
+        return self.dae.output_signals[: self.dae.num_outputs - len(self.steered)]
 
     def configuration(
         self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
@@ -225,7 +225,7 @@ class RobotModel:
                 f"{nu} outputs; name in `forces` those that are outputs, take constraints "
                 "away, or add actuators"
             )
-        if count + m != nu:
+        if count + m and count + m != nu:  # A robot that is only simulated needs none.
             names = [s.name for p in self.positions for s in p.signals(self.links)]
             raise ModelError(
                 f"{self.name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces "
@@ -272,7 +272,7 @@ class RobotModel:
             h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(B, driven.direct), driven.drive),
             k=bound.constraint_output(links.kinematics()),  # (44)
             l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
-            m=ca.vertcat(ca.SX(nu - S.shape[0], m), S),
+            m=ca.vertcat(ca.SX(h_1.numel(), m), S),
             parameters=(*links.parameters, *driven.parameters, *bound.parameters),
             state_signals=(
                 *links.position_signals,
