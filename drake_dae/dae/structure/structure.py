@@ -49,6 +49,8 @@ class Structure:
         round_off: Which entries of B(x) are zero but for round-off at all of many states, shape
             (p, p). A column of nothing else would be scaled up to the size of the others.
         states: The consistent states at which numbers were decided, shape (samples, n).
+        scale: How large each state is over them and the states near which they were sought, shape
+            (n,).
         constraint_margin: The margin of A(x), Assumption (2); None without constraints.
         control_margin: The margin of B(x), Assumption (5).
     """
@@ -66,6 +68,7 @@ class Structure:
     chains_need_force: bool
     round_off: Booleans
     states: FloatArray
+    scale: FloatArray
     constraint_margin: Margin | None
     control_margin: Margin
 
@@ -250,6 +253,7 @@ def examine_outputs(constrained: Constrained) -> Structure:
         chains_need_force=outputs.need_force,
         round_off=outputs.round_off,
         states=samples.states,
+        scale=samples.scale,
         constraint_margin=constrained.margin,
         control_margin=find_margin(samples, outputs.control_matrix, outputs.round_off),
     )
