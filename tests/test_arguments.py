@@ -37,6 +37,7 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.diagrams.scenario import Scenario, find_scenario
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.actuation.stage import Stage
@@ -90,6 +91,12 @@ def analysis() -> dd.Analysis:
 
 
 @cache
+def pinned_motion() -> PinnedMotion:
+    dynamics = dd.ZeroDynamics(arm("two_link").model.dae, structure=arm("two_link").structure)
+    return dynamics.motion(lambda t: record()["reference"][0], [0.0, 0.1])
+
+
+@cache
 def textbook() -> dd.LinkExpressions:
     q, v = ca.SX.sym("q"), ca.SX.sym("v")
     return dd.LinkExpressions(q, v, ca.SX(2.0), ca.SX(0.0), {"tool": ca.vertcat(q, 0, 0)})
@@ -133,6 +140,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Derivatives: lambda: arm("two_link").structure.derivatives,
     Elimination: lambda: arm("two_link").structure.elimination,
     Margin: lambda: arm("two_link").structure.control_margin,
+    PinnedMotion: pinned_motion,
     dd.Record: record,
     dd.Reference: lambda: dd.ConstantReference(0.5),
     dd.ReferenceGenerator: lambda: loop().reference,
@@ -237,6 +245,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "end_time": lambda: 1.0,
     "control": lambda: [1.0, 1.0],
     "reference of ZeroDynamics.motion": lambda: lambda t: record()["reference"][0],
+    "reference of ZeroDynamics.stability_along": lambda: lambda t: record()["reference"][0],
+    "guesses": lambda: state()[None],
     "reference of analyze": lambda: None,
     "times of analyze": lambda: None,
     "time of Record": lambda: [0.0, 1.0],

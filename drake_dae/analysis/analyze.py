@@ -34,6 +34,7 @@ from drake_dae.dae.structure.structure import (
     why_not_square,
 )
 from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.stability import Stability
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
 
@@ -75,7 +76,8 @@ def analyze(
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
             few others close to the first: what is zero at one state alone is not zero.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
-            the motion that it commands, and the zero dynamics judged at its first outputs.
+            the motion that it commands, and the zero dynamics judged at its first outputs and
+            along the motion.
         times: Times in s at which the reference is examined, increasing, shape (k,).
         start: State near which the motion along the reference starts, shape (n,); the first
             examined state if None; only with a reference.
@@ -135,7 +137,12 @@ def analyze(
         return analysis
     dynamics = ZeroDynamics(system, structure=analysis.structure)
     if reference is None or times is None:
-        return replace(analysis, zero_dynamics=dynamics.stability(samples.states[0]))
+        stability = dynamics.stability(samples.states[0])
+        return replace(
+            analysis,
+            zero_dynamics=stability,
+            equilibria=_equilibria(dynamics, stability, samples.states, None),
+        )
     layout = analysis.structure.layout
     with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion tells when.
         check_reference(system, layout, reference, times)
@@ -147,7 +154,33 @@ def analyze(
         rest = motion.states[0]
         outputs = layout.values(reference(float(motion.times[0])))
     stability = dynamics.stability(rest, outputs=outputs)
-    return replace(analysis, motion=motion, zero_dynamics=stability)
+    along = None
+    if dynamics.dimension and motion.times.size > 1:
+        along = dynamics.stability_along(reference, motion)
+    return replace(
+        analysis,
+        motion=motion,
+        zero_dynamics=stability,
+        equilibria=_equilibria(dynamics, stability, samples.states, outputs),
+        zero_dynamics_along=along,
+    )
+
+
+def _equilibria(
+    dynamics: ZeroDynamics,
+    stability: Stability,
+    states: FloatArray,
+    outputs: FloatArray | None,
+) -> tuple[Stability, ...]:
+    """All equilibria with the outputs of the one that was judged, that one first."""
+    if not dynamics.dimension:
+        return ()
+    if stability.state is not None:
+        states = np.vstack([stability.state, states])
+    found = dynamics.equilibria(states, outputs=outputs)
+    known = () if stability.state is None else (stability,)
+    others = found[len(known) :]
+    return (*known, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
 def _examine(

@@ -11,6 +11,7 @@ from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.along import StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
@@ -49,10 +50,11 @@ class Assumption:
 
 OF_VERDICT = {
     Verdict.STABLE: Finding.SATISFIED,
+    Verdict.BOUNDED: Finding.SATISFIED,
     Verdict.UNSTABLE: Finding.VIOLATED,
     Verdict.UNDECIDED: Finding.UNDECIDED,
 }
-"""What the stability of the zero dynamics says of Assumption 2.2."""
+"""What is found of the zero dynamics says of Assumption 2.2, which asks for bounded states."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,9 @@ class Findings:
         independence: Margin of the gradients of all chains, which are linearly independent by
             Theorem 2.1; None also where there are no chains.
         zero_dynamics: Assumption 2.2, by linearization at an equilibrium.
+        equilibria: All equilibria of the zero dynamics with the same outputs that were found from
+            the examined states.
+        zero_dynamics_along: Assumption 2.2 along the reference; None also without one.
         motion: The motion along the reference; None also without one.
         constraint_structure: What the constraints alone decide, for `DaePlant`; None where A(x) is
             singular at an examined state itself, or there are no degrees.
@@ -87,6 +92,8 @@ class Findings:
     output_degrees: tuple[int, ...] | None = None
     independence: Margin | None = None
     zero_dynamics: Stability | None = None
+    equilibria: tuple[Stability, ...] = ()
+    zero_dynamics_along: StabilityAlong | None = None
     motion: PinnedMotion | None = None
     constraint_structure: ConstraintStructure | None = None
     structure: Structure | None = None
@@ -124,6 +131,20 @@ class Findings:
         return None if known is None or degrees is None else known - sum(degrees)
 
     @property
+    def decisive(self) -> Stability | StabilityAlong | None:
+        """What decides on Assumption 2.2: the reference where that says anything, or else rest.
+
+        Where the reference has no period, its end is not the end of time: an unstable equilibrium
+        beside it decides, too.
+        """
+        rest, along = self.zero_dynamics, self.zero_dynamics_along
+        if along is None or rest is None or along.verdict is Verdict.UNDECIDED:
+            return rest
+        if not along.period and rest.verdict is Verdict.UNSTABLE:
+            return rest
+        return along
+
+    @property
     def problems(self) -> tuple[str, ...]:
         """What is violated, one text each; empty if nothing is."""
         found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
@@ -134,8 +155,10 @@ class Findings:
                 "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
                 f"depend on each other at {place}"
             )
-        if self.zero_dynamics is not None and self.zero_dynamics.verdict is Verdict.UNSTABLE:
-            found.append(f"Assumption 2.2: {self.zero_dynamics.reason}")
+        decisive = self.decisive
+        if decisive is not None and decisive.verdict is Verdict.UNSTABLE:
+            place = "along the reference " if decisive is self.zero_dynamics_along else ""
+            found.append(f"Assumption 2.2: {place}{decisive.reason}")
         if self.motion is not None and self.motion.ending is not None:
             found.append(str(self.motion.ending))
         return tuple(found)

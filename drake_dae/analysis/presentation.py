@@ -19,6 +19,7 @@ def as_dict(findings: Findings) -> dict[str, Any]:
     """What is printed, as plain numbers, lists and texts, with the states of the margins."""
     system = findings.system
     zero, motion = findings.zero_dynamics, findings.motion
+    along = findings.zero_dynamics_along
     return {
         "name": system.name,
         "num_states": system.num_states,
@@ -52,9 +53,26 @@ def as_dict(findings: Findings) -> dict[str, Any]:
         if zero is None
         else {
             "verdict": str(zero.verdict),
-            "eigenvalues": [[float(e.real), float(e.imag)] for e in zero.eigenvalues],
+            "eigenvalues": _pairs(zero.eigenvalues),
             "state": None if zero.state is None else zero.state.tolist(),
             "reason": zero.reason,
+        },
+        "equilibria": [
+            {
+                "verdict": str(one.verdict),
+                "eigenvalues": _pairs(one.eigenvalues),
+                "state": None if one.state is None else one.state.tolist(),
+            }
+            for one in findings.equilibria
+        ],
+        "zero_dynamics_along": None
+        if along is None
+        else {
+            "verdict": str(along.verdict),
+            "period": along.period,
+            "multipliers": _pairs(along.multipliers),
+            "exponents": along.exponents.tolist(),
+            "reason": along.reason,
         },
         "reference": None if motion is None else _motion(motion),
         "problems": list(findings.problems),
@@ -127,8 +145,8 @@ def _findings(findings: Findings) -> Table:
     if findings.output_degrees is not None:
         singular = findings.independence is not None and findings.independence.is_singular
         chains = Finding.FAILS if singular else Finding.SATISFIED
-    if findings.zero_dynamics is not None:
-        zero = OF_VERDICT[findings.zero_dynamics.verdict]
+    if findings.decisive is not None:
+        zero = OF_VERDICT[findings.decisive.verdict]
     none = ": there are none" if findings.zero_dynamics_dimension == 0 else ""
     rows += [
         [
@@ -161,6 +179,18 @@ def _places(findings: Findings) -> list[Part]:
         lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")
     if zero is not None and findings.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:
         lines.append(f"Zero dynamics {zero.verdict}: {zero.reason}.")
+    if len(findings.equilibria) > 1:
+        lines += [
+            f"At rest at {named_values(findings.system.state_signals, one.state)}: {one.verdict}."
+            for one in findings.equilibria
+            if one.state is not None
+        ]
+    along = findings.zero_dynamics_along
+    if along is not None:
+        if along.multipliers.size:
+            lines.append(f"Along the reference: Floquet multipliers {_complex(along.multipliers)}.")
+        if along.verdict != Verdict.UNSTABLE or along is not findings.decisive:
+            lines.append(f"Zero dynamics along the reference {along.verdict}: {along.reason}.")
     return [lines] if lines else []
 
 
@@ -224,6 +254,11 @@ def _complex(values: ComplexArray) -> str:
         elif value.imag == 0.0:
             texts.append(f"{real:.4g}")
     return ", ".join(texts)
+
+
+def _pairs(values: ComplexArray) -> list[list[float]]:
+    """Complex numbers as their real and imaginary parts."""
+    return [[float(value.real), float(value.imag)] for value in values]
 
 
 def _by_name(signals: Sequence[Signal], values: Sequence[int] | None) -> dict[str, int] | None:

@@ -366,3 +366,38 @@ def test_what_is_out_of_reach_is_named():
 def test_something_else_than_a_system_is_refused():
     with pytest.raises(ModelError, match="NormalForm: system must be a DaeSystem"):
         NormalForm(3.0)
+
+
+def leaning() -> DaeSystem:
+    """A cart on a rail that a constraint force holds at y = 0, in coordinates that mix them."""
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+
+    def height(x: ca.SX) -> ca.SX:
+        return ca.sinh(3 * x[0]) + 0.3 * ca.sin(x[0]) * x[1]
+
+    return DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], -x[0] - 0.2 * x[2], -x[1]],
+        g=lambda x: [0, 0, *turn[:, 0]],
+        h=lambda x: [0, 0, *turn[:, 1]],
+        k=height,
+        l=lambda x: [ca.sin(x[1])],
+        m=lambda x: [0],
+        nominal_state=[0.02, 0.4, 0.0, 0.1],
+        name="leaning",
+    )
+
+
+def test_the_inverse_where_a_state_is_round_off_on_the_manifold():
+    """On N* x0 = x2 = 0, so that Newton's method leaves them at 1e-20 or so; off N* they are 0.5.
+
+    Phi is regular there: y = k, y' = L_f k, zeta = (sin x1, x3 cos x1).
+    """
+    normal_form = NormalForm(leaning())
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        state = random.uniform([-0.5, -0.8, -0.5, -0.5], [0.5, 0.8, 0.5, 0.5])
+        assert np.linalg.cond(normal_form.jacobian(state)) < 100.0
+        found = normal_form.state(normal_form.coordinates(state))
+        # Round-off of Phi, times the condition of its Jacobian.
+        np.testing.assert_allclose(found, state, rtol=0, atol=1e-13)

@@ -8,7 +8,8 @@ from problems import PROBLEMS, Problem, hidden_normal_form
 
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.zero_dynamics.zero_dynamics import Verdict, ZeroDynamics
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 
 
 def test_a_dozen_come_from_the_literature():

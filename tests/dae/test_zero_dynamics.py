@@ -28,7 +28,8 @@ from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.zero_dynamics import Verdict, ZeroDynamics
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import (
     InconsistentStateError,
     ModelError,
@@ -947,10 +948,12 @@ def test_no_equilibrium_is_reported():
     ) as e:
         dynamics.equilibrium([0.0])
     assert e.value.residual[1] >= 1.0
-    undecided = dynamics.stability()
-    assert undecided.verdict is Verdict.UNDECIDED
-    assert (undecided.state, undecided.eigenvalues.shape) == (None, (0,))
-    assert "no regular state at rest" in undecided.reason
+    # The motion from there, s = tan t, tells it.
+    growing = dynamics.stability()
+    assert growing.verdict is Verdict.UNSTABLE
+    assert (growing.state, growing.eigenvalues.shape) == (None, (0,))
+    assert "no regular state at rest" in growing.reason
+    assert "the motion from there grows without bound" in growing.reason
 
     blade = zero_dynamics(PROBLEMS["knife_edge"]().system)
     with pytest.raises(InconsistentStateError, match=r"V = 0\.8 have no regular state at rest"):

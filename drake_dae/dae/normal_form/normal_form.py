@@ -87,7 +87,8 @@ class NormalForm:
             "normal form and Jacobian",
             {"coordinates": coordinates, "jacobian": ca.jacobian(coordinates, system.state)},
         )
-        self._scale = samples.scale
+        # Not that of `samples`: a state that is zero on N* is round-off there.
+        self._scale = structure.scale
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Phi(x) = (y, zeta, xi) of (20)-(22).

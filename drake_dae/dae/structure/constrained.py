@@ -35,6 +35,8 @@ class ConstraintStructure:
         derivatives: The time derivatives along the motion on N*.
         elimination: Equations (9)-(14) as expressions; not finite where A(x) is singular.
         states: The consistent states at which numbers were decided, shape (samples, n).
+        scale: How large each state is over them and the states near which they were sought, shape
+            (n,).
         constraint_margin: The margin of A(x), Assumption (2); None without constraints.
     """
 
@@ -44,6 +46,7 @@ class ConstraintStructure:
     derivatives: Derivatives
     elimination: Elimination
     states: FloatArray
+    scale: FloatArray
     constraint_margin: Margin | None
 
     def __repr__(self) -> str:
@@ -183,6 +186,7 @@ def examine_constraints(
         derivatives=derivatives,
         elimination=elimination,
         states=samples.states,
+        scale=samples.scale,
         constraint_margin=(find_margin(samples, elimination.constraint_matrix) if chains else None),
     )
     return found, samples

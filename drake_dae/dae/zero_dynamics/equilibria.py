@@ -1,18 +1,24 @@
 """States at rest with constant outputs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point, Regularity
-from drake_dae.dae.zero_dynamics.stability import balanced_norm
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.stability import balanced_norm, linearized_eigenvalues
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
 
 AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
+
+
+APART = 1e-6
+"""States at rest that are nearer than this, relative to their sizes, are the same."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +46,12 @@ class Equilibria:
         pinned: Z(R).
 
     Attributes:
+        pinned: Z(R).
         sizes: How large the states are, shape (n,).
     """
 
     def __init__(self, pinned: PinnedOutputs) -> None:
-        self._pinned = pinned
+        self.pinned = pinned
         examined = np.abs(pinned.structure.states).max(axis=0)
         self.sizes = np.maximum(examined, pinned.system.nominal_spread)
 
@@ -53,7 +60,7 @@ class Equilibria:
 
         The state does not tell outputs of degree 0; they are as brings it nearest to rest.
         """
-        pinned, layout = self._pinned, self._pinned.layout
+        pinned, layout = self.pinned, self.pinned.layout
         reference = np.zeros(layout.reference_size)
         chain = pinned.residual(state, reference, parameters)[-layout.chain_size :]
         if layout.chain_size:
@@ -72,7 +79,7 @@ class Equilibria:
         T spans the tangent space of Z(R), in which x' is. Where there is a continuum, the step
         along it is the shortest.
         """
-        pinned = self._pinned
+        pinned = self.pinned
 
         def linearize(x: FloatArray) -> Linearization | None:
             gradients = pinned.gradients(x, parameters)
@@ -104,19 +111,42 @@ class Equilibria:
             point.rate,
         )
 
+    def find_all(
+        self, reference: FloatArray, guesses: Sequence[FloatArray], parameters: FloatArray
+    ) -> FloatArray:
+        """The equilibria that searches from several guesses find, each once, shape (k, n).
+
+        Of those that are not isolated, which have a zero eigenvalue, only one that is found first.
+        """
+        found = np.zeros((0, self.sizes.size))
+        for guess in guesses:
+            try:
+                rest = self.find(reference, guess, parameters)
+            except InconsistentStateError:
+                continue
+            near = np.abs(found - rest) <= APART * np.maximum(self.sizes, np.abs(rest))
+            if np.any(np.all(near, axis=1)):
+                continue
+            values, errors = linearized_eigenvalues(
+                self.pinned, self.sizes, rest, reference, parameters
+            )
+            if not len(found) or np.all(np.abs(values) > errors):
+                found = np.vstack([found, rest])
+        return found
+
     def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
         """What moves at a point, or that it is singular; None at a regular equilibrium.
 
         Neither moves what a tiny change of the state brings to rest, as in a fast system.
         """
-        regularity = self._pinned.regularity(point)
+        regularity = self.pinned.regularity(point)
         if regularity is not Regularity.REGULAR:
             return Unrest(regularity)
-        slopes, _ = self._pinned.slopes(point.state, reference, parameters)
+        slopes, _ = self.pinned.slopes(point.state, reference, parameters)
         slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self.sizes
         unrest = np.where(slow, 0.0, point.unrest)
         worst = int(np.argmax(unrest))
         if unrest[worst] <= AT_REST:
             return None
-        moving = self._pinned.system.state_signals[worst].name
+        moving = self.pinned.system.state_signals[worst].name
         return Unrest(regularity, moving, float(point.rate[worst]))

@@ -8,66 +8,25 @@ and the control u = B^-1 (-a + r^(mu)), which is (28) without an error. On Z(R) 
 x' = f* + h* u.
 """
 
-from dataclasses import dataclass
-from enum import Enum
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.layout import Indices
 from drake_dae.dae.manifold import CONSISTENT
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.round_off import positive
 
 VANISHED = 1e-9
 """A or B counts as singular below this part of its usual margin, also where it is one number."""
-
-
-class Regularity(Enum):
-    """Whether the motion is determined at a point; the value says what is wrong."""
-
-    REGULAR = ""
-    MATRIX_NOT_FINITE = "A(x) or B(x) is not finite"
-    SINGULAR = "A(x) or B(x) is singular"
-    RATE_NOT_FINITE = "x' is not finite"
-
-
-@dataclass(frozen=True, eq=False)
-class Point:
-    """A state on Z(R), and what belongs to it, finite or not.
-
-    Attributes:
-        state: x, shape (n,).
-        rate: x', shape (n,).
-        control: u, shape (p,).
-        constraint_input: v, shape (m,).
-        A, B: The matrices of Assumptions (2) and (5).
-        pivot: A number that is 0 exactly where one of them is singular, shape (1,).
-        unrest: |E x'| relative to the sizes of the terms that cancel in it at rest, shape (n,).
-    """
-
-    state: FloatArray
-    rate: FloatArray
-    control: FloatArray
-    constraint_input: FloatArray
-    A: FloatArray
-    B: FloatArray
-    pivot: FloatArray
-    unrest: FloatArray
-
-    @cached_property
-    def margins(self) -> tuple[float, float]:
-        """The smallest singular values of A and B."""
-        return _margin(self.A), _margin(self.B)
-
-    @cached_property
-    def signs(self) -> tuple[float, ...]:
-        """The signs of det A and det B."""
-        return tuple(float(np.linalg.slogdet(_square(matrix))[0]) for matrix in (self.A, self.B))
 
 
 class PinnedOutputs:
@@ -100,6 +59,7 @@ class PinnedOutputs:
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
         )
+        self._moved = ca.vertcat(constraint_input, control)
         self._inputs = {"reference": goal}
         self._residual = system.trace("pinned outputs", {"residual": residual}, self._inputs)
         self._gradient = system.trace(
@@ -187,6 +147,30 @@ class PinnedOutputs:
         gradients = self._gradient.evaluate(state, parameters)[0]
         return gradients.reshape(-1, self.system.num_states)
 
+    def tangent(self, state: FloatArray, parameters: FloatArray, scale: FloatArray) -> FloatArray:
+        """A basis of the tangent space of Z(R), orthonormal relative to a scale, shape (n, d)."""
+        rows = self.gradients(state, parameters) * scale
+        rows /= positive(np.linalg.norm(rows, axis=1, keepdims=True))
+        return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
+
+    def coordinates(
+        self, state: FloatArray, parameters: FloatArray, scale: FloatArray
+    ) -> tuple[Indices, FloatArray]:
+        """States that are coordinates of Z(R), and how all move with them, (d,) and (n, d).
+
+        Unlike orthonormal ones these leave a triangular system triangular.
+        """
+        basis = self.tangent(state, parameters, scale) / scale[:, None]
+        count = basis.shape[1]
+        free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])
+        rest = np.setdiff1d(np.arange(state.size), free)
+        rows = self.gradients(state, parameters) * scale
+        rows /= positive(np.linalg.norm(rows, axis=1, keepdims=True))
+        moved = np.zeros(basis.shape)
+        moved[free] = np.eye(count)
+        moved[rest] = -np.linalg.solve(rows[:, rest], rows[:, free])
+        return free, scale[:, None] * moved / scale[free]
+
     def rate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> FloatArray:
         """x' = f* + h* u, shape (n,)."""
         return self._motion.evaluate(state, reference, parameters)[0].copy()
@@ -213,12 +197,25 @@ class PinnedOutputs:
         n, directions = state.size, np.eye(state.size + self.layout.reference_size)
         direct = self.layout.lowest[self.layout.direct]
         chosen = directions[[*range(n), *(n + direct)]]
-        columns = [
-            self._slope.evaluate(state, reference, along[:n], along[n:], parameters)[0].copy()
-            for along in chosen
-        ]
-        slopes = np.array(columns).T
+        slopes = self.slopes_along(state, reference, parameters, chosen.T)
         return slopes[:, :n], slopes[:, n:]
+
+    def slopes_along(
+        self,
+        state: FloatArray,
+        reference: FloatArray,
+        parameters: FloatArray,
+        directions: FloatArray,
+    ) -> FloatArray:
+        """The derivatives of x' along directions of (x, R), or of x alone, one in each column."""
+        n, still = state.size, np.zeros(self.layout.reference_size)
+        columns = [
+            self._slope.evaluate(
+                state, reference, along[:n], along[n:] if along.size > n else still, parameters
+            )[0].copy()
+            for along in directions.T
+        ]
+        return np.array(columns).reshape(-1, n).T
 
     def sizes_of_slopes(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
@@ -226,19 +223,38 @@ class PinnedOutputs:
         """How large the terms are that add up to dx'/dx, before they cancel, shape (n, n)."""
         point = self.point(state, reference, parameters)
         given = (point.rate, point.control, point.constraint_input, parameters)
-        mass, slope = (m.reshape(state.size, -1) for m in self._balance(state, *given))
-        return np.abs(np.linalg.inv(mass)) @ np.abs(slope)
+        n, inputs = state.size, point.constraint_input.size + point.control.size
+        mass, slope, fields = (m.reshape(n, -1) for m in self._balance(state, *given))
+        moved = [
+            self._input_slope.evaluate(state, reference, dx, parameters)[0].reshape(inputs).copy()
+            for dx in np.eye(n)
+        ]
+        return np.abs(np.linalg.inv(mass)) @ (
+            np.abs(slope) + np.abs(fields) @ np.abs(np.array(moved).T)
+        )
+
+    @cached_property
+    def _input_slope(self) -> TracedFunction:
+        """The derivative of v and u along a direction of the state."""
+        dx = ca.SX.sym("dx", self.system.num_states)
+        slope = ca.jtimes(ca.cse(self._moved), self.system.state, dx)
+        inputs = {**self._inputs, "dx": dx}
+        return self.system.trace("slope of inputs", {"slope": slope}, inputs, often=False)
 
     @cached_property
     def _balance(self) -> TracedFunction:
-        """E, and the slope of f + g v + h u - E x' with all but the state fixed."""
+        """E, the slope of f + g v + h u - E x' with all but the state fixed, and (g, h)."""
         system, u = self.system, self.structure.derivatives.control
         rate, v = ca.SX.sym("x'", system.num_states), ca.SX.sym("v", system.num_constraints)
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
         balance -= ca.mtimes(system.mass_matrix, rate)
         return system.trace(
             "balance",
-            {"mass": system.mass_matrix, "slope": ca.jacobian(balance, system.state)},
+            {
+                "mass": system.mass_matrix,
+                "slope": ca.jacobian(balance, system.state),
+                "fields": ca.densify(ca.horzcat(system.g, system.h)),
+            },
             {"rate": rate, "u": u, "v": v},
             often=False,
         )
@@ -267,14 +283,3 @@ class PinnedOutputs:
             self.point(state, reference, parameters).margins for state in self.structure.states
         ]
         return max(a for a, _ in margins), max(b for _, b in margins)
-
-
-def _square(matrix: FloatArray) -> FloatArray:
-    """A square matrix; one with one column comes as a vector."""
-    return matrix.reshape(round(matrix.size**0.5), round(matrix.size**0.5))
-
-
-def _margin(matrix: FloatArray) -> float:
-    """The smallest singular value; that of a matrix without columns is infinite."""
-    values = np.linalg.svd(_square(matrix), compute_uv=False)
-    return float(np.min(values, initial=np.inf))

@@ -8,7 +8,8 @@ import scipy.integrate
 from drake_dae.arguments import result_of
 from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause, Ending, PinnedMotion
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 
 TOLERANCE = 1e-6

@@ -6,11 +6,15 @@ from enum import StrEnum
 import numpy as np
 import scipy.linalg
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 
 LINEARIZED = 1e-11
-"""The error of a linearization, relative to its norm: that of the equilibrium, and round-off."""
+"""The error of a linearization, relative to the terms that add up to each of its entries."""
+
+ROUNDED = 1e-15
+"""The error of computed eigenvalues, relative to the norm of the matrix."""
 
 SHIFT = 1e-7
 """How far off an equilibrium may be, relative to the size of the states."""
@@ -19,9 +23,10 @@ ComplexArray = np.typing.NDArray[np.complex128]
 
 
 class Verdict(StrEnum):
-    """What the linearization says of the zero dynamics."""
+    """What is found of the zero dynamics."""
 
     STABLE = "exponentially stable"
+    BOUNDED = "bounded, not asymptotically stable"
     UNSTABLE = "unstable"
     UNDECIDED = "undecided"
 
@@ -72,40 +77,52 @@ def linearized_eigenvalues(
         Both in 1/s, largest real part first, shape (dimension,) each.
     """
     slopes, _ = pinned.slopes(state, reference, parameters)
-    tangent = scipy.linalg.null_space(pinned.gradients(state, parameters))
-    sizes = pinned.sizes_of_slopes(state, reference, parameters) / scale[:, None] * scale
-    noise = LINEARIZED * max(balanced_norm(slopes), float(np.linalg.norm(sizes)))
-    values, errors = _eigenvalues(tangent.T @ slopes @ tangent, noise)
-    along = tangent @ np.random.default_rng(0).standard_normal(tangent.shape[1])
+    free, moved = pinned.coordinates(state, parameters, scale)
+    # What moves with a coordinate is known to round-off, relative to the scale of the states.
+    least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
+    sizes = pinned.sizes_of_slopes(state, reference, parameters)
+    off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
+    rounded = ROUNDED * balanced_norm(sizes)
+    values, errors = eigenvalues_of((slopes @ moved)[free], off, rounded)
+    along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
     beside, _ = pinned.slopes(state + SHIFT * along, reference, parameters)
     if np.all(np.isfinite(beside)):
-        others = np.linalg.eigvals(tangent.T @ beside @ tangent)
+        others, _ = eigenvalues_of((beside @ moved)[free], 0.0 * off)
         errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
     return values, errors
 
 
 def balanced_norm(matrix: FloatArray) -> float:
     """The norm of a matrix without the units of its state."""
-    return float(np.linalg.norm(_balanced(matrix), 2))
-
-
-def _balanced(matrix: FloatArray) -> FloatArray:
-    """A matrix without the units of its state: rows and columns scaled to similar norms."""
     with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
-        return np.asarray(scipy.linalg.matrix_balance(matrix, permute=False)[0])
+        return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
 
 
-def _eigenvalues(matrix: FloatArray, error: float) -> tuple[ComplexArray, FloatArray]:
+def eigenvalues_of(
+    matrix: FloatArray, error: FloatArray, rounded: float = 0.0
+) -> tuple[ComplexArray, FloatArray]:
     """Eigenvalues, largest real part first, and how far off each may be.
 
-    To first order an error E of the matrix moves an eigenvalue by at most |E| / |y^H x|, with its
-    left and right eigenvectors y and x of length one. Balancing takes the units out first.
+    To first order an error E of the matrix moves an eigenvalue by at most
+    |y|^H |E| |x| / |y^H x|, with its left and right eigenvectors y and x. So in a triangular matrix
+    a small eigenvalue is as certain as its own entry. Balancing takes the units out first.
+
+    Args:
+        matrix: The matrix, shape (d, d).
+        error: How far off its entries may be, shape (d, d).
+        rounded: How far off any entry of the balanced matrix may be; that of the eigenvalues'
+            computation is added.
     """
     if not matrix.size:
         return np.zeros(0, dtype=complex), np.zeros(0)
-    values, left, right = scipy.linalg.eig(_balanced(matrix), left=True, right=True)
-    errors = error / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), 1e-300)
+    with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
+        balanced, similarity = scipy.linalg.matrix_balance(matrix, permute=False)
+    units = np.diag(similarity)
+    values, left, right = scipy.linalg.eig(balanced, left=True, right=True)
+    off = error / units[:, None] * units + rounded + ROUNDED * np.linalg.norm(balanced, 2)
+    moved = np.einsum("ik,ij,jk->k", np.abs(left), off, np.abs(right))
+    errors = moved / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), 1e-300)
     order = np.lexsort((values.imag, -values.real))
     return values[order], errors[order]
 
@@ -131,3 +148,21 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
         f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
         f"imaginary axis, up to round-off, {place}",
     )
+
+
+def without_dynamics(structure: Structure) -> Stability:
+    """What is said where no internal states are left."""
+    nothing = np.zeros(0, dtype=complex)
+    margins = {
+        "A(x) of Assumption (2)": structure.constraint_margin,
+        "B(x) of (16)": structure.control_margin,
+    }
+    for matrix, margin in margins.items():
+        if margin is not None and margin.is_singular:
+            reason = (
+                "no zero dynamics, but the reference does not determine the motion: "
+                f"{matrix} is singular at x = {show(margin.state)}"
+            )
+            return Stability(Verdict.UNDECIDED, nothing, None, reason)
+    reason = "no zero dynamics: the reference alone determines the motion"
+    return Stability(Verdict.STABLE, nothing, None, reason)

@@ -11,20 +11,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.arrays import FloatArray, numbers, show, vector
 from drake_dae.dae import references
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.along import StabilityAlong, judge_along
+from drake_dae.dae.zero_dynamics.disturbances import Flow
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import Reference, follow
+from drake_dae.dae.zero_dynamics.settling import judge_at_rest, judge_without_rest
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     Stability,
-    Verdict,
-    judge,
     linearized_eigenvalues,
+    without_dynamics,
 )
 from drake_dae.errors import InconsistentStateError, ModelError
 
@@ -191,32 +193,90 @@ class ZeroDynamics:
             InconsistentStateError: The state is not near N*.
             ModelError: A shape is wrong, or a number is not finite.
         """
-        nothing = np.zeros(0, dtype=complex)
         if self.dimension == 0:
-            margins = {
-                "A(x) of Assumption (2)": self.structure.constraint_margin,
-                "B(x) of (16)": self.structure.control_margin,
-            }
-            for matrix, margin in margins.items():
-                if margin is not None and margin.is_singular:
-                    reason = (
-                        "no zero dynamics, but the reference does not determine the motion: "
-                        f"{matrix} is singular at x = {show(margin.state)}"
-                    )
-                    return Stability(Verdict.UNDECIDED, nothing, None, reason)
-            reason = "no zero dynamics: the reference alone determines the motion"
-            return Stability(Verdict.STABLE, nothing, None, reason)
+            return without_dynamics(self.structure)
         p = self.system.parameter_vector(parameters)
         start = self.structure.manifold.project(self._guess(state), p)
         try:
             goal = self._goal(start, outputs, p)
             rest = self._equilibria.find(goal, start, p)
         except InconsistentStateError as error:
-            return Stability(Verdict.UNDECIDED, nothing, None, str(error))
-        sizes = self._equilibria.sizes
-        values, errors = linearized_eigenvalues(self._pinned, sizes, rest, goal, p)
-        place = f"at the equilibrium with {self._pinned.describe(goal)}"
-        return judge(values, errors, rest, place)
+            goal = self._goal(start, outputs, p)
+            return judge_without_rest(self._equilibria, goal, start, p, str(error))
+        return judge_at_rest(self._equilibria, goal, rest, p)
+
+    def equilibria(
+        self,
+        guesses: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        outputs: ArrayLike | None = None,
+    ) -> FloatArray:
+        """The states at rest with the same outputs that a search from several guesses finds.
+
+        Args:
+            guesses: States from which the search starts, shape (k, n); `structure.states` if None.
+            parameters: Values of all parameters.
+            outputs: z, shape (p,). If None those of the first guess, as in `stability`.
+
+        Returns:
+            Each of them once, in the order in which they are found, shape (l, n). Of states at rest
+            that are not isolated, only one that is found first.
+
+        Raises:
+            InconsistentStateError: The first guess is not near N*.
+            ModelError: A shape is wrong, or a number is not finite.
+        """
+        given = numbers(
+            f"{self.system.name}: guesses", self.structure.states if guesses is None else guesses
+        )
+        if given.ndim != 2 or not len(given):
+            raise ModelError(
+                f"{self.system.name}: guesses must have shape (k, {self.system.num_states}), got "
+                f"{given.shape}"
+            )
+        starts, p = [self._guess(row) for row in given], self.system.parameter_vector(parameters)
+        goal = self._goal(self.structure.manifold.project(starts[0], p), outputs, p)
+        return self._equilibria.find_all(goal, starts, p)
+
+    def stability_along(
+        self, reference: Reference, motion: PinnedMotion, parameters: ArrayLike | None = None
+    ) -> StabilityAlong:
+        """Whether Assumption 2.2 holds along a motion, by what it does to small disturbances.
+
+        On Z(R(t)) a disturbance moves by delta' = (dx'/dx) delta. If the reference repeats itself
+        within the times, the motion of the same period is sought, and the eigenvalues of the
+        matrix that takes disturbances through one period, the Floquet multipliers, decide;
+        otherwise how much disturbances grow over the second half of the times. A constant
+        reference is judged as by `stability`.
+
+        Args:
+            reference: The function t -> R(t).
+            motion: What `motion` returns for it.
+            parameters: Values of all parameters.
+
+        Raises:
+            ModelError: A shape is wrong, or a number is not finite.
+        """
+        if self.dimension == 0:
+            still = without_dynamics(self.structure)
+            return StabilityAlong.without_numbers(still.verdict, still.reason)
+        p, n = self.system.parameter_vector(parameters), self.system.num_states
+        if motion.states.shape != (motion.times.size, n):
+            raise ModelError(
+                f"{self.system.name}: the motion is one of another system: its states have shape "
+                f"{motion.states.shape}, and not {(motion.times.size, n)}"
+            )
+        flow, period = Flow(self._pinned, reference, p, self._equilibria.sizes), None
+        if motion.ending is None and motion.times.size > 1:
+            period = flow.period(float(motion.times[0]), float(motion.times[-1]))
+        if period == 0.0:
+            outputs = self._pinned.layout.values(flow.goal(float(motion.times[0])))
+            found = self.stability(motion.states[0], parameters, outputs)
+            rates = found.eigenvalues.real.copy()
+            return StabilityAlong(
+                found.verdict, 0.0, found.eigenvalues[:0], rates, found.state, found.reason
+            )
+        return judge_along(flow, motion, period)
 
     def _moving(
         self, parameters: FloatArray, exogenous: Sequence[references.Reference]

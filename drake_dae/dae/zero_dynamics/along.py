@@ -1,0 +1,168 @@
+"""Stability of the zero dynamics along a reference: Floquet multipliers, and exponents.   (35)"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
+from drake_dae.dae.zero_dynamics.pinned_motion import Cause, PinnedMotion
+from drake_dae.dae.zero_dynamics.settling import Fate, carry_in_halves, fate_of, leave
+from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of
+
+CLOSED = 1e-7
+"""A motion is closed if it comes back to this, relative to the scale of the states."""
+
+CARRIED = 1e-6
+"""The error of a transition matrix, relative to its norm."""
+
+
+@dataclass(frozen=True, eq=False)
+class StabilityAlong:
+    """Whether the internal states stay near their motion while the outputs follow a reference.
+
+    Attributes:
+        verdict: With a period: exponentially stable if all multipliers are inside the unit circle,
+            unstable if one is outside and the motions that leave are not seen to stay bounded, or
+            bounded; undecided if one is on the circle up to the error. Without: what the
+            exponents and the volume of the disturbances say over the second half of the time.
+        period: The period of the reference in s; None if it has none, 0 if it is constant.
+        multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
+            (dimension,); empty if there is no such motion.
+        exponents: The rates at which disturbances grow, in 1/s, the largest first: log |multiplier|
+            per period, or of the singular values of the transition matrix over the second half
+            of the time, shape (dimension,); empty if the motion ends. If the reference is constant
+            the real parts of the eigenvalues at rest.
+        state: Where the periodic motion begins, shape (n,); None if there is none.
+        reason: What decided, in words.
+    """
+
+    verdict: Verdict
+    period: float | None
+    multipliers: ComplexArray
+    exponents: FloatArray
+    state: FloatArray | None
+    reason: str
+
+    @classmethod
+    def without_numbers(
+        cls, verdict: Verdict, reason: str, period: float | None = None
+    ) -> "StabilityAlong":
+        """One that nothing is computed for."""
+        return cls(verdict, period, np.zeros(0, dtype=complex), np.zeros(0), None, reason)
+
+
+def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
+    """Whether disturbances of a motion with pinned outputs grow.
+
+    Args:
+        flow: Along the reference.
+        motion: The motion on it.
+        period: The period of the reference; None if it has none.
+    """
+    if motion.ending is not None:
+        unbounded = motion.ending.cause is Cause.UNBOUNDED
+        verdict = Verdict.UNSTABLE if unbounded else Verdict.UNDECIDED
+        return StabilityAlong.without_numbers(verdict, f"the motion ends: {motion.ending}", period)
+    if motion.times.size < 2:
+        reason = "one time alone is no motion; give more times"
+        return StabilityAlong.without_numbers(Verdict.UNDECIDED, reason, period)
+    if period is not None:
+        # Late, where what dies out has died out; or early, where what grows is small yet.
+        late = int(np.flatnonzero(motion.times <= motion.times[-1] - period)[-1])
+        for first in dict.fromkeys((late, 0)):
+            begin = float(motion.times[first])
+            closed = _closed_motion(flow, motion.states[first], begin, period)
+            if closed is not None:
+                return _by_multipliers(flow, *closed, begin, period)
+    return _by_exponents(flow, motion, period)
+
+
+def _closed_motion(
+    flow: Flow, state: FloatArray, begin: float, period: float
+) -> tuple[FloatArray, FloatArray] | None:
+    """Where the motion begins that comes back after a period, and its monodromy matrix.
+
+    Newton's method for the way that is left after a period, along the tangent space.
+    """
+    scale = flow.scale
+    for _ in range(12):
+        basis = flow.basis(state)
+        try:
+            passage = flow.carry(state, begin, begin + period)
+        except Lost:
+            return None
+        scaled = (basis / scale[:, None]).T
+        with np.errstate(over="ignore"):
+            monodromy = np.exp(passage.growth) * (
+                scaled @ (passage.basis / scale[:, None]) @ passage.transition
+            )
+        if not np.all(np.isfinite(monodromy)):
+            return None
+        gap = scaled @ ((passage.state - state) / scale)
+        step = basis @ np.linalg.lstsq(monodromy - np.eye(gap.size), -gap, rcond=CARRIED)[0]
+        if np.max(np.abs(step) / scale, initial=0.0) <= CLOSED:
+            off = np.max(np.abs(passage.state - state) / scale)
+            return (state, monodromy) if off <= 1e3 * CLOSED * max(1.0, passage.growth) else None
+        try:
+            state = flow.onto(state + step, begin)
+        except Lost:
+            return None
+    return None
+
+
+def _by_multipliers(
+    flow: Flow, state: FloatArray, monodromy: FloatArray, begin: float, period: float
+) -> StabilityAlong:
+    noise = CARRIED * max(1.0, float(np.linalg.norm(monodromy, 2)))
+    values, errors = eigenvalues_of(monodromy, np.full(monodromy.shape, noise))
+    order = np.argsort(-np.abs(values), kind="stable")
+    values, errors = values[order], errors[order]
+    sizes = np.abs(values)
+    exponents = np.log(np.maximum(sizes, 1e-300)) / period
+    largest = f"the largest Floquet multiplier is {sizes[0]:.4g} over {period:.6g} s"
+    if np.all(sizes < 1.0 - errors):
+        verdict, reason = Verdict.STABLE, largest
+    elif np.any(sizes > 1.0 + errors):
+        verdict, reason = Verdict.UNSTABLE, f"small disturbances of the motion grow: {largest}"
+        fate, _ = leave(flow.repeating(begin, period), state, begin, float(exponents[0]))
+        if fate is Fate.CIRCLES:
+            verdict = Verdict.BOUNDED
+        if fate in (Fate.CIRCLES, Fate.SETTLES):
+            reason += f"; what leaves it {fate.value}"
+    else:
+        count = np.count_nonzero(np.abs(sizes - 1.0) <= errors)
+        verdict = Verdict.UNDECIDED
+        reason = (
+            f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to the error "
+            f"of integration, over {period:.6g} s"
+        )
+    return StabilityAlong(verdict, period, values, exponents, state, reason)
+
+
+def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
+    """What the second half of the time does with disturbances of the motion there."""
+    middle = int(np.searchsorted(motion.times, 0.5 * (motion.times[0] + motion.times[-1])))
+    middle = min(middle, motion.times.size - 2)
+    begin, end = float(motion.times[middle]), float(motion.times[-1])
+    try:
+        passage, halves = carry_in_halves(flow, motion.states[middle], begin, end)
+    except Lost as lost:
+        verdict = Verdict.UNSTABLE if lost.cause is Cause.UNBOUNDED else Verdict.UNDECIDED
+        reason = f"from x = {show(motion.states[middle])}: {lost}"
+        return StabilityAlong.without_numbers(verdict, reason, period)
+    verdict = {
+        Fate.SPREADS: Verdict.UNSTABLE,
+        Fate.SETTLES: Verdict.STABLE,
+        Fate.CIRCLES: Verdict.BOUNDED,
+    }.get(fate_of(passage, *halves), Verdict.UNDECIDED)
+    sizes = np.linalg.svd(passage.transition, compute_uv=False)
+    exponents = (np.log(np.maximum(sizes, 1e-300)) + passage.growth) / (end - begin)
+    reason = (
+        f"from {begin:.6g} to {end:.6g} s disturbances of the motion change by a factor "
+        f"{np.exp(min(passage.growth, 700.0)):.3g} at most, {exponents[0]:.3g} 1/s"
+    )
+    if verdict is Verdict.UNDECIDED:
+        reason += "; that is not long enough to tell"
+    none = np.zeros(0, dtype=complex)
+    return StabilityAlong(verdict, period, none, exponents, None, reason)

@@ -1,0 +1,179 @@
+"""Motions with pinned outputs, and what becomes of small disturbances of them.            (35)
+
+To first order a disturbance delta of a state on Z(R(t)) moves by delta' = (dx'/dx) delta, with the
+derivative of x' = f* + h* u at fixed R, and stays tangent to Z(R(t)). In bases T of the tangent
+spaces an interval of time takes it from T_0 c to T_1 M c. Over a period of a periodic motion the
+eigenvalues of M are the Floquet multipliers.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.integrate
+import scipy.linalg
+
+from drake_dae.arguments import result_of
+from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.zero_dynamics.periods import find_period
+from drake_dae.dae.zero_dynamics.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pursuit import GROWN, STEPS, Reference
+
+ACCURACY = 1e-9
+"""The error of an integration step, relative to the scale of the states."""
+
+SECTIONS = 16
+"""In so many parts of an interval the state is put back on Z(R), and bases are chosen anew."""
+
+
+class Lost(Exception):
+    """A motion cannot be followed to the end of an interval."""
+
+    def __init__(self, cause: Cause) -> None:
+        super().__init__(cause.value)
+        self.cause = cause
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """What an interval of time makes of a state on Z(R), and of its disturbances.
+
+    Attributes:
+        state: The state at the end, shape (n,).
+        basis: T_1, of the tangent space there, orthonormal relative to the scale, shape (n, d).
+        transition: M divided by exp(growth), shape (d, d); the identity if nobody asked for it.
+        growth: The logarithm of the norm of M, by which disturbances grow at most.
+        volume: The logarithm of |det M|, by which a volume of disturbances grows.
+    """
+
+    state: FloatArray
+    basis: FloatArray
+    transition: FloatArray
+    growth: float
+    volume: float
+
+
+class Flow:
+    """Carries states on Z(R(t)), and their disturbances, through intervals of time.
+
+    Args:
+        pinned: Z(R).
+        reference: The function t -> R(t).
+        parameters: Values of all parameters.
+        scale: How large the states are, shape (n,).
+    """
+
+    def __init__(
+        self,
+        pinned: PinnedOutputs,
+        reference: Reference,
+        parameters: FloatArray,
+        scale: FloatArray,
+    ) -> None:
+        self.pinned, self.parameters, self.scale = pinned, parameters, scale
+        self._reference = reference
+
+    def basis(self, state: FloatArray) -> FloatArray:
+        """T at a state, shape (n, d)."""
+        return self.pinned.tangent(state, self.parameters, self.scale)
+
+    def goal(self, time: float) -> FloatArray:
+        """R at a time, shape (sum (mu_i + 1),).
+
+        Raises:
+            ModelError: The reference has another size, or is not finite.
+        """
+        given = result_of("reference", self._reference, time)
+        size = self.pinned.layout.reference_size
+        return vector(f"reference({time:g})", np.ravel(given), size)
+
+    def period(self, begin: float, end: float) -> float | None:
+        """The period of the reference, as `find_period` finds it in an interval."""
+        return find_period(self.goal, begin, end)
+
+    def repeating(self, begin: float, period: float) -> "Flow":
+        """The same along a reference that repeats what it is in one period."""
+
+        def reference(time: float) -> FloatArray:
+            return self.goal(begin + (time - begin) % period)
+
+        return Flow(self.pinned, reference, self.parameters, self.scale)
+
+    def onto(self, state: FloatArray, time: float) -> FloatArray:
+        """The state on Z(R(t)) next to a given one.
+
+        Raises:
+            Lost: There is none, or it is far.
+        """
+        found, converged = self.pinned.project(state, self.goal(time), self.parameters)
+        if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
+            raise Lost(Cause.NO_WAY_ON)
+        return found
+
+    def carry(
+        self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
+    ) -> Passage:
+        """Where an interval of time takes a state, and its disturbances.
+
+        Raises:
+            Lost: The motion grows without bound, is too fast, or leaves the domain.
+        """
+        d = self.pinned.structure.zero_dynamics_dimension
+        basis, transition, growth, volume = self.basis(state), np.eye(d), 0.0, 0.0
+        times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
+        for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+            columns = basis if disturbed else basis[:, :0]
+            state, columns, steps = self._integrate(state, columns, start, stop, steps)
+            state = self.onto(state, stop)
+            basis = self.basis(state)
+            if disturbed:
+                scaled = (basis / self.scale[:, None]).T @ (columns / self.scale[:, None])
+                transition = scaled @ transition
+                size = max(float(np.linalg.norm(transition, 2)), 1e-300)
+                transition, growth = transition / size, growth + float(np.log(size))
+                volume += max(float(np.linalg.slogdet(scaled)[1]), -700.0)
+        return Passage(state, basis, transition, growth, volume)
+
+    def _integrate(
+        self, state: FloatArray, columns: FloatArray, begin: float, end: float, steps: int
+    ) -> tuple[FloatArray, FloatArray, int]:
+        """A state and directions at the end of a section, and how many steps are left."""
+        n, unit = state.size, self.scale[:, None]
+        bound = GROWN * np.maximum(1.0, np.max(np.abs(state) / self.scale))
+
+        def split(both: FloatArray) -> tuple[FloatArray, FloatArray]:
+            parts = both.reshape(-1, n).T * unit
+            return parts[:, 0], parts[:, 1:]
+
+        def joined(first: FloatArray, rest: FloatArray) -> FloatArray:
+            return (np.column_stack([first, rest]) / unit).T.reshape(-1)
+
+        def rate(time: float, both: FloatArray) -> FloatArray:
+            (x, along), goal, p = split(both), self.goal(time), self.parameters
+            moved = joined(
+                self.pinned.rate(x, goal, p), self.pinned.slopes_along(x, goal, p, along)
+            )
+            if not np.all(np.isfinite(moved)):
+                raise Lost(Cause.NO_WAY_ON)
+            return moved
+
+        def slopes(time: float, both: FloatArray) -> FloatArray:
+            # Without the second derivatives, which the iteration of the integrator makes up for.
+            matrix = self.pinned.slopes(split(both)[0], self.goal(time), self.parameters)[0]
+            blocks = [matrix * self.scale / unit] * (1 + columns.shape[1])
+            return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
+
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # That of a step that fails; it is told as Lost.
+            solver = scipy.integrate.LSODA(
+                rate, begin, joined(state, columns), end, rtol=ACCURACY, atol=ACCURACY, jac=slopes
+            )
+            while solver.status == "running":
+                solver.step()
+                steps -= 1
+                if not np.max(np.abs(solver.y[:n])) <= bound:
+                    raise Lost(Cause.UNBOUNDED)
+                if steps < 0 or solver.status == "failed":
+                    raise Lost(Cause.TOO_FAST)
+        return *split(solver.y), steps

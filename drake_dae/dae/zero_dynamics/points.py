@@ -1,0 +1,63 @@
+"""A state with its outputs pinned, and whether its motion is determined."""
+
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+
+
+class Regularity(Enum):
+    """Whether the motion is determined at a point; the value says what is wrong."""
+
+    REGULAR = ""
+    MATRIX_NOT_FINITE = "A(x) or B(x) is not finite"
+    SINGULAR = "A(x) or B(x) is singular"
+    RATE_NOT_FINITE = "x' is not finite"
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A state on Z(R), and what belongs to it, finite or not.
+
+    Attributes:
+        state: x, shape (n,).
+        rate: x', shape (n,).
+        control: u, shape (p,).
+        constraint_input: v, shape (m,).
+        A, B: The matrices of Assumptions (2) and (5).
+        pivot: A number that is 0 exactly where one of them is singular, shape (1,).
+        unrest: |E x'| relative to the sizes of the terms that cancel in it at rest, shape (n,).
+    """
+
+    state: FloatArray
+    rate: FloatArray
+    control: FloatArray
+    constraint_input: FloatArray
+    A: FloatArray
+    B: FloatArray
+    pivot: FloatArray
+    unrest: FloatArray
+
+    @cached_property
+    def margins(self) -> tuple[float, float]:
+        """The smallest singular values of A and B."""
+        return _margin(self.A), _margin(self.B)
+
+    @cached_property
+    def signs(self) -> tuple[float, ...]:
+        """The signs of det A and det B."""
+        return tuple(float(np.linalg.slogdet(_square(matrix))[0]) for matrix in (self.A, self.B))
+
+
+def _square(matrix: FloatArray) -> FloatArray:
+    """A square matrix; one with one column comes as a vector."""
+    return matrix.reshape(round(matrix.size**0.5), round(matrix.size**0.5))
+
+
+def _margin(matrix: FloatArray) -> float:
+    """The smallest singular value; that of a matrix without columns is infinite."""
+    values = np.linalg.svd(_square(matrix), compute_uv=False)
+    return float(np.min(values, initial=np.inf))

@@ -1,0 +1,199 @@
+"""What becomes of a motion with pinned outputs in the long run."""
+
+from dataclasses import replace
+from enum import Enum
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Passage
+from drake_dae.dae.zero_dynamics.equilibria import Equilibria
+from drake_dae.dae.zero_dynamics.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.stability import (
+    Stability,
+    Verdict,
+    balanced_norm,
+    judge,
+    linearized_eigenvalues,
+)
+from drake_dae.errors import InconsistentStateError
+
+FOLDINGS = 40.0
+"""A motion is watched while the fastest disturbance grows by e to this power."""
+
+BESIDE = 1e-3
+"""How far beside a motion one starts that may leave it, relative to the scale of the states."""
+
+PLAIN = float(np.log(10.0))
+"""Disturbances grow or shrink where the logarithm of their size changes by more than this."""
+
+
+SLOWEST = 1e-4
+"""What moves more slowly than this, relative to all that moves, is not waited for."""
+
+
+class Fate(Enum):
+    """What becomes of a motion; the value says it."""
+
+    GROWS = "grows without bound"
+    SETTLES = "settles into another motion, which is stable"
+    CIRCLES = "settles into a bounded motion, like a limit cycle"
+    SPREADS = "stays beside no neighbour: small disturbances grow on and on"
+    UNCLEAR = "was not followed long enough to tell"
+
+
+def fate_of(passage: Passage, *halves: Passage) -> Fate:
+    """What an interval says of a motion that has lasted for some time.
+
+    Neighbours that a motion draws to it come nearer in all directions. On a limit cycle those
+    ahead stay ahead, while volumes shrink. A growth that is no more than proportional to time, as
+    of neighbours that are a little faster, is not exponential: then that of both halves adds up
+    to much more.
+
+    Args:
+        passage: The interval.
+        halves: Its two halves.
+    """
+    grows = passage.growth > 0.8 * sum(max(half.growth, 0.0) for half in halves)
+    if passage.growth > PLAIN and grows:
+        return Fate.SPREADS
+    if passage.growth < -PLAIN:
+        return Fate.SETTLES
+    if abs(passage.growth) < 0.7 * PLAIN and passage.volume < -2.0 * PLAIN:
+        return Fate.CIRCLES
+    return Fate.UNCLEAR
+
+
+def watch(flow: Flow, state: FloatArray, begin: float, end: float) -> tuple[Fate, Passage | None]:
+    """What becomes of the motion from a state, and the second half of the time."""
+    middle = 0.5 * (begin + end)
+    try:
+        later = flow.carry(state, begin, middle, disturbed=False).state
+        passage, halves = carry_in_halves(flow, later, middle, end)
+    except Lost as lost:
+        return (Fate.GROWS if lost.cause is Cause.UNBOUNDED else Fate.UNCLEAR), None
+    return fate_of(passage, *halves), passage
+
+
+def carry_in_halves(
+    flow: Flow, state: FloatArray, begin: float, end: float
+) -> tuple[Passage, tuple[Passage, Passage]]:
+    """What an interval of time and its halves make of a state.
+
+    Raises:
+        Lost: The motion cannot be followed.
+    """
+    middle = 0.5 * (begin + end)
+    first = flow.carry(state, begin, middle)
+    second = flow.carry(first.state, middle, end)
+    transition = second.transition @ first.transition
+    size = max(float(np.linalg.norm(transition, 2)), 1e-300)
+    whole = Passage(
+        second.state,
+        second.basis,
+        transition / size,
+        first.growth + second.growth + float(np.log(size)),
+        first.volume + second.volume,
+    )
+    return whole, (first, second)
+
+
+def watch_from(flow: Flow, state: FloatArray) -> tuple[Fate, FloatArray | None]:
+    """What becomes of the motion from a state that is not at rest, and where it is at the end.
+
+    How long that takes is told by how fast its disturbances move.
+    """
+    basis = flow.basis(state) / flow.scale[:, None]
+    slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters)
+    scaled = basis.T @ (slopes * flow.scale / flow.scale[:, None]) @ basis
+    if not np.all(np.isfinite(scaled)):
+        return Fate.UNCLEAR, None
+    rates = np.abs(np.linalg.eigvals(scaled))
+    rates = rates[rates > SLOWEST * balanced_norm(slopes)]
+    if not rates.size:
+        return Fate.UNCLEAR, None
+    fate, passage = watch(flow, state, 0.0, FOLDINGS / float(rates.min()))
+    return fate, None if passage is None else passage.state
+
+
+def leave(flow: Flow, state: FloatArray, time: float, rate: float) -> tuple[Fate, Passage | None]:
+    """What becomes of the motions that leave an unstable one, on both sides of it.
+
+    Args:
+        flow: Of a reference that can be asked at all times.
+        state: A state of the unstable motion, shape (n,).
+        time: When it is there.
+        rate: The largest exponent of its disturbances, in 1/s, positive.
+
+    Returns:
+        The fate that is worse, or that is not known; the circling one only if both sides circle.
+    """
+    basis = flow.basis(state)
+    aside = basis @ np.random.default_rng(0).standard_normal(basis.shape[1])
+    aside *= BESIDE / np.max(np.abs(aside) / flow.scale)
+    found: list[tuple[Fate, Passage | None]] = []
+    for side in (aside, -aside):
+        try:
+            start = flow.onto(state + side, time)
+        except Lost:
+            return Fate.UNCLEAR, None
+        found.append(watch(flow, start, time, time + FOLDINGS / rate))
+        if found[-1][0] not in (Fate.CIRCLES, Fate.SETTLES):
+            break
+    return min(found, key=lambda one: one[0] is Fate.CIRCLES)
+
+
+def judge_at_rest(
+    equilibria: Equilibria, goal: FloatArray, rest: FloatArray, parameters: FloatArray
+) -> Stability:
+    """What the eigenvalues say; where they are unstable, also what leaves the equilibrium.
+
+    Args:
+        equilibria: The states at rest on Z(R).
+        goal: R with constant outputs.
+        rest: The equilibrium, shape (n,).
+        parameters: Values of all parameters.
+    """
+    pinned, sizes = equilibria.pinned, equilibria.sizes
+    values, errors = linearized_eigenvalues(pinned, sizes, rest, goal, parameters)
+    place = f"at the equilibrium with {pinned.describe(goal)}"
+    found = judge(values, errors, rest, place)
+    if found.verdict is not Verdict.UNSTABLE:
+        return found
+    flow = Flow(pinned, lambda time: goal, parameters, sizes)
+    fate, _ = leave(flow, rest, 0.0, float(values[0].real))
+    if fate not in (Fate.CIRCLES, Fate.SETTLES):
+        return found
+    verdict = Verdict.BOUNDED if fate is Fate.CIRCLES else Verdict.UNSTABLE
+    return replace(found, verdict=verdict, reason=f"{found.reason}; what leaves it {fate.value}")
+
+
+def judge_without_rest(
+    equilibria: Equilibria,
+    goal: FloatArray,
+    start: FloatArray,
+    parameters: FloatArray,
+    reason: str,
+) -> Stability:
+    """What the motion from a state says where the search finds no equilibrium near it.
+
+    Args:
+        equilibria: The states at rest on Z(R).
+        goal: R with constant outputs.
+        start: A state near Z(R), shape (n,).
+        parameters: Values of all parameters.
+        reason: Why there is no equilibrium.
+    """
+    nothing, pinned = np.zeros(0, dtype=complex), equilibria.pinned
+    flow = Flow(pinned, lambda time: goal, parameters, equilibria.sizes)
+    try:
+        fate, end = watch_from(flow, pinned.state(goal, start, parameters))
+        if fate is Fate.SETTLES and end is not None:
+            rest = equilibria.find(goal, end, parameters)
+            return judge_at_rest(equilibria, goal, rest, parameters)
+    except InconsistentStateError:
+        return Stability(Verdict.UNDECIDED, nothing, None, reason)
+    verdict = {Fate.GROWS: Verdict.UNSTABLE, Fate.CIRCLES: Verdict.BOUNDED}.get(fate)
+    if verdict is None:
+        return Stability(Verdict.UNDECIDED, nothing, None, reason)
+    return Stability(verdict, nothing, None, f"{reason}; the motion from there {fate.value}")
