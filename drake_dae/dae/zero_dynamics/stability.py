@@ -87,13 +87,8 @@ def linearized_eigenvalues(
 
 def balanced_norm(matrix: FloatArray) -> float:
     """The norm of a matrix without the units of its state."""
-    return float(np.linalg.norm(_balanced(matrix), 2))
-
-
-def _balanced(matrix: FloatArray) -> FloatArray:
-    """A matrix without the units of its state: rows and columns scaled to similar norms."""
-    with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
-        return np.asarray(scipy.linalg.matrix_balance(matrix, permute=False)[0])
+    with np.errstate(invalid="ignore"):  # Of permutations, which are not asked for.
+        return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
 
 
 def _eigenvalues(matrix: FloatArray, error: float) -> tuple[ComplexArray, FloatArray]:
@@ -104,7 +99,8 @@ def _eigenvalues(matrix: FloatArray, error: float) -> tuple[ComplexArray, FloatA
     """
     if not matrix.size:
         return np.zeros(0, dtype=complex), np.zeros(0)
-    values, left, right = scipy.linalg.eig(_balanced(matrix), left=True, right=True)
+    balanced = scipy.linalg.matrix_balance(matrix, permute=False)[0]
+    values, left, right = scipy.linalg.eig(balanced, left=True, right=True)
     errors = error / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), 1e-300)
     order = np.lexsort((values.imag, -values.real))
     return values[order], errors[order]
