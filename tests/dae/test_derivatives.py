@@ -215,3 +215,27 @@ def test_what_is_symmetric_at_the_default_parameters_alone_is_not_taken_as_symme
         v = -(2 * speed_now @ speed_now + gradient @ free) / (gradient @ force)
         found = function(np.concatenate([place_now, speed_now]), [u], [factor])[0]
         np.testing.assert_allclose(found[2:], free + force * v, rtol=1e-12, atol=1e-12)
+
+
+def test_the_inverse_holds_no_unknown_whose_slope_cancels():
+    """c (s w) - s (c w) is zero to the Jacobian, and still an expression of w: each wanted value
+    asks so for the other unknown, whichever is solved for first. u is x'' here."""
+    x = ca.SX.sym("x", 4)
+    system = DaeSystem(
+        state=x,
+        f=ca.vertcat(x[2:], 0, 0),
+        g=[],
+        h=ca.vertcat(ca.SX(2, 2), ca.SX.eye(2)),
+        k=[],
+        l=x[:2],
+        m=[],
+        nominal_state=[0.3, 0.2, 0.1, 0.4],
+    )
+    motion = find_structure(system).derivatives
+    c, s, rate = ca.cos(x[0]), ca.sin(x[0]), motion.rate[2:]
+    both = rate + c * (s * rate[[1, 0]]) - s * (c * rate[[1, 0]])
+    assert ca.sparsify(ca.jacobian(both, rate)).nnz() == 2
+    wanted = ca.SX.sym("wanted", 2)
+    found, _ = motion.inverse(both, wanted)
+    function = TracedFunction("inverse", {"x": x, "wanted": wanted}, {"u": found})
+    np.testing.assert_allclose(function([0.3, 0.2, 0.1, 0.4], [5.0, 7.0])[0], [5.0, 7.0])

@@ -14,13 +14,17 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
+    PrismaticJoint,
     RevoluteJoint,
     RpyFloatingJoint,
+    ScrewJoint,
     SpatialInertia,
+    UniversalJoint,
 )
 
 from drake_dae import LinkExpressions, MultibodyExpressions
 from drake_dae.errors import ModelError
+from drake_dae.robots.links.kinematics import Reaction
 from drake_dae.trace.functions import TracedFunction
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}
@@ -65,10 +69,28 @@ def floating():
     return MultibodyExpressions(plant)
 
 
+def chain():
+    """A screw, a slide, a hinge whose parent is the outer body, and a joint with two positions."""
+    plant = MultibodyPlant(0.0)
+    inertia = SpatialInertia.SolidBoxWithMass(2.0, 0.3, 0.5, 0.7)
+    world = plant.world_frame()
+    a, b, c, d = (plant.AddRigidBody(name, inertia).body_frame() for name in "abcd")
+    pose = RigidTransform(RollPitchYaw(0.3, -0.7, 1.1), [0.5, 0.2, 0.9])
+    off = plant.AddFrame(FixedOffsetFrame("off", a, pose))
+    plant.AddJoint(ScrewJoint("screw", world, a, [0.6, 0.0, 0.8], 0.3, 0.0))
+    plant.AddJoint(PrismaticJoint("slide", off, b, [0.48, 0.6, 0.64]))
+    plant.AddJoint(RevoluteJoint("hinge", c, b, [0.0, 0.6, 0.8]))
+    plant.AddJoint(UniversalJoint("cross", c, d))
+    plant.AddFrame(FixedOffsetFrame("tool", d, pose))
+    plant.Finalize()
+    return MultibodyExpressions(plant)
+
+
 MAKERS = {
     "textbook arm": textbook_arm,
     "sled": sled,
     "floating": floating,
+    "chain": chain,
     "two_link": lambda: MultibodyExpressions(parse("two_link_arm")),
     "seven_joint": lambda: MultibodyExpressions(parse("seven_joint_arm")),
 }
@@ -210,3 +232,29 @@ def test_forces_have_the_power_of_their_work(links):
         {"tau": links.generalized_force(kinematics, again)},
     )
     np.testing.assert_allclose(other, tau, **CLOSE)
+
+
+KNOWN = {"floating": 1, "chain": 3, "two_link": 2, "seven_joint": 7}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_joint_axis_is_a_unit_of_the_generalized_force(name):
+    """On the child, and the opposite on the parent: tau is one for the joint and no other."""
+    links = made(name)
+    kinematics, found = links.kinematics(), 0
+    for i, signal in enumerate(links.position_signals):
+        axis = kinematics.joint_axis(signal.name)
+        if axis is None:
+            continue
+        found += 1
+        acting = Reaction(ca.SX(links.v.numel(), 1))
+        for frame, sign in ((axis.child, 1.0), (axis.parent, -1.0)):
+            # The force acts at the point, to which the frame's origin has a lever.
+            lever = axis.point - kinematics.position(frame)
+            moment = sign * (axis.moment + ca.cross(lever, axis.force))
+            force = sign * axis.force
+            acting += kinematics.push(frame, ca.densify(force), moment=ca.densify(moment))
+        tau = links.generalized_force(kinematics, acting)
+        (tau,), _ = numbers(links, {}, {"tau": tau})
+        np.testing.assert_allclose(tau, np.eye(len(tau))[i], atol=1e-12)
+    assert found == KNOWN.get(name, 0)

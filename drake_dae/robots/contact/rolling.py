@@ -78,9 +78,10 @@ class RollingWheel(Constraint):
     s; the ground gets the opposite. A wheel that turns by positive angles about its axle goes
     forward. The parameter "<name>.radius" is the radius.
 
-    It keeps no height, so that robots whose joints keep it stay regular: for a body that is free to
-    fall use a `RollingBall`, or a `PointOnSurface` elsewhere. A second wheel on the same axle would
-    say again that the axle does not move sideways: give that one holds_side = False.
+    It keeps no height, so that robots whose joints keep it stay regular: on a base that is free to
+    fall, hold the centers of the wheels at their height by a `PointOnSurface` each. A second wheel
+    on the same axle would say again that the axle does not move sideways: give that one
+    holds_side = False.
 
     Attributes:
         frame: Name of a frame on the wheel.
