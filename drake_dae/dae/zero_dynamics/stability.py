@@ -82,6 +82,9 @@ def linearized_eigenvalues(
     least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
     sizes = pinned.sizes_of_slopes(state, reference, parameters)
     off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
+    # The numbers of a model are rounded too, such as the cosine of a right angle.
+    units = scale[free][:, None] / scale[free]
+    off += ROUNDED * np.linalg.norm((slopes @ moved)[free] / units, 2) * units
     rounded = ROUNDED * balanced_norm(sizes)
     values, errors = eigenvalues_of((slopes @ moved)[free], off, rounded)
     along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
