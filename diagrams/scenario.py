@@ -21,7 +21,7 @@ from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
 from drake_dae.errors import ScenarioError
-from drake_dae.robots import actuation, contact, outputs
+from drake_dae.robots import actuation, contact, loads, outputs
 from drake_dae.robots.contact import surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
 
@@ -72,6 +72,7 @@ Reference = Annotated[
     ],
     Choice({**_WRITTEN, ArrayLike: Row}),
 ]
+Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
@@ -104,6 +105,8 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not.
+        loads: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
+            `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
             for example.
         gains: The gains of the tracking law (28).
@@ -122,6 +125,7 @@ class Scenario:
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
+    loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     gains: Gains = field(default_factory=parts.Poles)
     references: list[Reference] = field(kw_only=True)

@@ -25,6 +25,7 @@ from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 
@@ -54,7 +55,8 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
     _check_forces(scenario.forces, constraints, links)
-    _check_exogenous(scenario.exogenous, links, constraints, stages)
+    loads = each("loads", scenario.loads, lambda load: _load(load, links))
+    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages)
     with at("actuation" if stages else "outputs"):
         return RobotModel(
             links,
@@ -65,6 +67,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
             stages,
             scenario.forces,
             tuple(scenario.exogenous),
+            loads,
         )
 
 
@@ -248,16 +251,21 @@ def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
     return stages
 
 
+def _load(load: KnownForce, links: Links) -> KnownForce:
+    load.reaction(links.kinematics())
+    return load
+
+
 @at("exogenous")
 def _check_exogenous(
     names: Iterable[str],
     links: Links,
-    constraints: Sequence[Constraint],
+    members: Sequence[Constraint | KnownForce],
     stages: Sequence[Stage],
 ) -> None:
     """Refuses to move what is no parameter."""
     attached = [stage.attach(links).parameters for stage in stages]
-    groups = [links.parameters, *(c.parameters for c in constraints), *attached]
+    groups = [links.parameters, *(member.parameters for member in members), *attached]
     known = [parameter.name for group in groups for parameter in group]
     for name in names:
         if name not in known:

@@ -51,6 +51,7 @@ from .robots.contact.surfaces import Torus as Torus
 from .robots.contact.welds import WeldedFrames as WeldedFrames
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
+from .robots.loads import KnownForce as KnownForce
 from .robots.model import RobotModel as RobotModel
 from .robots.outputs import AxisCoordinates as AxisCoordinates
 from .robots.outputs import ExpressionOutput as ExpressionOutput

@@ -22,6 +22,7 @@ from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
 from drake_dae.trace.functions import TracedFunction
@@ -55,10 +56,11 @@ class RobotModel:
         forces: Names of the constraint forces that are outputs, in their order; all if None.
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
+        loads: Known forces on frames, which are zero where nobody sets their parameters.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, positions, name: The arguments.
+        links, positions, name, loads: The arguments.
         constraints: The constraints, with those of the plant.
         steered: Which of the constraint forces are outputs, in their order: the rows of S.
         stages: The attached stages.
@@ -81,11 +83,13 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str] | None = None,
         exogenous: Sequence[str] = (),
+        loads: Sequence[KnownForce] = (),
     ) -> None:
         self.links = links
         self.constraints = (*constraints, *plant_constraints(links))
         self.positions = tuple(positions)
         self.name = name
+        self.loads = tuple(loads)
         bound = ConstraintSet(self.constraints)
         self.steered = bound.places(forces)
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
@@ -117,6 +121,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str] | None = None,
         exogenous: Sequence[str] = (),
+        loads: Sequence[KnownForce] = (),
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -125,7 +130,15 @@ class RobotModel:
         """
         links = MultibodyExpressions(plant)
         return cls(
-            links, constraints, positions, nominal_positions, name, actuation, forces, exogenous
+            links,
+            constraints,
+            positions,
+            nominal_positions,
+            name,
+            actuation,
+            forces,
+            exogenous,
+            loads,
         )
 
     @property
@@ -246,7 +259,7 @@ class RobotModel:
         m, nu = bound.size, len(links.actuator_signals)
         B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(B, driven.joint_force)
+        torque = ca.mtimes(B, driven.joint_force) + self._known_force()
         rotors = self._moved_rotors(driven)
 
         def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -273,7 +286,12 @@ class RobotModel:
             k=bound.constraint_output(links.kinematics()),  # (44)
             l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
             m=ca.vertcat(ca.SX(h_1.numel(), m), S),
-            parameters=(*links.parameters, *driven.parameters, *bound.parameters),
+            parameters=(
+                *links.parameters,
+                *driven.parameters,
+                *bound.parameters,
+                *(parameter for load in self.loads for parameter in load.parameters),
+            ),
             state_signals=(
                 *links.position_signals,
                 *links.velocity_signals,
@@ -287,6 +305,13 @@ class RobotModel:
             name=self.name,
             implicit=implicit,
         )
+
+    def _known_force(self) -> ca.SX:
+        """The generalized force of the loads, shape (nv, 1)."""
+        total, kinematics = ca.SX(self.links.v.numel(), 1), self.links.kinematics()
+        for load in self.loads:
+            total += self.links.generalized_force(kinematics, load.reaction(kinematics))
+        return total
 
     def _moved_rotors(self, driven: ActuationChain) -> ca.SX:
         """What of M turns with a stage, and not with the links, shape (nv, nv)."""
