@@ -245,6 +245,8 @@ CASES = {
 }
 
 
+# A ball that spins freely has zero dynamics with eigenvalues 0 in pairs: round-off takes sides.
+@pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_path):
     """The accuracy of 1e-8 in a step leaves less than 1e-6 along the way, and the forces are met
