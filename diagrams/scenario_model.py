@@ -155,7 +155,7 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
 class _Dropped(logging.Filter):
     """Collects what Drake's parser changes or leaves out, with no more than a warning."""
 
-    KINDS = ("inertia", "friction", "effort limit")
+    KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
 
     def __init__(self, level: int) -> None:
         super().__init__()
@@ -181,6 +181,11 @@ def _explained(warning: str) -> str:
         )
     elif "friction" in text:
         text = "Coulomb friction of a joint is not supported; leave <dynamics friction> out"
+    elif "equality" in text:
+        return (
+            f"{place}: {' '.join(text.split())} Take it out of the file, and write it under "
+            "constraints; two joints that move together are a !JointCoupler"
+        )
     file, _, line = place.rpartition(":")
     owner = ""
     if _is_file(file) and line.isdecimal():

@@ -245,6 +245,8 @@ CASES = {
 }
 
 
+# A ball that spins freely has zero dynamics with eigenvalues 0 in pairs: round-off takes sides.
+@pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_path):
     """The accuracy of 1e-8 in a step leaves less than 1e-6 along the way, and the forces are met
@@ -315,6 +317,36 @@ def test_what_does_not_fit_is_refused_with_its_key(name, settings, words, tmp_pa
     path = scenario_file(tmp_path, text, robot)
     with pytest.raises(ScenarioError) as caught:
         build_scenario(load_scenario(path, settings))
+    message = str(caught.value)
+    assert [word for word in words if word not in message] == [], message
+
+
+BALLS = """<drake:ball_constraint><drake:ball_constraint_body_A name="left_pad"/>
+<drake:ball_constraint_body_B name="right_pad"/><drake:ball_constraint_p_AP value="0 0 1"/>
+<drake:ball_constraint_p_BQ value="0 0 1"/></drake:ball_constraint></robot>"""
+
+EQUAL = """<mujoco model="m"><worldbody>
+<body name="a"><joint name="j1" type="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/></body>
+<body name="b"><joint name="j2" type="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/></body>
+</worldbody><equality><joint joint1="j1" joint2="j2" polycoef="0 2 0 0 0"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("file", "robot", "words"),
+    [
+        (
+            "robot.urdf",
+            GRIPPER.replace("</robot>", BALLS),
+            ["robot.file: ", "1 constraint(s)", "ball constraint is CoincidentPoints"],
+        ),
+        ("robot.xml", EQUAL, ["robot.file: ", "equality", "ignored", "!JointCoupler"]),
+    ],
+)
+def test_what_a_robot_file_holds_besides_is_refused_and_not_dropped(file, robot, words, tmp_path):
+    path = scenario_file(tmp_path, PADS.replace("robot.urdf", file), GRIPPER)
+    (tmp_path / file).write_text(robot)
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(load_scenario(path))
     message = str(caught.value)
     assert [word for word in words if word not in message] == [], message
 

@@ -33,6 +33,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ModelError
+from drake_dae.robots.contact.plant_constraints import plant_constraints
 
 LINK = """
   <link name="{name}"><inertial><origin xyz="{x} 0 0.1"/><mass value="{mass}"/>
@@ -90,6 +91,20 @@ def test_a_mimic_joint_is_a_coupler(time_step, multiplier):
         follower, leader, multiplier, 0.05, "m", name=f"{follower}_coupler"
     )
     assert [s.name for s in model.dae.output_signals] == ["arm", f"{follower}_coupler.force"]
+
+
+def test_a_mimic_joint_of_sdformat_is_a_coupler():
+    text = '<sdf version="1.11" xmlns:drake="http://drake.mit.edu"><model name="m">'
+    for k, mimic in enumerate(["", '<drake:mimic joint="j0" multiplier="2" offset="0.1"/>']):
+        text += (
+            f'<link name="b{k}"/><joint name="j{k}" type="revolute"><parent>world</parent>'
+            f"<child>b{k}</child><axis><xyz>0 1 0</xyz></axis>{mimic}</joint>"
+        )
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(f"{text}</model></sdf>", "sdf")
+    plant.Finalize()
+    (coupler,) = plant_constraints(MultibodyExpressions(plant))
+    assert coupler == JointCoupler("j1", "j0", 2.0, 0.1, name="j1_coupler")
 
 
 def two_wheels(add):
@@ -164,7 +179,7 @@ def test_rods_of_a_plant_are_fixed_distances():
     [
         (
             lambda plant, a, b: plant.AddBallConstraint(a, [0, 0, 0], b, [0, 0, 0]),
-            r"1 constraint\(s\) that cannot be read back.*RobotModel as `constraints`: a ball.*"
+            r"1 constraint\(s\) that cannot be read back.*give them as `constraints`: a ball.*"
             "CoincidentPoints",
         ),
         (

@@ -35,8 +35,8 @@ def plant_constraints(links: Links) -> tuple[Constraint, ...]:
     others = plant.num_constraints() - len(found)
     if others:
         raise ModelError(
-            f"the plant has {others} constraint(s) that cannot be read back from it; leave them "
-            "out of the plant and hand them to RobotModel as `constraints`: a ball constraint is "
+            f"the plant has {others} constraint(s) that cannot be read back from it; take them out "
+            "of the plant or of its file, and give them as `constraints`: a ball constraint is "
             "CoincidentPoints, a weld constraint WeldedFrames"
         )
     return found
