@@ -22,6 +22,7 @@ from drake_dae.systems.block import (
     TracedFormula,
 )
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -70,7 +71,7 @@ class DaePlant(ParameterizedSystem):
     def __init__(
         self, system: DaeSystem, *, structure: Structure | None = None, project: bool = True
     ) -> None:
-        structure = structure_of("DaePlant", system, structure)
+        structure = structure_of(type(self).__name__, system, structure)
         signals = {"state": system.state_signals, "control": system.control_signals}
         super().__init__(system, system.parameter_values, signals)
         self.structure = structure
@@ -84,13 +85,13 @@ class DaePlant(ParameterizedSystem):
         self._force = structure.trace("constraint force", force, self._force_needs_control)
         self._output = structure.trace("controlled output", output, self._output_needs_control)
 
-        state_index = self.DeclareContinuousState(
-            BasicVector(structure.manifold.project(system.nominal_state))
-        )
+        self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
-        by_state = {self.xc_ticket(), self.all_parameters_ticket()}
+        by_state = state_tickets(self) | {self.all_parameters_ticket()}
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
-        self.DeclareStateOutputPort("state", state_index)
+        self.DeclareVectorOutputPort(
+            "state", system.num_states, weakly(self._copy_state), state_tickets(self)
+        )
         self.DeclareVectorOutputPort(
             "constraint_force",
             system.num_constraints,
@@ -162,6 +163,9 @@ class DaePlant(ParameterizedSystem):
             name: TracedFormula(function, signals=self._signals)
             for name, function in functions.items()
         }
+
+    def _copy_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFrom(context.get_continuous_state_vector())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))

@@ -9,6 +9,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.plant import DaePlant
+from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -52,7 +53,7 @@ class RobotPlant(DaePlant):
                 name,
                 part.stop - part.start,
                 weakly(self._calc_part, part),
-                {self.xc_ticket()},
+                state_tickets(self),
             )
         if model.joint_force is not None:
             self._joint_force = model.dae.trace("joint torque", {"value": model.joint_force})
@@ -60,7 +61,7 @@ class RobotPlant(DaePlant):
                 "joint_torque",
                 model.joint_force.numel(),
                 weakly(self._calc_joint_torque),
-                {self.xc_ticket(), self.all_parameters_ticket()},
+                state_tickets(self) | {self.all_parameters_ticket()},
             )
 
     def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
