@@ -158,7 +158,7 @@ def _examine(constrained: Constrained, samples: Samples, where: str, search: boo
         matrix = elimination.constraint_matrix
         margin = find_margin(samples, matrix, search=search)
         constrained = replace(constrained, margin=margin)
-        judge(margin, constraint_violation(system, constrained.degrees, margin), 2)
+        judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
         try:

@@ -1,7 +1,6 @@
 """What the constraints alone decide of a system: Assumptions (1)-(3), N*, and (9)-(14)."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -14,6 +13,7 @@ from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
+from drake_dae.dae.structure.dependence import find_dependence
 from drake_dae.dae.structure.relative_degrees import constraint_chains
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -80,12 +80,21 @@ def check_system(system: DaeSystem) -> None:
         raise Violation(2, Cause.COUNT, names).error()
 
 
-def constraint_violation(
-    system: DaeSystem, degrees: Sequence[int], margin: Margin | None
-) -> Violation | None:
+def constraint_violation(found: Constrained) -> Violation | None:
     """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
     causes = ((1, Cause.CONSTRAINT_DEGREE), (2, Cause.CONSTRAINT_RANK))
-    return rank_violation(margin, system.constraint_output_signals, degrees, *causes)
+    signals = found.samples.system.constraint_output_signals
+    violation = rank_violation(found.margin, signals, found.degrees, *causes)
+    if violation is None or violation.cause is not Cause.CONSTRAINT_RANK or found.margin is None:
+        return violation
+    manifold, states = found.samples.manifold, found.samples.states
+    dependence = find_dependence(manifold, found.elimination, states, found.margin.state)
+    cause = Cause.CONSTRAINT_RANK
+    if dependence.in_gradients:
+        cause = Cause.REDUNDANT if dependence.everywhere else Cause.SINGULAR_CONFIGURATION
+    elif dependence.everywhere:
+        cause = Cause.HIDDEN_DEGREE
+    return replace(violation, cause=cause, combinations=dependence.combinations)
 
 
 def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
@@ -105,5 +114,8 @@ def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
                 continue
         raise ModelError(
             f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
-            f"{show(state)}"
+            f"{show(state)}. An equation in which no derivative stands is a constraint 0 = k(x) "
+            "with a constraint input; where it holds an unknown z that has no derivative, lift it: "
+            "make z a state with z' = v, v a new constraint input, and keep the equation as "
+            "constraint"
         )

@@ -212,7 +212,7 @@ def examine_structure(
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
     constrained = examine_constraints(system, draw(system, spread, count, seed))
-    violation = constraint_violation(system, constrained.degrees, constrained.margin)
+    violation = constraint_violation(constrained)
     if violation:
         raise violation.error()
     structure = examine_outputs(constrained)
