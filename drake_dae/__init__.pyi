@@ -18,6 +18,7 @@ from .dae.references import Reference as Reference
 from .dae.references import SinusoidReference as SinusoidReference
 from .dae.signals import Parameter as Parameter
 from .dae.signals import Signal as Signal
+from .dae.structure.redundancy import drop_constraints as drop_constraints
 from .dae.structure.structure import Structure as Structure
 from .dae.structure.structure import find_structure as find_structure
 from .dae.system import DaeSystem as DaeSystem

@@ -31,7 +31,8 @@ class Cause(Enum):
     )
     REDUNDANT = (
         "The constraints are redundant at every state: how the forces split among them is not "
-        "determined. Remove a redundant constraint with its constraint input"
+        "determined. Remove a redundant constraint with its constraint input, as drop_constraints "
+        "does"
     )
     SINGULAR_CONFIGURATION = (
         "This is a singular configuration: the constraints are redundant there, and not around it, "
