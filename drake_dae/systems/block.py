@@ -33,6 +33,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.systems.failures import simulation_error
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import StepWatch
 from drake_dae.trace.functions import InvalidValueError, TracedFunction
 
 STATES = ("state", "estimated_state")
@@ -184,6 +185,7 @@ class ParameterizedSystem(DifferentiableSystem):
         self._exogenous: InputPort | None = None
         self.exogenous_layout = Layout(())
         self.exogenous_places: list[int] = []
+        self._steps = StepWatch(self)
         self.DeclareNumericParameter(BasicVector(values))
 
     def _declare_exogenous(self, degrees: Sequence[int]) -> set[DependencyTicket]:
@@ -215,7 +217,7 @@ class ParameterizedSystem(DifferentiableSystem):
     def _checked(
         self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
     ) -> tuple[FloatArray, ...]:
-        """The values of a function of (state, inputs, parameters).
+        """The values of a function of (state, inputs, parameters); nan where a trial fails.
 
         Raises:
             SingularityError: A matrix in it is singular; the exception has time and state.
@@ -225,7 +227,10 @@ class ParameterizedSystem(DifferentiableSystem):
             return function.checked(state, *inputs, self._values(context))
         except InvalidValueError as error:
             time = context.get_time()
-            raise simulation_error(error.failure, time, state, self._signals) from None
+            self._steps.tolerate(
+                context, simulation_error(error.failure, time, state, self._signals)
+            )
+            return function.nowhere()
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""

@@ -23,15 +23,22 @@ def simulation_error(
         signals: Name of an input -> names of its entries; the name of the input serves otherwise.
     """
     where = f"at t = {time:.6g} s, state {show(state)}"
+    bad = ", ".join(
+        signals[name][i].name if name in signals else name
+        for name, entries in failure.inputs.items()
+        for i in (entries if name in signals else entries[:1])
+    )
     match failure.fault:
         case Fault.INPUT:
-            bad = [
-                signals[name][i].name if name in signals else name
-                for name, entries in failure.inputs.items()
-                for i in (entries if name in signals else entries[:1])
-            ]
             return NonFiniteError(
-                f"{failure.function}: its input {', '.join(bad)} is not finite {where}", time, state
+                f"{failure.function}: its input {bad} is not finite {where}", time, state
+            )
+        case Fault.OVERFLOW:
+            return NonFiniteError(
+                f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
+                "without bound. Look at the gains, and at what the model has wrong",
+                time,
+                state,
             )
         case Fault.VALUE:
             return NonFiniteError(
@@ -43,7 +50,8 @@ def simulation_error(
         case Fault.SINGULAR:
             return SingularityError(
                 f"{failure.singular} is singular {where}, so {failure.function} is not determined "
-                "there. Keep away from this state, or choose other constraints or outputs",
+                "there: a singular configuration, through which smaller steps do not lead. Keep "
+                "away from this state, or choose other constraints or outputs",
                 time,
                 state,
             )

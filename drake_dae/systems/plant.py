@@ -22,6 +22,7 @@ from drake_dae.systems.block import (
     TracedFormula,
 )
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -81,7 +82,7 @@ class DaePlant(ParameterizedSystem):
         structure: ConstraintStructure | None = None,
         project: bool = True,
     ) -> None:
-        structure = constraint_structure_of("DaePlant", system, structure)
+        structure = constraint_structure_of(type(self).__name__, system, structure)
         signals = {"state": system.state_signals, "control": system.control_signals}
         super().__init__(system, system.parameter_values, signals)
         self.structure = structure
@@ -97,15 +98,15 @@ class DaePlant(ParameterizedSystem):
         self._force = structure.trace("constraint force", force, self._force_needs_control)
         self._output = structure.trace("controlled output", output, self._output_needs_control)
 
-        state_index = self.DeclareContinuousState(
-            BasicVector(structure.manifold.project(system.nominal_state))
-        )
+        self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
         residual = structure.manifold.residual_expression
         degrees = system.exogenous_degrees(rate, force, output, residual)
-        by_state = self._by_state = {self.xc_ticket()} | self._declare_exogenous(degrees)
+        by_state = self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
-        self.DeclareStateOutputPort("state", state_index)
+        self.DeclareVectorOutputPort(
+            "state", system.num_states, weakly(self._copy_state), state_tickets(self)
+        )
         self.DeclareVectorOutputPort(
             "constraint_force",
             system.num_constraints,
@@ -178,6 +179,9 @@ class DaePlant(ParameterizedSystem):
             name: TracedFormula(function, signals=self._signals)
             for name, function in functions.items()
         }
+
+    def _copy_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFrom(context.get_continuous_state_vector())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))

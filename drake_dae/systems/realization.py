@@ -18,6 +18,7 @@ from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.block import Formula, ParameterizedSystem
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -89,21 +90,26 @@ class StateRealization(ParameterizedSystem):
         self._output = structure.trace("controlled output", direct, True)
 
         start = structure.states[0]
-        state_index = self.DeclareContinuousState(BasicVector(self._coordinates(start, None)))
+        coordinates = BasicVector(self._coordinates(start, None))
+        self.DeclareContinuousState(coordinates)
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
         chain = ca.vertcat(structure.manifold.residual_expression, structure.chain)
         degrees = dae.exogenous_degrees(rates, force, direct, chain, normal_form.completion)
-        by_state = {self.xc_ticket()} | self._declare_exogenous(degrees)
+        by_state = state_tickets(self) | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
-        # Drake hands the value before to the calculation: Newton's method starts there.
+        # x, and where Newton's method starts: Drake hands the value before to the calculation.
         # Its number, since Drake's entry would keep this system for ever.
         self._state_index = self.DeclareCacheEntry(
             "state",
-            ValueProducer(lambda: AbstractValue.Make(start.copy()), weakly(self._calc_state)),
+            ValueProducer(
+                lambda: AbstractValue.Make((start.copy(), start.copy())), weakly(self._calc_state)
+            ),
             by_state,
         ).cache_index()
         self.DeclareVectorOutputPort("state", dae.num_states, weakly(self._copy_state), by_state)
-        self.DeclareStateOutputPort("coordinates", state_index)
+        self.DeclareVectorOutputPort(
+            "coordinates", coordinates.size(), weakly(self._copy_coordinates), state_tickets(self)
+        )
         self.DeclareVectorOutputPort(
             "constraint_force",
             dae.num_constraints,
@@ -114,12 +120,12 @@ class StateRealization(ParameterizedSystem):
             "controlled_output",
             dae.num_controls,
             weakly(self._calc_output),
-            by_control if layout.direct.size else {self.xc_ticket()},
+            by_control if layout.direct.size else state_tickets(self),
         )
 
     def state(self, context: Context) -> FloatArray:
         """The state x = Phi^-1(0, zeta, xi) in a context, shape (n,)."""
-        return self._state_entry().Eval(context).copy()
+        return self._eval_state(context).copy()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the coordinates to those of a state on N*, shape (n,), and the branch to its own.
@@ -143,7 +149,7 @@ class StateRealization(ParameterizedSystem):
         # Makes x out of date where N* is but points, so that there are no coordinates to set.
         context.get_mutable_numeric_parameter(0)
         entry = self._state_entry().get_mutable_cache_entry_value(context)
-        entry.GetMutableValueOrThrow()[:] = x
+        entry.GetMutableValueOrThrow()[1][:] = x
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         rates = self._evaluate(self._dynamics, context, needs_control=True)
@@ -156,28 +162,39 @@ class StateRealization(ParameterizedSystem):
     def _state_entry(self) -> CacheEntry:
         return self.get_cache_entry(self._state_index)
 
+    def _eval_state(self, context: Context) -> FloatArray:
+        state: FloatArray = self._state_entry().Eval(context)[0]
+        return state
+
     def _coordinates(self, state: FloatArray, parameters: FloatArray | None) -> FloatArray:
         return self.normal_form.coordinates(state, parameters)[self._on_manifold.size :]
 
     def _calc_state(self, context: Context, value: AbstractValue) -> None:
         coordinates = context.get_continuous_state_vector().CopyToVector()
-        last, p = value.get_value(), self._values(context)
+        last, p = value.get_value()[1], self._values(context)
         if not np.all(np.isfinite(coordinates)):
-            raise NonFiniteError(
+            error = NonFiniteError(
                 f"{self.dae.name}: the coordinates {coordinates} are not finite at t = "
                 f"{context.get_time():.6g} s",
                 context.get_time(),
                 last,
             )
+            self._steps.tolerate(context, error)
+            value.set_value((np.full_like(last, np.nan), last))
+            return
         wanted = np.concatenate([self._on_manifold, coordinates])
         try:
-            value.set_value(self.normal_form.state(wanted, last, p))
+            found = self.normal_form.state(wanted, last, p)
+            value.set_value((found, found))
             return
         except InconsistentStateError as error:
             reason = error
         try:
-            value.set_value(self.normal_form.state(wanted, None, p))
+            found = self.normal_form.state(wanted, None, p)
+            value.set_value((found, found))
         except InconsistentStateError:
+            # Also in a trial: shorter steps would carry the motion over a fold of its coordinates,
+            # where it has no unique continuation, and come out on a wrong one.
             raise SimulationError(
                 f"the motion left the domain of its coordinates at t = {context.get_time():.6g} s, "
                 f"last state {show(last)}: {reason}. DaePlant needs no coordinates",
@@ -188,7 +205,7 @@ class StateRealization(ParameterizedSystem):
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
-        x = self._state_entry().Eval(context)
+        x = self._eval_state(context)
         inputs = (self._control_port.Eval(context),) if needs_control else ()
         return self._checked(function, context, x, *inputs)[0]
 
@@ -199,7 +216,10 @@ class StateRealization(ParameterizedSystem):
         )
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._state_entry().Eval(context))
+        output.SetFromVector(self._eval_state(context))
+
+    def _copy_coordinates(self, context: Context, output: BasicVector) -> None:
+        output.SetFrom(context.get_continuous_state_vector())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))

@@ -11,6 +11,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.plant import DaePlant
+from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -68,7 +69,7 @@ class RobotPlant(DaePlant):
                 name,
                 part.stop - part.start,
                 weakly(self._calc_part, part),
-                {self.xc_ticket()},
+                state_tickets(self),
             )
         self._add_wrenches()
         if model.joint_force is not None:

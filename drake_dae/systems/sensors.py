@@ -10,6 +10,7 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.errors import ModelError, NonFiniteError
 from drake_dae.systems.block import DifferentiableSystem, Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import StepWatch, state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -82,12 +83,13 @@ class ForceSensor(DifferentiableSystem):
             self._noise_port = self.DeclareVectorInputPort("noise", size)
         if self.time_constant:
             self.DeclareContinuousState(size)
+            self._steps = StepWatch(self)
         if self.sample_period:
             self._held = self.DeclareDiscreteState(size)
             self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, weakly(self._sample))
             sources = {self.xd_ticket()}
         else:
-            sources = {self.xc_ticket()}
+            sources = state_tickets(self)
             if self._noise_port is not None:
                 sources.add(self.input_port_ticket(self._noise_port.get_index()))
         self.DeclareVectorOutputPort("measured_force", size, weakly(self._calc_measured), sources)
@@ -120,12 +122,13 @@ class ForceSensor(DifferentiableSystem):
                 rate = (force - felt) / self.time_constant
             if not np.isfinite(rate).all():
                 time = context.get_time()
-                raise NonFiniteError(
+                error = NonFiniteError(
                     f"{self.get_name()}: the rate of the measured force is not finite at "
                     f"t = {time:.6g} s; its time_constant is {self.time_constant:g} s",
                     time,
                     felt,
                 )
+                self._steps.tolerate(context, error)
             derivatives.get_mutable_vector().SetFromVector(rate)
 
     def _felt(self, context: Context) -> FloatArray:

@@ -13,6 +13,10 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import DrakeDaeError, ModelError
 
+HUGE = 1e30
+"""A number above this, in whatever unit, says that something grew without bound. Its powers cancel
+and overflow, so that what it does to a pivot means nothing."""
+
 SINGULAR_PIVOT = 1e-12
 """A matrix whose `pivot` is below this counts as singular; see `trace.factorization`."""
 
@@ -21,6 +25,7 @@ class Fault(Enum):
     """What is wrong with the values of a function."""
 
     INPUT = "an input is not finite"
+    OVERFLOW = "an input is beyond all measure"
     VALUE = "the function is not finite: it left its domain, or a matrix in it is singular"
     SINGULAR = "a matrix that must be regular is singular"
 
@@ -32,7 +37,8 @@ class Failure:
     Attributes:
         function: The function's name.
         fault: What is wrong.
-        inputs: Name of an input -> its entries that are not finite; empty unless `fault` is INPUT.
+        inputs: Name of an input -> its entries that are not finite, or beyond `HUGE`; empty unless
+            `fault` is INPUT or OVERFLOW.
         singular: The matrix that must be regular, which is singular if `fault` is SINGULAR.
     """
 
@@ -148,6 +154,10 @@ class TracedFunction:
             return values
         raise InvalidValueError(self._failure())
 
+    def nowhere(self) -> tuple[FloatArray, ...]:
+        """What stands for the outputs where the function has no value: fresh arrays of nan."""
+        return tuple(np.full_like(output, np.nan) for output in self._outputs)
+
     @property
     def sizes(self) -> tuple[int, ...]:
         """How many entries each input has."""
@@ -165,13 +175,14 @@ class TracedFunction:
 
     def _failure(self) -> Failure:
         """What was wrong with the last call."""
-        bad = {
-            name: tuple(int(i) for i in np.flatnonzero(~np.isfinite(given)))
-            for name, given in zip(self.input_names, self._inputs, strict=True)
-            if not np.all(np.isfinite(given))
-        }
-        if bad:
-            return Failure(self.name, Fault.INPUT, bad)
+        for fault, limit in ((Fault.INPUT, np.inf), (Fault.OVERFLOW, HUGE)):
+            bad = {
+                name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
+                for name, given in zip(self.input_names, self._inputs, strict=True)
+                if not np.all(np.abs(given) < limit)
+            }
+            if bad:
+                return Failure(self.name, fault, bad)
         # What is not finite may be so because of the matrix.
         is_singular = self.is_finite or self._pivot[0] < SINGULAR_PIVOT
         fault = Fault.SINGULAR if is_singular else Fault.VALUE

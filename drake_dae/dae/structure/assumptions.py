@@ -7,6 +7,7 @@ from enum import Enum
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.structure.dependence import Combination
 from drake_dae.errors import AssumptionError
 
 
@@ -25,8 +26,24 @@ class Cause(Enum):
     NO_FORCE = "It is redundant, or no constraint input keeps it"
     NO_CONTROL = "Choose another output"
     CONSTRAINT_RANK = (
-        "The constraints are redundant, or their constraint inputs cannot act independently. "
-        "Remove a redundant constraint, or keep away from this state"
+        "Their gradients are independent there, but the constraint inputs cannot act on them "
+        "independently. Keep away from this state, or change how the constraint inputs enter"
+    )
+    REDUNDANT = (
+        "The constraints are redundant at every state: how the forces split among them is not "
+        "determined. Remove a redundant constraint with its constraint input, as drop_constraints "
+        "does"
+    )
+    SINGULAR_CONFIGURATION = (
+        "This is a singular configuration: the constraints are redundant there, and not around it, "
+        "so that forces are not determined, and motions on N* may branch. Smaller steps do not "
+        "help a motion through it. Keep away from this state, or write other constraints that stay "
+        "independent there; a spring or a clearance in one of them makes the forces determined"
+    )
+    HIDDEN_DEGREE = (
+        "No constraint is redundant, but the system is not in the class as it is written: such a "
+        "constraint, less the combination of others that its row follows from, has a higher "
+        "relative degree. Write this difference in place of the constraint: N* stays the same"
     )
     CONTROL_RANK = (
         "An output may repeat a constraint or another output; choose other outputs, keep away from "
@@ -47,6 +64,7 @@ class Violation:
             everywhere.
         singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
             if the rank is lost.
+        combinations: The constraints that follow from others there, if the rank of A(x) is lost.
     """
 
     assumption: int
@@ -55,6 +73,7 @@ class Violation:
     order: int | None = None
     state: FloatArray | None = None
     singular_value: float | None = None
+    combinations: tuple[Combination, ...] = ()
 
     def __str__(self) -> str:
         return f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
@@ -67,6 +86,7 @@ class Violation:
         names = ", ".join(f"'{name}'" for name in self.names)
         where = "" if self.state is None else f" at x = {show(self.state)}"
         value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
+        rows = "; ".join(map(str, self.combinations))
         match self.cause:
             case Cause.COUNT:
                 return (
@@ -93,6 +113,7 @@ class Violation:
                 return (
                     f"no constraint input ever acts on constraint {names}: none reaches it, or its "
                     "derivatives repeat each other or fill the state"
+                    f"{f'; gradients of constraints: {rows}' if rows else ''}"
                 )
             case Cause.NO_CONTROL:
                 return (
@@ -100,10 +121,18 @@ class Violation:
                     "the constraints, or no control reaches it, so it has no relative degree and "
                     "B(x) no row for it"
                 )
-            case Cause.CONSTRAINT_RANK:
+            case (
+                Cause.CONSTRAINT_RANK
+                | Cause.REDUNDANT
+                | Cause.SINGULAR_CONFIGURATION
+                | Cause.HIDDEN_DEGREE
+            ):
+                what = "gradients of constraints"
+                if self.cause in (Cause.CONSTRAINT_RANK, Cause.HIDDEN_DEGREE):
+                    what = "rows of A(x)"
                 return (
                     f"A(x) loses rank{where}: smallest singular value {value} (rows and columns "
-                    "scaled)"
+                    f"scaled){f'; {what}: {rows}' if rows else ''}"
                 )
             case Cause.CONTROL_RANK:
                 return (

@@ -15,6 +15,7 @@ from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
+from drake_dae.dae.structure.dependence import find_dependence
 from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
@@ -208,8 +209,17 @@ def check_system(system: DaeSystem) -> None:
 def constraint_violation(found: ConstraintStructure) -> Violation | None:
     """How a singular A(x) violates Assumption (1) or (2); None if it is regular."""
     causes = ((1, Cause.CONSTRAINT_DEGREE), (2, Cause.CONSTRAINT_RANK))
-    signals, degrees = found.system.constraint_output_signals, found.constraint_degrees
-    return rank_violation(found.constraint_margin, signals, degrees, *causes)
+    signals, margin = found.system.constraint_output_signals, found.constraint_margin
+    violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
+    if violation is None or violation.cause is not Cause.CONSTRAINT_RANK or margin is None:
+        return violation
+    dependence = find_dependence(found.manifold, found.elimination, found.states, margin.state)
+    cause = Cause.CONSTRAINT_RANK
+    if dependence.in_gradients:
+        cause = Cause.REDUNDANT if dependence.everywhere else Cause.SINGULAR_CONFIGURATION
+    elif dependence.everywhere:
+        cause = Cause.HIDDEN_DEGREE
+    return replace(violation, cause=cause, combinations=dependence.combinations)
 
 
 def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
@@ -229,5 +239,8 @@ def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
                 continue
         raise ModelError(
             f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
-            f"{show(state)}"
+            f"{show(state)}. An equation in which no derivative stands is a constraint 0 = k(x) "
+            "with a constraint input; where it holds an unknown z that has no derivative, lift it: "
+            "make z a state with z' = v, v a new constraint input, and keep the equation as "
+            "constraint"
         )

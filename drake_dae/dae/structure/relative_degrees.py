@@ -16,6 +16,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation
+from drake_dae.dae.structure.dependence import redundant_constraints
 from drake_dae.dae.system import DaeSystem
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized
@@ -68,7 +69,9 @@ def constraint_chains(
         if sum(len(chain) for chain in chains) + len(still) > system.num_states:
             stuck = still
         if stuck:
-            raise Violation(2, Cause.NO_FORCE, tuple(names[i] for i in stuck)).error()
+            dependent = redundant_constraints(samples)
+            those = tuple(names[i] for i in stuck)
+            raise Violation(2, Cause.NO_FORCE, those, combinations=dependent).error()
         for i in still:
             following = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:

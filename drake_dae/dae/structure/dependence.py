@@ -1,0 +1,137 @@
+"""Which constraints follow from which others, where A(x) loses its rank."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.elimination import Elimination
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.states.margins import SINGULAR
+from drake_dae.dae.states.samples import Samples
+from drake_dae.trace.newton import are_dependent
+from drake_dae.trace.round_off import equilibration
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A row that is a combination of others: row = sum factors_j row_j.
+
+    Attributes:
+        name: The constraint whose row it is.
+        others: The constraints that it follows from.
+        factors: Theirs, shape (len(others),), at the state where this was found.
+        constant: Whether the factors are the same at all examined states.
+    """
+
+    name: str
+    others: tuple[str, ...]
+    factors: FloatArray
+    constant: bool
+
+    def __str__(self) -> str:
+        terms = " + ".join(
+            f"{factor:.4g} {other}" for other, factor in zip(self.others, self.factors, strict=True)
+        )
+        varying = "" if self.constant else ", with factors that depend on the state"
+        return f"'{self.name}' ~ {terms.replace('+ -', '- ') or '0'}{varying}"
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """How the constraints depend on each other where A(x) is singular.
+
+    Attributes:
+        combinations: The rows that follow from those before them: of the gradients of the
+            constraints if these depend on each other, otherwise of A(x).
+        everywhere: Whether A(x) is singular at all examined states, and not just at one.
+        in_gradients: Whether the gradients of the chains k_i, L_f k_i, ..., depend on each other,
+            at all examined states if `everywhere`.
+    """
+
+    combinations: tuple[Combination, ...]
+    everywhere: bool
+    in_gradients: bool
+
+
+def find_dependence(
+    manifold: Manifold, elimination: Elimination, states: FloatArray, where: FloatArray
+) -> Dependence:
+    """How the constraints depend on each other at a state where A(x) is singular.
+
+    Args:
+        manifold: N*.
+        elimination: A(x), and the gradients of the last derivative in each chain.
+        states: Other consistent states, shape (count, n).
+        where: The state, shape (n,).
+    """
+    system = manifold.system
+    names = [signal.name for signal in system.constraint_output_signals]
+    rows = {"a": elimination.constraint_matrix, "last": elimination.constraint_gradient}
+    function = system.trace("dependence", {k: ca.densify(e) for k, e in rows.items()}, often=False)
+
+    def matrices(state: FloatArray) -> list[FloatArray]:
+        values = function(state, system.parameter_values)
+        return [value.reshape(len(names), -1) for value in values]
+
+    def is_singular(state: FloatArray) -> bool:
+        scaled = _scaled(matrices(state)[0])[0]
+        return bool(np.linalg.svd(scaled, compute_uv=False)[-1] < SINGULAR)
+
+    def in_gradients(state: FloatArray) -> bool:
+        return are_dependent(manifold.gradients(state))
+
+    everywhere = all(is_singular(state) for state in states)
+    examined = [where, *states] if everywhere else [where]
+    dependent = all(in_gradients(state) for state in examined)
+    # Chains may depend on each other below their last derivatives alone.
+    by_gradients = dependent and are_dependent(matrices(where)[1])
+    values = [matrices(state)[1 if by_gradients else 0] for state in examined]
+    return Dependence(tuple(_combinations(names, values)), everywhere, dependent)
+
+
+def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
+    """The constraints k_i whose gradients follow from those before them, at all of some states."""
+    system = samples.system
+    if not samples.dependent(system.k):
+        return ()
+    names = [signal.name for signal in system.constraint_output_signals]
+    values = samples.values(gradient=ca.jacobian(system.k, system.state))
+    return tuple(_combinations(names, [gradient for (gradient,) in values]))
+
+
+def _combinations(names: list[str], values: list[FloatArray]) -> list[Combination]:
+    """The rows that follow from those before them at the first of some states."""
+    matrix, lengths = _scaled(values[0])
+    kept: list[int] = []
+    found = []
+    for i, name in enumerate(names):
+        factors, error = _fit(matrix, kept, i)
+        if error >= SINGULAR:
+            kept.append(i)
+            continue
+        used = [j for j, factor in zip(kept, factors, strict=True) if abs(factor) > SINGULAR]
+        plain = _fit(matrix, used, i)[0] * lengths[i] / lengths[used]
+        others = []
+        for value in values[1:]:
+            scaled, own = _scaled(value)
+            others.append(_fit(scaled, used, i)[0] * own[i] / own[used])
+        constant = all(np.allclose(other, plain, rtol=1e-6, atol=0.0) for other in others)
+        found.append(Combination(name, tuple(names[j] for j in used), plain, constant))
+    return found
+
+
+def _fit(matrix: FloatArray, kept: list[int], row: int) -> tuple[FloatArray, float]:
+    """The factors by which rows make another one, and what they leave of it."""
+    if not kept:
+        return np.zeros(0), float(np.linalg.norm(matrix[row]))
+    factors = scipy.linalg.lstsq(matrix[kept].T, matrix[row])[0]
+    return factors, float(np.linalg.norm(matrix[row] - factors @ matrix[kept]))
+
+
+def _scaled(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A matrix with rows and columns of about length one, and what its rows were divided by."""
+    rows, columns = equilibration(matrix)
+    return matrix / rows[:, None] / columns, rows

@@ -1,0 +1,182 @@
+"""Trial and accepted: what a block answers at a state that an integrator only tries.
+
+An integrator evaluates the blocks of a diagram at states that the motion may never reach: the
+stages of a step that it then makes shorter. There a function that has no value is no failure, and
+the answer is nan: error control takes a shorter step. At a state that is reached it is one.
+
+Nobody tells a block which of them it is asked about. But Drake publishes at accepted states alone,
+and the time of every trial lies after that of the last accepted one. So a block notes the time at
+each accepted step, and looks at it where a function has no value, and nowhere else.
+"""
+
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from weakref import proxy
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    Context,
+    DependencyTicket,
+    EventStatus,
+    LeafSystem,
+    ValueProducer,
+)
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.errors import NonFiniteError, SimulationError
+from drake_dae.systems.lifetime import weakly
+
+FAILURES = 1000
+"""So many trials that fail end the run: ten of them bring a step of 0.1 s to round-off, and each
+takes some stages, or a Jacobian by finite differences."""
+
+SHORTEST = 1e-12
+"""A trial that is but this ahead of the accepted state, relative to the time, is the last one."""
+
+STEPS = 1000
+SLOWEST = 1e-8
+"""Of the time that is simulated already, which so many steps must add. A kink in a reference takes
+a few such steps, a state that grows without bound takes them for ever."""
+
+
+def state_tickets(system: LeafSystem) -> set[DependencyTicket]:
+    """What a function of the continuous state is declared to depend on: also on the time.
+
+    After a step that is given up, Drake's runge_kutta5 and bogacki_shampine3 put the state back
+    without telling (Drake 1.51); only the time, which is put back too, makes values that were kept
+    for the trial out of date.
+    """
+    return {system.xc_ticket(), system.time_ticket()}
+
+
+@dataclass
+class Progress:
+    """What a block knows of a simulation, in one context.
+
+    Attributes:
+        time: Of the last accepted state, in s; without a simulation it is infinite, and no state
+            is a trial.
+        state: The continuous state of the block then; empty if it has none.
+        failures: How many trials failed since then.
+        reason: What the earliest of them said.
+        reason_time: When that was, in s.
+        start: When the simulation began, in s.
+        steps: How many steps were accepted.
+        mark: The time after the last thousand steps, in s.
+    """
+
+    time: float = inf
+    state: FloatArray = field(default_factory=lambda: np.zeros(0))
+    failures: int = 0
+    reason: str = ""
+    reason_time: float = inf
+    start: float = 0.0
+    steps: int = 0
+    mark: float = 0.0
+
+
+class StepWatch:
+    """Tells trials from accepted states for one block, and sees that steps come to an end.
+
+    Args:
+        system: The block; gets two events and a cache entry.
+    """
+
+    def __init__(self, system: LeafSystem) -> None:
+        self._system = proxy(system)
+        # It depends on nothing, so nothing but the two events changes it.
+        self._index = system.DeclareCacheEntry(
+            "progress",
+            ValueProducer(_no_simulation, lambda *_: None),
+            {system.nothing_ticket()},
+        ).cache_index()
+        system.DeclareInitializationPublishEvent(weakly(self._begin))
+        system.DeclarePerStepPublishEvent(weakly(self._accept))
+
+    def tolerate(self, context: Context, error: SimulationError) -> None:
+        """Returns if the context holds a trial, at which a failure is an answer.
+
+        Raises:
+            SimulationError: The error, at an accepted state and without a simulation; or another
+                one of its kind, which says that no step leads on.
+        """
+        progress = self._progress(context)
+        step = error.time - progress.time
+        # After other trials one of no length is but rounded: steps are that short by now.
+        if not (step > 0.0 or progress.failures):
+            raise error from None
+        progress.failures += 1
+        # A state that is not finite follows from another failure.
+        if error.time < progress.reason_time and np.isfinite(error.state).all():
+            progress.reason, progress.reason_time = str(error), error.time
+        if step > SHORTEST * abs(error.time) and progress.failures < FAILURES:
+            return
+        raise type(error)(
+            f"{self._system.get_name()}: no step leads on from t = {progress.time:.6g} s"
+            f"{_at(progress.state)} since each that was tried failed, however short: "
+            f"{progress.reason}",
+            progress.time,
+            progress.state if progress.state.size else error.state,
+        ) from None
+
+    def _progress(self, context: Context) -> Progress:
+        entry = self._system.get_cache_entry(self._index)
+        found: Progress = entry.get_mutable_cache_entry_value(context).GetMutableValueOrThrow()
+        return found
+
+    def _begin(self, context: Context) -> EventStatus:
+        time = context.get_time()
+        progress = self._progress(context)
+        progress.__init__(time=time, start=time, mark=time)  # type: ignore[misc]
+        if context.num_continuous_states():
+            progress.state = context.get_continuous_state_vector().CopyToVector()
+        return EventStatus.DidNothing()
+
+    def _accept(self, context: Context) -> EventStatus:
+        progress = self._progress(context)
+        time = context.get_time()
+        if progress.state.size:
+            state = context.get_continuous_state_vector().CopyToVector()
+            # The sum takes a fifth of the time, and may overflow.
+            if not (isfinite(sum(state.tolist())) or np.isfinite(state).all()):
+                raise self._spoilt(progress, time)
+            progress.state = state
+            progress.steps += 1
+            if progress.steps % STEPS == 0:
+                self._check_pace(progress, time)
+        progress.time = time
+        if progress.failures:
+            progress.failures, progress.reason, progress.reason_time = 0, "", inf
+        return EventStatus.DidNothing()
+
+    def _spoilt(self, progress: Progress, time: float) -> NonFiniteError:
+        """The error where an integrator without error control accepted a trial that failed."""
+        reason = f": {progress.reason}" if progress.reason else ""
+        return NonFiniteError(
+            f"{self._system.get_name()}: the step from t = {progress.time:.6g} s"
+            f"{_at(progress.state)} to t = {time:.6g} s led to a state that is not finite"
+            f"{reason}. Take smaller steps, or an integrator with error control",
+            progress.time,
+            progress.state,
+        )
+
+    def _check_pace(self, progress: Progress, time: float) -> None:
+        before, progress.mark = progress.mark, time
+        if time - before < SLOWEST * (time - progress.start):
+            raise SimulationError(
+                f"{self._system.get_name()}: the last {STEPS} steps led from t = {before:.12g} s "
+                f"only to {time:.12g} s{_at(progress.state)} where it grows without bound, or "
+                "jumps. Look at the gains and at what the model has wrong; where that is in order, "
+                "choose a fixed step",
+                time,
+                progress.state,
+            )
+
+
+def _no_simulation() -> AbstractValue:
+    return AbstractValue.Make(Progress())
+
+
+def _at(state: FloatArray) -> str:
+    return f", state {show(state)}," if state.size else ""

@@ -1,0 +1,163 @@
+"""Why A(x) has no full rank: which constraints follow from which, and what is to be done."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import redundant, system_of
+
+from drake_dae import DaeSystem, analyze, find_structure
+from drake_dae.dae.structure.assumptions import Cause
+from drake_dae.errors import AssumptionError, ModelError
+
+
+def violation(system):
+    with pytest.raises(AssumptionError) as caught:
+        find_structure(system)
+    return caught.value.violation
+
+
+def mass_point(k, nominal=None, size=3, **fields):
+    """q'' = J^T v + u in some dimensions, J = dk/dq, with the constraints k(q)."""
+    q = ca.SX.sym("q", size)
+    rows = k(q)
+    jacobian = ca.jacobian(ca.vertcat(*rows), q)
+    force = ca.Function("force", [q], [jacobian.T])
+    return DaeSystem.from_functions(
+        2 * size,
+        f=lambda x: ca.vertcat(x[size:], ca.SX(size, 1)),
+        g=lambda x: ca.vertcat(ca.SX(size, len(rows)), force(x[:size])),
+        h=lambda x: ca.vertcat(ca.SX(2 * size - 1, 1), 1),
+        k=lambda x: k(x[:size]),
+        l=lambda x: [x[size - 1]],
+        m=lambda x: ca.SX(1, len(rows)),
+        nominal_state=nominal,
+        name="point",
+        **fields,
+    )
+
+
+def test_the_rows_that_follow_are_named_with_their_factors():
+    """k_3 = 3 k_1 - k_2, and k_4 = k_2 in other units."""
+    labels = ("floor", "wall", "corner", "wall again")
+    found = violation(
+        mass_point(
+            lambda q: [q[0], q[1], 3 * q[0] - q[1], 1000 * q[1]],
+            size=5,
+            constraint_output_signals=labels,
+        )
+    )
+    assert found.cause is Cause.REDUNDANT
+    corner, again = found.combinations
+    assert (corner.name, corner.others, corner.constant) == ("corner", ("floor", "wall"), True)
+    np.testing.assert_allclose(corner.factors, [3.0, -1.0], rtol=1e-9)
+    assert (again.name, again.others) == ("wall again", ("wall",))
+    np.testing.assert_allclose(again.factors, [1000.0], rtol=1e-9)
+    text = str(found)
+    assert "'corner' ~ 3 floor - 1 wall; 'wall again' ~ 1000 wall" in text
+    assert "how the forces split among them is not determined" in text
+
+
+def test_rows_are_named_also_where_their_derivatives_have_no_room():
+    """Eight derivatives in six states."""
+    found = violation(mass_point(lambda q: [q[0], q[1], 3 * q[0] - q[1], 1000 * q[1]]))
+    assert found.cause is Cause.NO_FORCE
+    assert "gradients of constraints: 'y2' ~ 3 y0 - 1 y1; 'y3' ~ 1000 y1" in str(found)
+
+
+def test_factors_that_depend_on_the_state_are_told():
+    """k_2 = (2 + sin q_2) k_1 has the gradient (2 + sin q_2) dk_1 on N*."""
+    found = violation(mass_point(lambda q: [q[0], (2 + ca.sin(q[1])) * q[0]]))
+    assert found.cause is Cause.REDUNDANT
+    assert not found.combinations[0].constant
+    np.testing.assert_allclose(found.combinations[0].factors, 2 + np.sin(found.state[1]), rtol=1e-9)
+    assert " y0, with factors that depend on the state" in str(found)
+
+
+def test_a_singular_configuration_is_one():
+    """Of (x, z, y) the gradients (-2x, 1, 0) and (2x + y, 1, x) are equal at the origin alone."""
+
+    def k(q):
+        return [q[1] - q[0] ** 2, q[1] + q[0] ** 2 + q[0] * q[2]]
+
+    found = violation(mass_point(k))
+    assert found.cause is Cause.SINGULAR_CONFIGURATION
+    assert found.combinations[0].name == "y1"
+    np.testing.assert_allclose(found.combinations[0].factors, [1.0], rtol=1e-9)
+    assert "This is a singular configuration" in str(found)
+    assert "Smaller steps do not help" in str(found)
+    # Around it nothing is wrong: on the branch x = 0 the gradients are (0, 1, 0) and (y, 1, 0).
+    beside = mass_point(k, nominal=[0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    assert find_structure(beside, spread=0.01).constraint_degrees == (2, 2)
+
+
+def hidden(k):
+    """a' = v_1, b' = c, c' = v_2, d' = u."""
+    return system_of(
+        4,
+        f=lambda x: [0, x[2], 0, 0],
+        g=lambda x: [[1, 0], [0, 0], [0, 1], [0, 0]],
+        h=lambda x: [0, 0, 0, 1],
+        k=k,
+        l=lambda x: [x[3]],
+        m=lambda x: [[0, 0]],
+    )
+
+
+@pytest.mark.parametrize("factor", [1.0, -2.0, 1e4])
+def test_a_regular_difference_is_not_called_redundant(factor):
+    """k = (a, factor a + b) has A = [1, 0; factor, 0]; b alone has degree 2, and A is regular."""
+    found = violation(hidden(lambda x: [x[0], factor * x[0] + x[1]]))
+    assert found.cause is Cause.HIDDEN_DEGREE
+    (combination,) = found.combinations
+    assert (combination.name, combination.others) == ("y1", ("y0",))
+    np.testing.assert_allclose(combination.factors, [factor], rtol=1e-9)
+    assert "No constraint is redundant" in str(found)
+    assert "Write this difference in place of the constraint" in str(found)
+    # What the message says to write.
+    assert find_structure(hidden(lambda x: [x[0], x[1]])).constraint_degrees == (1, 2)
+
+
+def test_inputs_that_do_not_act_independently_at_one_state():
+    """A = diag(1, x_2) turned by 45 degrees, and gradients that never depend on each other."""
+    found = violation(
+        system_of(
+            3,
+            f=lambda x: [0, 0, 0],
+            g=lambda x: [[1 + x[2], 1 - x[2]], [1 - x[2], 1 + x[2]], [0, 0]],
+            h=lambda x: [0, 0, 1],
+            k=lambda x: [x[0], x[1]],
+            l=lambda x: [x[2]],
+            m=lambda x: [[0, 0]],
+        )
+    )
+    assert found.cause is Cause.CONSTRAINT_RANK
+    assert "rows of A(x): 'y1' ~ 1 y0" in str(found)
+
+
+def test_the_analysis_names_them_too():
+    analysis = analyze(redundant(lambda x: [x[0], 2 * x[0]]))
+    assert "'y1' ~ 2 y0" in analysis.problems[0]
+
+
+def test_a_singular_mass_matrix_comes_with_its_remedy():
+    """0 = z - x^2 as a row of E x' = f; then lifted: z' = v, k = z - x^2."""
+    with pytest.raises(ModelError, match="lift it: make z a state with z' = v"):
+        find_structure(
+            DaeSystem.from_functions(
+                ["x", "z"],
+                f=lambda s: [s[1], s[1] - s[0] ** 2],
+                h=lambda s: [1, 0],
+                l=lambda s: [s[0]],
+                mass_matrix=np.diag([1.0, 0.0]),
+            )
+        )
+    lifted = DaeSystem.from_functions(
+        ["x", "z"],
+        f=lambda s: [s[1], 0],
+        g=lambda s: [0, 1],
+        h=lambda s: [1, 0],
+        k=lambda s: [s[1] - s[0] ** 2],
+        l=lambda s: [s[0]],
+        m=lambda s: [[0]],
+    )
+    assert find_structure(lifted).constraint_degrees == (1,)

@@ -1,0 +1,124 @@
+"""A system without its redundant constraints has the same motion."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm
+from problems import redundant, system_of
+
+from drake_dae import DaePlant, DaeSystem, drop_constraints, find_structure
+from drake_dae.dae.states.samples import draw
+from drake_dae.dae.structure.constrained import examine_constraints
+from drake_dae.errors import AssumptionError, ModelError
+
+
+def plate(rows, **fields):
+    """A plate (z, a, b) on legs at the corners r: heights z + a r_x + b r_y = 0, forces by J^T."""
+    jacobian = np.array([[1.0, x, y] for x, y in rows])
+    mass = np.diag([4.0, 0.5, 0.25])
+    q, v, names = slice(0, 3), slice(3, 6), [f"leg{i}" for i in range(len(rows))]
+    return DaeSystem.from_functions(
+        ["z", "a", "b", "vz", "va", "vb", "s"],
+        f=lambda x: ca.vertcat(x[v], -9.81 * 4.0, 0.3, -0.2, 0),
+        g=lambda x: ca.vertcat(ca.SX(3, len(rows)), jacobian.T, ca.SX(1, len(rows))),
+        h=lambda x: ca.vertcat(ca.SX(6, 1), 1),
+        k=lambda x: ca.mtimes(ca.SX(jacobian), x[q]),
+        l=lambda x: [x[6]],
+        m=lambda x: ca.SX(1, len(rows)),
+        mass_matrix=np.block(
+            [
+                [np.eye(3), np.zeros((3, 4))],
+                [np.zeros((3, 3)), mass, np.zeros((3, 1))],
+                [np.zeros((1, 6)), np.ones((1, 1))],
+            ]
+        ),
+        constraint_output_signals=names,
+        **fields,
+    )
+
+
+TABLE = [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]
+
+
+@pytest.mark.parametrize("names", [None, ["leg3"], ["leg0"]])
+def test_a_table_with_four_legs_stands_on_three(names):
+    """Whichever leg goes, the sum of forces and torques is that of the load, by NumPy alone."""
+    with pytest.raises(AssumptionError):
+        find_structure(plate(TABLE))
+    system = drop_constraints(plate(TABLE), names)
+    gone = (names or ["leg3"])[0]
+    stay = [i for i in range(4) if f"leg{i}" != gone]
+    assert [s.name for s in system.constraint_output_signals] == [f"leg{i}" for i in stay]
+    plant = DaePlant(system)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [0.0])
+    force = plant.GetOutputPort("constraint_force").Eval(context)
+    jacobian = np.array([[1.0, *TABLE[i]] for i in stay])
+    np.testing.assert_allclose(jacobian.T @ force, [9.81 * 4.0, -0.3, 0.2], rtol=1e-12)
+    rates = plant.EvalTimeDerivatives(context).CopyToVector()
+    np.testing.assert_allclose(rates, 0.0, atol=1e-12)
+
+
+def test_where_nothing_is_redundant_nothing_goes():
+    system = plate(TABLE[:3])
+    assert drop_constraints(system) is system
+
+
+def test_a_robot_keeps_its_shorter_form():
+    """A row twice, then once: the same derivatives as the robot's own, to round-off."""
+    own = arm("two_link").model.dae
+
+    def implicit(rate, force):
+        rest, constraint_rate = own.implicit(rate, force[0] + 2 * force[1])
+        return rest, ca.vertcat(constraint_rate, 2 * constraint_rate)
+
+    names = ["wall", "again"]
+    twice = replace(
+        own,
+        g=ca.horzcat(own.g, 2 * own.g),
+        k=ca.vertcat(own.k, 2 * own.k),
+        m=ca.SX(2, 2),
+        l=ca.vertcat(own.l[0], own.state[1]),
+        constraint_input_signals=names,
+        constraint_output_signals=names,
+        implicit=implicit,
+    )
+    once = drop_constraints(twice)
+    assert once.implicit is not None
+    values = []
+    for system in (once, replace(once, implicit=None)):
+        values.append(rate_of(system)(own.nominal_state, [3.0, -2.0], own.parameter_values)[0])
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-9, atol=1e-9)
+
+
+def rate_of(system):
+    """x' as a function of state, control and parameters, by what the constraints alone decide."""
+    found, _ = examine_constraints(system, draw(system, None, 3, 0))
+    derivatives = found.derivatives
+    control = {"control": derivatives.control}
+    rate = derivatives.expand(derivatives.rate)
+    return system.trace("rate", {"rate": rate}, control)
+
+
+def test_what_cannot_go_is_refused():
+    with pytest.raises(ModelError, match=r"no constraint 'leg4'; did you mean 'leg"):
+        drop_constraints(plate(TABLE), ["leg4"])
+    with pytest.raises(ModelError, match="'leg0', 'leg1' cannot be left out: the gradients"):
+        drop_constraints(plate(TABLE), ["leg0", "leg1"])
+    # v_2 pushes z'' beside x''.
+    with pytest.raises(ModelError, match="'y1' cannot be left out: the constraint inputs"):
+        drop_constraints(redundant(lambda x: [x[0], x[0]]))
+    with pytest.raises(ModelError, match="an output is the force of 'y1', which is not determined"):
+        drop_constraints(
+            system_of(
+                2,
+                f=lambda x: [0, 0],
+                g=lambda x: [[1, 1], [0, 0]],
+                h=lambda x: [0, 1],
+                k=lambda x: [x[0], 2 * x[0]],
+                l=lambda x: [0],
+                m=lambda x: [[0, 1]],
+            )
+        )
