@@ -34,7 +34,7 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.failures import simulation_error
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import StepWatch
-from drake_dae.trace.functions import InvalidValueError, TracedFunction
+from drake_dae.trace.functions import TracedFunction
 
 STATES = ("state", "estimated_state")
 """The names of the argument of a formula that says where the system is."""
@@ -95,11 +95,11 @@ class TracedFormula:
     def _checked(
         self, function: TracedFunction, time: float, arguments: tuple[FloatArray, ...]
     ) -> tuple[FloatArray, ...]:
-        try:
-            return function.checked(*arguments)
-        except InvalidValueError as error:
+        values = function.evaluate(*arguments)
+        if not function.is_valid:
             state = arguments[self._state]
-            raise simulation_error(error.failure, time, state, self._signals) from None
+            raise simulation_error(function.failure(), time, state, self._signals)
+        return values
 
 
 @checked(ModelError)
@@ -223,14 +223,16 @@ class ParameterizedSystem(DifferentiableSystem):
             SingularityError: A matrix in it is singular; the exception has time and state.
             NonFiniteError: A value is not finite, likewise.
         """
-        try:
-            return function.checked(state, *inputs, self._values(context))
-        except InvalidValueError as error:
-            time = context.get_time()
-            self._steps.tolerate(
-                context, simulation_error(error.failure, time, state, self._signals)
-            )
-            return function.nowhere()
+        if self._exogenous is None:  # Without a call more, in each evaluation.
+            parameters = context.get_numeric_parameter(0).CopyToVector()
+        else:
+            parameters = self._values(context)
+        values = function.evaluate(state, *inputs, parameters)
+        if function.is_valid:
+            return values
+        failure, time = function.failure(), context.get_time()
+        self._steps.tolerate(context, simulation_error(failure, time, state, self._signals))
+        return function.nowhere()
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""

@@ -67,7 +67,7 @@ class TrackingController(ParameterizedSystem):
         sizes = {"estimated_state": dae.num_states, "reference": law.layout.reference_size}
         if law.measured_force:
             sizes["measured_force"] = dae.num_constraints
-        self._input_ports = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
+        self._evaluators = [self.DeclareVectorInputPort(*item).Eval for item in sizes.items()]
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         self.DeclareVectorOutputPort(
@@ -98,7 +98,7 @@ class TrackingController(ParameterizedSystem):
         output.SetFromVector(self._evaluate(context)[1])
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
-        inputs = [port.Eval(context) for port in self._input_ports]
+        inputs = [evaluate(context) for evaluate in self._evaluators]
         return self._checked(self.law.function, context, *inputs)
 
     def _formulas(self) -> dict[str, Formula]:

@@ -163,8 +163,9 @@ class DaePlant(ParameterizedSystem):
         self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
         x = context.get_continuous_state_vector().CopyToVector()
-        inputs = (self._control_port.Eval(context),) if needs_control else ()
-        return self._checked(function, context, x, *inputs)[0]
+        if needs_control:
+            return self._checked(function, context, x, self._control_port.Eval(context))[0]
+        return self._checked(function, context, x)[0]
 
     def _formulas(self) -> dict[str, Formula]:
         dae, residual = self.dae, self.structure.manifold.residual_expression

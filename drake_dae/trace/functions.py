@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.errors import DrakeDaeError, ModelError
+from drake_dae.errors import ModelError
 
 HUGE = 1e30
 """A number above this, in whatever unit, says that something grew without bound. Its powers cancel
@@ -48,24 +48,11 @@ class Failure:
     singular: str = ""
 
 
-class InvalidValueError(DrakeDaeError):
-    """Values of a function that are of no use.
-
-    Attributes:
-        failure: What is wrong with them.
-    """
-
-    def __init__(self, failure: Failure) -> None:
-        super().__init__(f"{failure.function}: {failure.fault.value}")
-        self.failure = failure
-
-
 class TracedFunction:
     """CasADi expressions, evaluated on preallocated NumPy arrays.
 
     A call goes through CasADi's buffer interface and allocates nothing. Whether its values are of
-    use is one number that the call computes as well, so that `checked` costs 0.1 us more than
-    `evaluate`.
+    use, `is_valid`, is one number that the call computes as well.
 
     Args:
         name: What messages call the function.
@@ -112,6 +99,7 @@ class TracedFunction:
         self.num_operations = int(self._function.n_instructions())
         self._buffer, self._evaluate = self._function.buffer()
         self._inputs = tuple(np.zeros(symbol.numel()) for symbol in inputs.values())
+        self._num_inputs = len(self._inputs)
         results = [np.zeros(e.shape, order="F") for e in expressions]
         for index, array in enumerate(self._inputs):
             self._buffer.set_arg(index, array.data)
@@ -135,24 +123,15 @@ class TracedFunction:
         Raises:
             TypeError: The number of arguments is wrong.
         """
-        if len(arguments) != len(self._inputs):
+        if len(arguments) != self._num_inputs:
             raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
         # zip(..., strict=True) and [:] would take as long as the function.
-        for index, given in enumerate(arguments):
-            self._inputs[index][...] = given
+        inputs, index = self._inputs, 0
+        for given in arguments:
+            inputs[index][...] = given
+            index += 1  # noqa: SIM113 - enumerate takes longer.
         self._evaluate()
         return self._outputs
-
-    def checked(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
-        """Calls the function as `evaluate` does, and refuses values that are of no use.
-
-        Raises:
-            InvalidValueError: A value is not finite, or a matrix that must be regular is singular.
-        """
-        values = self.evaluate(*arguments)
-        if isfinite(self._valid[0]):
-            return values
-        raise InvalidValueError(self._failure())
 
     def nowhere(self) -> tuple[FloatArray, ...]:
         """What stands for the outputs where the function has no value: fresh arrays of nan."""
@@ -164,6 +143,11 @@ class TracedFunction:
         return tuple(array.size for array in self._inputs)
 
     @property
+    def is_valid(self) -> bool:
+        """Whether the last values are of use: all finite, and what must be regular is."""
+        return isfinite(self._valid[0])
+
+    @property
     def is_finite(self) -> bool:
         """Whether every output of the last call was finite."""
         return isfinite(self._finite[0])
@@ -173,8 +157,8 @@ class TracedFunction:
         """The pivot of the last call; 1 where there is none."""
         return float(self._pivot[0])
 
-    def _failure(self) -> Failure:
-        """What was wrong with the last call."""
+    def failure(self) -> Failure:
+        """What was wrong with the last call, if it was not valid."""
         for fault, limit in ((Fault.INPUT, np.inf), (Fault.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
