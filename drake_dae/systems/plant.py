@@ -46,6 +46,9 @@ class DaePlant(ParameterizedSystem):
             (sum r_i,); zero on N*.
         controlled_output: z, shape (p,); direct feedthrough where n* = m beta is not zero.
 
+    At a state that an integrator only tries, what has no value is nan, and error control takes a
+    shorter step; at a state that was reached, and where no step leads on, it raises.
+
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
     The default state is the consistent one next to `system.nominal_state`.
 
