@@ -52,6 +52,9 @@ class DaePlant(ParameterizedSystem):
         controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
             zero.
 
+    At a state that an integrator only tries, what has no value is nan, and error control takes a
+    shorter step; at a state that was reached, and where no step leads on, it raises.
+
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
     The default state is the consistent one next to `system.nominal_state`.
 

@@ -1166,3 +1166,35 @@ def test_rest_does_not_depend_on_the_unit_of_time():
     expected = np.roots([mass, damping, softened])
     # The place is known to 1e-9 of the gap.
     np.testing.assert_allclose(np.sort(stability.eigenvalues.real), np.sort(expected), rtol=1e-8)
+
+
+def test_a_clock_among_the_states_is_told():
+    """A force beside c' = 1, held through a matrix whose round-off was divided by: z1 = 3e13."""
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy", "c"],
+        f=lambda s: [s[2], s[3], 0, 0, 1],
+        g=lambda s: [0, 0, 0, 1, 0],
+        h=lambda s: [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
+        k=lambda s: [s[1] - ca.sin(s[4])],
+        l=lambda s: [s[0], 0],
+        m=lambda s: [[0], [1]],
+        name="moved",
+    )
+    dynamics = ZeroDynamics(system)
+    for outputs in (None, [0.0, 10.0]):
+        stability = dynamics.stability(dynamics.structure.states[0], outputs=outputs)
+        assert stability.verdict is Verdict.UNDECIDED
+        assert "no state is at rest, since c' = 1" in stability.reason
+        assert "z1" not in stability.reason
+
+
+def test_a_constant_rate_that_something_steers_is_no_clock():
+    """x' = 1 + u rests at u = -1, which keeps x, and xi' = -xi + x with it."""
+    system = DaeSystem.from_functions(
+        ["x", "xi"],
+        f=lambda s: [1, s[0] - s[1]],
+        h=lambda s: [1, 0],
+        l=lambda s: [s[0]],
+    )
+    dynamics = ZeroDynamics(system)
+    assert dynamics.stability(dynamics.structure.states[0]).verdict is Verdict.STABLE

@@ -9,7 +9,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_dae import DaePlant, DaeSystem, RobotPlant
+from drake_dae import DaePlant, DaeSystem, RobotPlant, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SingularityError
 
 
@@ -206,6 +206,18 @@ def test_parameters_that_make_no_sense_are_refused():
 def test_what_is_no_system_is_refused():
     with pytest.raises(ModelError, match="DaePlant: system must be a DaeSystem, got None"):
         DaePlant(None)
+
+
+def test_the_structure_of_another_system_is_refused():
+    """A robot's by the name of its class, also where the other has the same equations."""
+    other = arm("seven_joint").structure
+    reason = (
+        r"RobotPlant: the structure is that of another system, 'seven_joint' and not 'two_link'"
+    )
+    with pytest.raises(ModelError, match=reason):
+        RobotPlant(arm("two_link").model, structure=other)
+    with pytest.raises(ModelError, match="DaePlant: the structure is that of another system"):
+        DaePlant(hanging_pendulum(), structure=find_structure(hanging_pendulum()))
 
 
 def pendulum(**fields):

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.dae.zero_dynamics.stability import balanced_norm, linearized_eigenvalues
@@ -39,6 +40,15 @@ class Unrest:
         return self.regularity.value or f"{self.moving}' = {self.rate:.3g}"
 
 
+def clock_rates(system: DaeSystem) -> FloatArray:
+    """The rates of states that run at a constant one whatever is done, shape (n,); 0 for others."""
+    explicit, rates = system.explicit, np.zeros(system.num_states)
+    for i in range(system.num_states):
+        if explicit.f[i].is_constant() and not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz()):
+            rates[i] = float(explicit.f[i])
+    return rates
+
+
 class Equilibria:
     """The states at rest on Z(R); all arguments are arrays of the right sizes.
 
@@ -54,6 +64,7 @@ class Equilibria:
         self.pinned = pinned
         examined = np.abs(pinned.structure.states).max(axis=0)
         self.sizes = np.maximum(examined, pinned.system.nominal_spread)
+        self._clocks = clock_rates(pinned.system)
 
     def held_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
         """R with constant outputs, as they are at a state.
@@ -65,7 +76,7 @@ class Equilibria:
         chain = pinned.residual(state, reference, parameters)[-layout.chain_size :]
         if layout.chain_size:
             reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
-        if layout.direct.size:
+        if layout.direct.size and not self._clocks.any():
             _, slopes = pinned.slopes(state, reference, parameters)
             rate = pinned.rate(state, reference, parameters)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
@@ -80,6 +91,17 @@ class Equilibria:
         along it is the shortest.
         """
         pinned = self.pinned
+        if self._clocks.any():
+            names = [signal.name for signal in pinned.system.state_signals]
+            running = ", ".join(
+                f"{names[i]}' = {self._clocks[i]:g}" for i in self._clocks.nonzero()[0]
+            )
+            raise InconsistentStateError(
+                f"{pinned.system.name}: no state is at rest, since {running} at all of them, like "
+                "a clock that nothing steers: time is no state. Take it out of the state, as an "
+                "exogenous signal, or judge the zero dynamics along a motion",
+                self._clocks,
+            )
 
         def linearize(x: FloatArray) -> Linearization | None:
             gradients = pinned.gradients(x, parameters)
