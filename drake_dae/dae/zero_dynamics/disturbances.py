@@ -18,10 +18,13 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.zero_dynamics.periods import find_period
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pursuit import GROWN, STEPS, Reference
+from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
 
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""
+
+STEPS = 5000
+"""The most steps of one interval."""
 
 SECTIONS = 16
 """In so many parts of an interval the state is put back on Z(R), and bases are chosen anew."""
