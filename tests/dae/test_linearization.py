@@ -8,7 +8,8 @@ from problems import PROBLEMS, hanging_pendulum, in_other_units
 from scipy.optimize import root
 
 from drake_dae.dae.gains import poles
-from drake_dae.dae.linearization import Linearization, linearize, linearize_loop
+from drake_dae.dae.linearization.linearization import linearize, linearize_loop
+from drake_dae.dae.linearization.models import Linearization, LinearModel
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
@@ -89,7 +90,7 @@ def test_the_minimal_form_is_that_of_finite_differences(problem, moving):
     assert found.index == structure.index
 
 
-def poles_of(model) -> Array:
+def poles_of(model: LinearModel) -> Array:
     """Finite poles of a pencil."""
     alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
     finite = np.abs(beta) > 1e-6 * np.abs(alpha)
