@@ -10,6 +10,8 @@ from .dae.gains import FeedbackGains as FeedbackGains
 from .dae.gains import gain_coefficients as gain_coefficients
 from .dae.gains import gain_matrices as gain_matrices
 from .dae.gains import poles as poles
+from .dae.linearization.linearization import linearize as linearize
+from .dae.linearization.linearization import linearize_loop as linearize_loop
 from .dae.normal_form.normal_form import NormalForm as NormalForm
 from .dae.references import ConstantReference as ConstantReference
 from .dae.references import ExpressionReference as ExpressionReference

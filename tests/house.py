@@ -52,6 +52,7 @@ PAPER = (
     "references",
     "measured_force",
     "tracking",
+    "linearization",
     "zero_dynamics",
     "extension",
 )

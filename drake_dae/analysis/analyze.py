@@ -156,7 +156,7 @@ def analyze(
     stability = dynamics.stability(rest, outputs=outputs)
     along = None
     if dynamics.dimension and motion.times.size > 1:
-        along = dynamics.stability_along(reference, motion)
+        along = dynamics.stability_along(reference, motion, exogenous=exogenous)
     return replace(
         analysis,
         motion=motion,

@@ -11,6 +11,7 @@ from scipy.optimize import fsolve
 
 from drake_dae import analyze
 from drake_dae.analysis.findings import Finding
+from drake_dae.dae.references import ExpressionReference
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.along import StabilityAlong
 from drake_dae.dae.zero_dynamics.stability import Verdict
@@ -103,6 +104,33 @@ def test_growth_by_a_parameter_that_oscillates():
     assert "the largest Floquet multiplier is 1.934 over 3.14159 s" in found.reason
     # At rest nothing is wrong.
     assert ZeroDynamics(oscillator(mathieu)).stability().verdict is Verdict.STABLE
+
+
+def test_growth_by_an_exogenous_signal():
+    """The same oscillator, pumped by a known signal while its output stands still."""
+    system = DaeSystem.from_functions(
+        ["z", "s", "w"],
+        f=lambda x, p: [0, x[2], mathieu(x[1], x[2], p.pump)],
+        h=lambda x, p: [1, 0, 0],
+        l=lambda x, p: x[0],
+        parameters={"pump": 1.0},
+        exogenous=["pump"],
+        nominal_state=[0.0, 0.01, 0.0],
+        name="pumped",
+    )
+    pump, still = ExpressionReference(lambda t: ca.cos(2 * t)), lambda t: np.zeros(2)
+    times = np.linspace(0.0, 60.0, 61)
+    dynamics = ZeroDynamics(system)
+    motion = dynamics.motion(still, times, exogenous=[pump])
+    found = dynamics.stability_along(still, motion, exogenous=[pump])
+    matrix = monodromy(lambda t: np.array([[0.0, 1.0], [-(1 + 0.9 * np.cos(2 * t)), -0.02]]), np.pi)
+    np.testing.assert_allclose(found.multipliers, by_size(np.linalg.eigvals(matrix)), rtol=1e-7)
+    assert abs(found.period - np.pi) < 1e-9
+    # Nobody pumps: it is at rest, with the pump where its parameter is.
+    alone = dynamics.stability_along(still, dynamics.motion(still, times))
+    assert alone.verdict is Verdict.STABLE
+    report = analyze(system, reference=still, times=times, exogenous=[pump])
+    assert any("Floquet multiplier is 1.934" in problem for problem in report.problems)
 
 
 @pytest.mark.parametrize("damping", [0.5, 0.02])

@@ -21,6 +21,7 @@ from drake_dae import (
     TrackingLaw,
     find_constraint_structure,
     find_structure,
+    linearize,
     make_closed_loop,
     poles,
 )
@@ -209,6 +210,30 @@ def test_the_realization_moves_as_the_plant():
         simulator.AdvancePendingEvents()
         ends.append(block.GetOutputPort("state").Eval(own).copy())
     assert_allclose(*ends, atol=1e-8)
+
+
+def test_the_linear_model_knows_what_moves():
+    """x' and its slopes on N* beside those of the plant; central differences are good to 1e-8."""
+    system = rod(l=None, m=None)  # A law is not needed.
+    structure = find_constraint_structure(system)
+    values = system.parameter_values
+    values[system.exogenous_places([2])] = 1.3, -0.4, 0.7
+    x, u = structure.manifold.project([0.5, -1.2, 0.3, 0.4], values), np.array([2.0, -3.0])
+    found = linearize(system, x, u, structure=structure, parameters=values)
+    plant = DaePlant(system, structure=structure)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("exogenous").FixValue(context, [1.3, -0.4, 0.7])
+    plant.GetInputPort("control").FixValue(context, u)
+
+    def rate(state):
+        plant.set_state(context, structure.manifold.project(state, values))
+        return plant.EvalTimeDerivatives(context).CopyToVector()
+
+    assert_allclose(found.rate, rate(x), rtol=1e-12)
+    steps = 1e-5 * found.basis.T
+    slopes = np.array([(rate(x + d) - rate(x - d)) / 2e-5 for d in steps]).T
+    assert_allclose(found.minimal.A, slopes[found.coordinates], atol=1e-7)
+    assert (found.minimal.C.shape, found.minimal.D.shape) == ((0, 2), (0, 2))
 
 
 def test_what_moves_must_be_a_parameter():

@@ -87,7 +87,7 @@ def _closed_motion(
     """
     scale = flow.scale
     for _ in range(12):
-        basis = flow.basis(state)
+        basis = flow.basis(state, begin)
         try:
             passage = flow.carry(state, begin, begin + period)
         except Lost:
@@ -125,7 +125,8 @@ def _by_multipliers(
         verdict, reason = Verdict.STABLE, largest
     elif np.any(sizes > 1.0 + errors):
         verdict, reason = Verdict.UNSTABLE, f"small disturbances of the motion grow: {largest}"
-        fate, _ = leave(flow.repeating(begin, period), state, begin, float(exponents[0]))
+        repeating, turning = flow.repeating(begin, period), 2.0 * np.pi / period
+        fate = leave(repeating, state, begin, float(exponents[0]), turning)
         if fate is Fate.CIRCLES:
             verdict = Verdict.BOUNDED
         if fate in (Fate.CIRCLES, Fate.SETTLES):

@@ -7,6 +7,7 @@ eigenvalues of M are the Floquet multipliers.
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +19,13 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.zero_dynamics.periods import find_period
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pursuit import GROWN, STEPS, Reference
+from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
 
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""
+
+STEPS = 5000
+"""The most steps of one interval."""
 
 SECTIONS = 16
 """In so many parts of an interval the state is put back on Z(R), and bases are chosen anew."""
@@ -60,7 +64,7 @@ class Flow:
     Args:
         pinned: Z(R).
         reference: The function t -> R(t).
-        parameters: Values of all parameters.
+        parameters: The function t -> values of all parameters.
         scale: How large the states are, shape (n,).
     """
 
@@ -68,15 +72,15 @@ class Flow:
         self,
         pinned: PinnedOutputs,
         reference: Reference,
-        parameters: FloatArray,
+        parameters: Callable[[float], FloatArray],
         scale: FloatArray,
     ) -> None:
         self.pinned, self.parameters, self.scale = pinned, parameters, scale
         self._reference = reference
 
-    def basis(self, state: FloatArray) -> FloatArray:
+    def basis(self, state: FloatArray, time: float) -> FloatArray:
         """T at a state, shape (n, d)."""
-        return self.pinned.tangent(state, self.parameters, self.scale)
+        return self.pinned.tangent(state, self.parameters(time), self.scale)
 
     def goal(self, time: float) -> FloatArray:
         """R at a time, shape (sum (mu_i + 1),).
@@ -89,16 +93,23 @@ class Flow:
         return vector(f"reference({time:g})", np.ravel(given), size)
 
     def period(self, begin: float, end: float) -> float | None:
-        """The period of the reference, as `find_period` finds it in an interval."""
-        return find_period(self.goal, begin, end)
+        """The period of reference and parameters, as `find_period` finds it in an interval."""
+        return find_period(
+            lambda time: np.concatenate([self.goal(time), self.parameters(time)]), begin, end
+        )
 
     def repeating(self, begin: float, period: float) -> "Flow":
-        """The same along a reference that repeats what it is in one period."""
+        """The same along a reference and parameters that repeat what they are in one period."""
 
-        def reference(time: float) -> FloatArray:
-            return self.goal(begin + (time - begin) % period)
+        def within(time: float) -> float:
+            return begin + (time - begin) % period
 
-        return Flow(self.pinned, reference, self.parameters, self.scale)
+        return Flow(
+            self.pinned,
+            lambda time: self.goal(within(time)),
+            lambda time: self.parameters(within(time)),
+            self.scale,
+        )
 
     def onto(self, state: FloatArray, time: float) -> FloatArray:
         """The state on Z(R(t)) next to a given one.
@@ -106,7 +117,7 @@ class Flow:
         Raises:
             Lost: There is none, or it is far.
         """
-        found, converged = self.pinned.project(state, self.goal(time), self.parameters)
+        found, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
         if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
             raise Lost(Cause.NO_WAY_ON)
         return found
@@ -120,13 +131,13 @@ class Flow:
             Lost: The motion grows without bound, is too fast, or leaves the domain.
         """
         d = self.pinned.structure.zero_dynamics_dimension
-        basis, transition, growth, volume = self.basis(state), np.eye(d), 0.0, 0.0
+        basis, transition, growth, volume = self.basis(state, begin), np.eye(d), 0.0, 0.0
         times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
         for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
             columns = basis if disturbed else basis[:, :0]
             state, columns, steps = self._integrate(state, columns, start, stop, steps)
             state = self.onto(state, stop)
-            basis = self.basis(state)
+            basis = self.basis(state, stop)
             if disturbed:
                 scaled = (basis / self.scale[:, None]).T @ (columns / self.scale[:, None])
                 transition = scaled @ transition
@@ -150,7 +161,7 @@ class Flow:
             return (np.column_stack([first, rest]) / unit).T.reshape(-1)
 
         def rate(time: float, both: FloatArray) -> FloatArray:
-            (x, along), goal, p = split(both), self.goal(time), self.parameters
+            (x, along), goal, p = split(both), self.goal(time), self.parameters(time)
             moved = joined(
                 self.pinned.rate(x, goal, p), self.pinned.slopes_along(x, goal, p, along)
             )
@@ -160,7 +171,8 @@ class Flow:
 
         def slopes(time: float, both: FloatArray) -> FloatArray:
             # Without the second derivatives, which the iteration of the integrator makes up for.
-            matrix = self.pinned.slopes(split(both)[0], self.goal(time), self.parameters)[0]
+            goal, p = self.goal(time), self.parameters(time)
+            matrix = self.pinned.slopes(split(both)[0], goal, p)[0]
             blocks = [matrix * self.scale / unit] * (1 + columns.shape[1])
             return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
 

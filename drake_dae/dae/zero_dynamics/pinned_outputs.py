@@ -12,18 +12,17 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.layout import Indices
 from drake_dae.dae.manifold import CONSISTENT
+from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
-from drake_dae.trace.round_off import positive
 
 VANISHED = 1e-9
 """A or B counts as singular below this part of its usual margin, also where it is one number."""
@@ -149,27 +148,13 @@ class PinnedOutputs:
 
     def tangent(self, state: FloatArray, parameters: FloatArray, scale: FloatArray) -> FloatArray:
         """A basis of the tangent space of Z(R), orthonormal relative to a scale, shape (n, d)."""
-        rows = self.gradients(state, parameters) * scale
-        rows /= positive(np.linalg.norm(rows, axis=1, keepdims=True))
-        return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
+        return tangent(self.gradients(state, parameters), scale)
 
     def coordinates(
         self, state: FloatArray, parameters: FloatArray, scale: FloatArray
     ) -> tuple[Indices, FloatArray]:
-        """States that are coordinates of Z(R), and how all move with them, (d,) and (n, d).
-
-        Unlike orthonormal ones these leave a triangular system triangular.
-        """
-        basis = self.tangent(state, parameters, scale) / scale[:, None]
-        count = basis.shape[1]
-        free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])
-        rest = np.setdiff1d(np.arange(state.size), free)
-        rows = self.gradients(state, parameters) * scale
-        rows /= positive(np.linalg.norm(rows, axis=1, keepdims=True))
-        moved = np.zeros(basis.shape)
-        moved[free] = np.eye(count)
-        moved[rest] = -np.linalg.solve(rows[:, rest], rows[:, free])
-        return free, scale[:, None] * moved / scale[free]
+        """States that are coordinates of Z(R), and how all move with them, (d,) and (n, d)."""
+        return coordinates(self.gradients(state, parameters), scale)
 
     def rate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> FloatArray:
         """x' = f* + h* u, shape (n,)."""

@@ -28,6 +28,9 @@ PLAIN = float(np.log(10.0))
 """Disturbances grow or shrink where the logarithm of their size changes by more than this."""
 
 
+LONGEST = 1500.0
+"""No motion is followed through a larger angle, in rad, some hundred turns."""
+
 SLOWEST = 1e-4
 """What moves more slowly than this, relative to all that moves, is not waited for."""
 
@@ -103,8 +106,8 @@ def watch_from(flow: Flow, state: FloatArray) -> tuple[Fate, FloatArray | None]:
 
     How long that takes is told by how fast its disturbances move.
     """
-    basis = flow.basis(state) / flow.scale[:, None]
-    slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters)
+    basis = flow.basis(state, 0.0) / flow.scale[:, None]
+    slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters(0.0))
     scaled = basis.T @ (slopes * flow.scale / flow.scale[:, None]) @ basis
     if not np.all(np.isfinite(scaled)):
         return Fate.UNCLEAR, None
@@ -116,7 +119,7 @@ def watch_from(flow: Flow, state: FloatArray) -> tuple[Fate, FloatArray | None]:
     return fate, None if passage is None else passage.state
 
 
-def leave(flow: Flow, state: FloatArray, time: float, rate: float) -> tuple[Fate, Passage | None]:
+def leave(flow: Flow, state: FloatArray, time: float, rate: float, fastest: float) -> Fate:
     """What becomes of the motions that leave an unstable one, on both sides of it.
 
     Args:
@@ -124,23 +127,28 @@ def leave(flow: Flow, state: FloatArray, time: float, rate: float) -> tuple[Fate
         state: A state of the unstable motion, shape (n,).
         time: When it is there.
         rate: The largest exponent of its disturbances, in 1/s, positive.
+        fastest: How fast it moves, in rad/s; what takes too many turns is not followed.
 
     Returns:
         The fate that is worse, or that is not known; the circling one only if both sides circle.
     """
-    basis = flow.basis(state)
+    duration = FOLDINGS / rate
+    if duration * fastest > LONGEST:
+        return Fate.UNCLEAR
+    basis = flow.basis(state, 0.0)
     aside = basis @ np.random.default_rng(0).standard_normal(basis.shape[1])
     aside *= BESIDE / np.max(np.abs(aside) / flow.scale)
-    found: list[tuple[Fate, Passage | None]] = []
+    found = Fate.UNCLEAR
     for side in (aside, -aside):
         try:
             start = flow.onto(state + side, time)
         except Lost:
-            return Fate.UNCLEAR, None
-        found.append(watch(flow, start, time, time + FOLDINGS / rate))
-        if found[-1][0] not in (Fate.CIRCLES, Fate.SETTLES):
-            break
-    return min(found, key=lambda one: one[0] is Fate.CIRCLES)
+            return Fate.UNCLEAR
+        fate, _ = watch(flow, start, time, time + duration)
+        if fate not in (Fate.CIRCLES, Fate.SETTLES):
+            return fate
+        found = Fate.SETTLES if Fate.SETTLES in (found, fate) else fate
+    return found
 
 
 def judge_at_rest(
@@ -160,8 +168,8 @@ def judge_at_rest(
     found = judge(values, errors, rest, place)
     if found.verdict is not Verdict.UNSTABLE:
         return found
-    flow = Flow(pinned, lambda time: goal, parameters, sizes)
-    fate, _ = leave(flow, rest, 0.0, float(values[0].real))
+    flow = Flow(pinned, lambda time: goal, lambda time: parameters, sizes)
+    fate = leave(flow, rest, 0.0, float(values[0].real), float(np.max(np.abs(values.imag))))
     if fate not in (Fate.CIRCLES, Fate.SETTLES):
         return found
     verdict = Verdict.BOUNDED if fate is Fate.CIRCLES else Verdict.UNSTABLE
@@ -185,7 +193,7 @@ def judge_without_rest(
         reason: Why there is no equilibrium.
     """
     nothing, pinned = np.zeros(0, dtype=complex), equilibria.pinned
-    flow = Flow(pinned, lambda time: goal, parameters, equilibria.sizes)
+    flow = Flow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
         fate, end = watch_from(flow, pinned.state(goal, start, parameters))
         if fate is Fate.SETTLES and end is not None:

@@ -239,7 +239,11 @@ class ZeroDynamics:
         return self._equilibria.find_all(goal, starts, p)
 
     def stability_along(
-        self, reference: Reference, motion: PinnedMotion, parameters: ArrayLike | None = None
+        self,
+        reference: Reference,
+        motion: PinnedMotion,
+        parameters: ArrayLike | None = None,
+        exogenous: Sequence[references.Reference] = (),
     ) -> StabilityAlong:
         """Whether Assumption 2.2 holds along a motion, by what it does to small disturbances.
 
@@ -253,6 +257,7 @@ class ZeroDynamics:
             reference: The function t -> R(t).
             motion: What `motion` returns for it.
             parameters: Values of all parameters.
+            exogenous: How the exogenous signals move, as for `motion`.
 
         Raises:
             ModelError: A shape is wrong, or a number is not finite.
@@ -266,12 +271,14 @@ class ZeroDynamics:
                 f"{self.system.name}: the motion is one of another system: its states have shape "
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
-        flow, period = Flow(self._pinned, reference, p, self._equilibria.sizes), None
+        moving = self._moving(p, exogenous)
+        flow, period = Flow(self._pinned, reference, moving, self._equilibria.sizes), None
         if motion.ending is None and motion.times.size > 1:
             period = flow.period(float(motion.times[0]), float(motion.times[-1]))
         if period == 0.0:
             outputs = self._pinned.layout.values(flow.goal(float(motion.times[0])))
-            found = self.stability(motion.states[0], parameters, outputs)
+            held = moving(float(motion.times[0]))
+            found = self.stability(motion.states[0], held, outputs)
             rates = found.eigenvalues.real.copy()
             return StabilityAlong(
                 found.verdict, 0.0, found.eigenvalues[:0], rates, found.state, found.reason

@@ -1,0 +1,40 @@
+"""Bases of the tangent space of a manifold that is given by the gradients of its constraints."""
+
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.layout import Indices
+from drake_dae.trace.round_off import positive
+
+
+def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
+    """A basis T, orthonormal in states relative to their scale, shape (n, n - k).
+
+    Args:
+        gradients: Of the constraints, independent rows, shape (k, n).
+        scale: How large the states are, shape (n,).
+    """
+    rows = _unit_rows(gradients * scale)
+    return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
+
+
+def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
+    """States that are coordinates, (n - k,), and how all states move with them, (n, n - k).
+
+    Unlike an orthonormal basis this one leaves a triangular system triangular. The arguments are
+    those of `tangent`.
+    """
+    basis = tangent(gradients, scale) / scale[:, None]
+    count = basis.shape[1]
+    free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])
+    rest = np.setdiff1d(np.arange(scale.size), free)
+    rows = _unit_rows(gradients * scale)
+    moved = np.zeros(basis.shape)
+    moved[free] = np.eye(count)
+    moved[rest] = -np.linalg.solve(rows[:, rest], rows[:, free])
+    return free, scale[:, None] * moved / scale[free]
+
+
+def _unit_rows(matrix: FloatArray) -> FloatArray:
+    return matrix / positive(np.linalg.norm(matrix, axis=1, keepdims=True))
