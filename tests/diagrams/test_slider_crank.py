@@ -5,10 +5,21 @@ from math import factorial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from runs import run_scenario, scenario
 
-from drake_dae import build_scenario
+from drake_dae import (
+    CoincidentPoints,
+    JointPositions,
+    RobotModel,
+    RobotPlant,
+    TrackingLaw,
+    build_scenario,
+    poles,
+)
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.scenario import FOLDER
 
 GRAVITY = 9.81
 CRANK, FLYWHEEL = 0.12, 4.0 * 0.16**2 / 2  # m, kg m^2
@@ -39,8 +50,12 @@ def placed(crank: float, rate: float) -> FloatArray:
     return np.array([crank, rod - crank, slider, rate, rod_rate - rate, speed])
 
 
-def by_hand(crank: float, rate: float, second: float) -> tuple[float, FloatArray]:
+def by_hand(
+    crank: float, rate: float, second: float, pushed: float = 0.0
+) -> tuple[float, FloatArray]:
     """The torque on the crank, and the force of the rod on the slider, shape (2,).
+
+    Someone else may push the slider as well.
 
     The rod's end stays at z = 0; the slider tells the force along the guide, the rod's moments
     about the crank pin that across it, and the crank's about the axle the torque.
@@ -50,7 +65,7 @@ def by_hand(crank: float, rate: float, second: float) -> tuple[float, FloatArray
     knee = CRANK * (across(crank) * second - along(crank) * rate**2)
     rod_second = (ROD * np.sin(rod) * rod_rate**2 - knee[1]) / (ROD * np.cos(rod))
     swing = across(rod) * rod_second - along(rod) * rod_rate**2
-    push = SLIDER * (knee + ROD * swing)[0] + DAMPING * speed
+    push = SLIDER * (knee + ROD * swing)[0] + DAMPING * speed - pushed
     inertial = ROD_MASS * (knee + ROD / 2 * swing + [0.0, GRAVITY])
     turning = ROD_INERTIA * rod_second + ROD / 2 * moment(along(rod), inertial)
     # moment(along, -f) = sin f_x - cos f_z.
@@ -106,6 +121,37 @@ def test_behind_the_shaft_the_spring_drives():
         assert_allclose(rates[3], second, rtol=1e-11)
         assert_allclose(rates[7], (control - STIFFNESS * twist) / SHAFT, rtol=1e-11, atol=1e-9)
         assert_allclose(found, by_hand(crank, rate, second)[1], rtol=1e-10, atol=1e-10)
+
+
+def test_a_second_motor_steers_one_force_of_the_pin():
+    """z = (crank, the pin's force along the guide), mu = (2, 0); the force across it follows."""
+    plant = MultibodyPlant(0.0)
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
+    parser.AddModelsFromUrl("package://drake_dae_models/slider_crank.urdf")
+    plant.AddJointActuator("pump", plant.GetJointByName("slider"))
+    plant.Finalize()
+    pin = CoincidentPoints("rod", (ROD, 0, 0), "slider", (0, 0, 0), "xz")
+    crank = JointPositions(["crank"])
+    nominal = placed(0.7, 0.0)[:3]
+    model = RobotModel.from_multibody(plant, [pin], [crank], nominal, forces=["pin.fx"])
+    law = TrackingLaw(model.dae, poles(-6.0))
+    assert law.structure.output_degrees == (2, 0)
+    assert law.structure.zero_dynamics_dimension == 0
+    block = RobotPlant(model, structure=law.structure)
+    context, random = block.CreateDefaultContext(), np.random.default_rng(2)
+    for _ in range(4):
+        angle, rate, second, wanted = random.uniform(-6.0, 6.0, 4)
+        state = placed(angle, rate)
+        control = law.control(state, [angle, rate, second, wanted])
+        alone = by_hand(angle, rate, second)[1]
+        torque, force = by_hand(angle, rate, second, alone[0] - wanted)
+        assert_allclose(force[0], wanted, atol=1e-12)
+        assert_allclose(control, [torque, alone[0] - wanted], rtol=1e-11, atol=1e-11)
+        block.set_state(context, state)
+        block.GetInputPort("control").FixValue(context, control)
+        found = block.GetOutputPort("constraint_force").Eval(context)
+        assert_allclose(found, force, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize(("name", "order"), [("slider_crank", 2), ("slider_crank_flexible", 4)])
