@@ -11,7 +11,7 @@ from typing import TypeVar
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import GetScopedFrameByName, Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RpyFloatingJoint
+from pydrake.multibody.tree import QuaternionFloatingJoint, RpyFloatingJoint
 
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Signal
@@ -106,13 +106,13 @@ def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
 @at("robot.file")
 def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
     plant = _parse(robot, scene_graph)
-    for index in plant.GetFloatingBaseBodies():
-        body = plant.get_body(index)
-        if body.has_quaternion_dofs():
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if isinstance(joint, QuaternionFloatingJoint):
             raise ModelError(
-                f"body '{body.name()}' is free; weld it to the world in the file, or name it in "
-                "robot.free, which gives it a joint in roll, pitch and yaw. A quaternion is not "
-                "supported: no force keeps its length"
+                f"body '{joint.child_body().name()}' is free; weld it to the world in the file, or "
+                "name it in robot.free, which gives it a joint in roll, pitch and yaw. A "
+                "quaternion is not supported: no force keeps its length"
             )
     links = MultibodyExpressions(plant)
     if not links.actuator_signals:
@@ -169,13 +169,13 @@ def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
     for name in bodies:
         try:
             body = GetScopedFrameByName(plant, name).body()
+            joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+            held = [j.name() for j in joints if j.child_body().index() == body.index()]
+            if held:
+                raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
+            plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
         except RuntimeError as error:
-            raise ModelError(f"no body '{name}': {error}") from None
-        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-        held = [j.name() for j in joints if j.child_body() is body]
-        if held:
-            raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
-        plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
+            raise ModelError(f"'{name}' is no body that can be free: {error}") from None
 
 
 class _Dropped(logging.Filter):

@@ -289,7 +289,8 @@ def test_what_is_free_moves_in_the_animation(name, body):
     ("name", "setting", "words"),
     [
         ("three_fingers", "robot.free=[]", ["robot.file: ", "body 'object' is free", "robot.free"]),
-        ("three_fingers", "robot.free=[objct]", ["robot.free: no body 'objct'"]),
+        ("three_fingers", "robot.free=[objct]", ["robot.free: 'objct' is no body that can"]),
+        ("three_fingers", "robot.free=[world]", ["robot.free: 'world' is no body that can"]),
         ("biped", "robot.free=[trunk]", ["robot.free: 'trunk' is not free: joint 'pitch'"]),
         ("three_fingers", "robot.free=object", ["robot.free: expected a list, got 'object'"]),
         ("three_fingers", "forces.0.first=grip", ["forces.0: no constraint 'grip'; did you mean"]),
