@@ -179,8 +179,7 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
             state = _in_motion(loop, context, wanted, state)
         plant.set_consistent_state(own, state)
     if loop.sensor is not None:
-        force = np.zeros(model.dae.num_constraints)
-        force[list(model.steered)] = forces
+        force = model.rest_forces(q, forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
         loop.set_seed(context, scenario.force.seed)
 

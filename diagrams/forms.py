@@ -110,9 +110,11 @@ class Choice:
 
     Attributes:
         written: The types that stand for others in data, as in `Form`, for all members.
+        text: The only field of the first member, for which plain text stands; empty if none does.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
+    text: str = ""
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: pydantic.GetCoreSchemaHandler
@@ -132,7 +134,28 @@ class Choice:
         choices = {
             form.tag: handler.generate_schema(Annotated[cls, form]) for cls, form in forms.items()
         }
-        return core_schema.tagged_union_schema(choices, chosen)
+        chosen_form = core_schema.tagged_union_schema(choices, chosen)
+        if not self.text:
+            return chosen_form
+        plain = next(iter(forms))
+
+        def written_out(value: Any) -> Any:
+            return {TAG: first, self.text: value} if isinstance(value, str) else value
+
+        def dump(made: Any, dump_data: Callable[[Any], Any]) -> Any:
+            return getattr(made, self.text) if type(made) is plain else dump_data(made)
+
+        return core_schema.no_info_before_validator_function(
+            written_out,
+            chosen_form,
+            serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=chosen_form),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        schema = handler(source)
+        return {"anyOf": [{"type": "string"}, schema]} if self.text else schema
 
 
 def _numbers(value: Any) -> Any:
@@ -221,13 +244,20 @@ class _Place:
     tags: str = ""
 
 
+_PARTS = {"oneOf", "items", "properties", "additionalProperties"}
+"""What schemas have of data with parts."""
+
+
 def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _Place:
     """Where pydantic's location is, in which a chosen tag is a part."""
     keys: list[str] = []
     tag = tags = ""
     for part in loc:
         if "anyOf" in schema:
-            break  # The rest of the location is about one of several types.
+            inside = [one for one in schema["anyOf"] if not _PARTS.isdisjoint(one)]
+            if len(inside) != 1:
+                break  # The rest of the location is about one of several types.
+            schema = inside[0]
         if "oneOf" in schema:
             tag, tags = str(part), _tags(schema)
             schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
@@ -286,6 +316,8 @@ def _in_words(schema: Mapping[str, Any]) -> str:
     """What a plain value must be."""
     if "anyOf" in schema:
         return " or ".join(map(_in_words, schema["anyOf"]))
+    if "oneOf" in schema:
+        return f"one of {_tags(schema)}"
     if "enum" in schema or "const" in schema:
         return "one of " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
     return _IN_WORDS.get(schema.get("type", ""), "something else")

@@ -21,7 +21,7 @@ from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
 from drake_dae.errors import ScenarioError
-from drake_dae.robots import actuation, contact, loads, outputs
+from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
 
@@ -59,6 +59,10 @@ Output = Annotated[
     | parts.SurfaceCoordinates
     | outputs.JointPositions,
     Choice(_WRITTEN),
+]
+ForceOutput = Annotated[
+    force_outputs.NamedForce | force_outputs.Squeeze | force_outputs.ForceCombination,
+    Choice(_WRITTEN, text="name"),
 ]
 Stage = Annotated[
     actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
@@ -100,8 +104,9 @@ class Scenario:
         constraints: What it touches or holds; a form without a tag is a PointOnSurface. Those that
             the robot's file has, as mimic joints, follow them.
         outputs: Position outputs; the constraint forces follow them.
-        forces: Names of the constraint forces that are outputs; all where left out. Forces that
-            nobody can or shall steer, as those of wheels and of mimic joints, stay out: [] is none.
+        forces: The force outputs: names of constraint forces, and combinations of forces by tags;
+            all constraint forces where left out. Forces that nobody can or shall steer, as those of
+            wheels and of mimic joints, stay out: [] is none.
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not.
@@ -121,7 +126,7 @@ class Scenario:
     robot: parts.Robot
     constraints: list[Constraint] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
-    forces: list[str] | None = None
+    forces: list[ForceOutput] | None = None
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
@@ -213,7 +218,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     except (OSError, RuntimeError, ValueError) as error:
         # The working directory is gone; a link that leads to itself; a null byte.
         raise ScenarioError(("robot", f"no path: {error}")) from None
-    return replace(scenario, robot=parts.Robot(file, packages))
+    return replace(scenario, robot=replace(robot, file=file, packages=packages))
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

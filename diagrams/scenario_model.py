@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.parsing import Parser
+from pydrake.multibody.parsing import GetScopedFrameByName, Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import QuaternionFloatingJoint, RpyFloatingJoint
 
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Signal
@@ -23,6 +24,7 @@ from drake_dae.robots.actuation import Stage
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
@@ -106,7 +108,16 @@ def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
 
 @at("robot.file")
 def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
-    links = MultibodyExpressions(_parse(robot, scene_graph))
+    plant = _parse(robot, scene_graph)
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if isinstance(joint, QuaternionFloatingJoint):
+            raise ModelError(
+                f"body '{joint.child_body().name()}' is free; weld it to the world in the file, or "
+                "name it in robot.free, which gives it a joint in roll, pitch and yaw. A "
+                "quaternion is not supported: no force keeps its length"
+            )
+    links = MultibodyExpressions(plant)
     if not links.actuator_signals:
         raise ModelError(
             f"'{Path(robot.file).name}' has no actuators; in a URDF, give each driven joint a "
@@ -140,7 +151,10 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
             parser.AddModels(robot.file)
         folders = [FOLDER / "models", *map(Path, robot.packages.values())]
         check_resources(scene_graph, [package_folder(Path(file)), *folders])
+        _add_free_joints(robot.free, plant)
         plant.Finalize()
+    except ScenarioError:
+        raise
     except (RuntimeError, ValueError, SystemExit) as error:
         # Drake has all of them: SystemExit for what an assertion of its own finds.
         raise ModelError(str(error)) from None
@@ -150,6 +164,21 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
     if dropped.warnings:
         raise ModelError("; ".join(map(_explained, dropped.warnings)))
     return plant
+
+
+@at("robot.free")
+def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
+    """Gives bodies that no joint holds one in roll, pitch and yaw, for which files have no word."""
+    for name in bodies:
+        try:
+            body = GetScopedFrameByName(plant, name).body()
+            joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+            held = [j.name() for j in joints if j.child_body().index() == body.index()]
+            if held:
+                raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
+            plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
+        except RuntimeError as error:
+            raise ModelError(f"'{name}' is no body that can be free: {error}") from None
 
 
 class _Dropped(logging.Filter):
@@ -234,11 +263,13 @@ def _try(constraint: Constraint, links: Links) -> None:
         constraint.rate(links.kinematics())
 
 
-@at("forces")
 def _check_forces(
-    forces: Sequence[str] | None, constraints: Sequence[Constraint], links: Links
+    forces: Sequence[ForceOutput] | None, constraints: Sequence[Constraint], links: Links
 ) -> None:
-    ConstraintSet([*constraints, *plant_constraints(links)]).places(forces)
+    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    each("forces", forces or (), lambda output: force_rows([output], bound, links))
+    with at("forces"):
+        force_outputs(forces, bound)
 
 
 def _outputs(

@@ -46,10 +46,13 @@ class Robot:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
             "package://drake_dae_models/<file>" for a shipped one.
         packages: Name -> folder, relative to the scenario, for other "package://<name>/...".
+        free: Names of bodies that no joint holds, "object" or "puck::object": they get a joint in
+            roll, pitch and yaw, with the positions "object_qx", "_qy", "_qz", "_x", "_y", "_z".
     """
 
     file: str
     packages: dict[str, str] = field(default_factory=dict)
+    free: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,10 @@ from .robots.contact.surfaces import Plane as Plane
 from .robots.contact.surfaces import Sphere as Sphere
 from .robots.contact.surfaces import Torus as Torus
 from .robots.contact.welds import WeldedFrames as WeldedFrames
+from .robots.force_outputs import ForceCombination as ForceCombination
+from .robots.force_outputs import ForceOutput as ForceOutput
+from .robots.force_outputs import NamedForce as NamedForce
+from .robots.force_outputs import Squeeze as Squeeze
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.loads import KnownForce as KnownForce

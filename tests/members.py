@@ -9,7 +9,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from drake_dae import PointOnSurface
+from drake_dae import ForceOutput, PointOnSurface
 from drake_dae.dae.signals import Signal
 from drake_dae.robots.actuation.numbers import diagonal_parameter
 from drake_dae.robots.actuation.stage import AttachedStage, Stage
@@ -118,3 +118,19 @@ def subclasses(family, package="drake_dae"):
             if cls.__module__.startswith(package) and not cls.__abstractmethods__:
                 found.add(cls)
     return found
+
+
+@dataclass(frozen=True)
+class Pull(ForceOutput):
+    """What a constraint exerts on a frame along an axis of that frame, a unit vector."""
+
+    frame: str
+    constraint: str
+    axis: tuple[float, float, float]
+
+    def expression(self, constraints, kinematics, constraint_force):
+        _, force = constraints.force_on(self.frame, self.constraint, kinematics, constraint_force)
+        return ca.dot(ca.mtimes(kinematics.rotation(self.frame), ca.DM(self.axis)), force)
+
+    def signals(self, constraints):
+        return (Signal(f"{self.constraint}.pull", "N"),)

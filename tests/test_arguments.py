@@ -235,6 +235,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "outputs of RobotModel.configuration": lambda: [0.3],
     "guess of RobotModel.configuration": lambda: [1.2, -1.6],
     "positions of RobotModel.rest_state": lambda: [1.2, -1.6],
+    "positions of RobotModel.rest_forces": lambda: [1.2, -1.6],
+    "second": lambda: "other",
     "forces": lambda: [1.0],
     "forces of RobotModel": lambda: None,
     "forces of RobotModel.from_multibody": lambda: None,
@@ -339,7 +341,7 @@ def public() -> Iterator[tuple[str, Any]]:
 
 
 # What the library calls on its members, with arguments of its own: rules for who writes one.
-CONTRACTS = (Surface, Constraint, PositionOutput, Stage, dd.Reference)
+CONTRACTS = (Surface, Constraint, PositionOutput, dd.ForceOutput, Stage, dd.Reference)
 
 
 def methods(cls: type) -> set[str]:

@@ -20,6 +20,7 @@ from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
@@ -41,8 +42,9 @@ class RobotModel:
     drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the
     constraint input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many
     position outputs as actuators less constraints. Where fewer forces can or shall be steered, as
-    those of wheels and of mimic joints, `forces` names these: z_2 = S lambda, and there are as many
-    position outputs as actuators less these. All of lambda is on the plant's port nevertheless.
+    those of wheels and of mimic joints, or combinations of them, as in a grasp, `forces` tells
+    which: z_2 = S(q) lambda, and there are as many position outputs as actuators less these. All of
+    lambda is on the plant's port nevertheless.
 
     Args:
         links: The links, which provide M, H and the frames.
@@ -53,7 +55,8 @@ class RobotModel:
             structure is examined; `links.default_positions` if None.
         name: The robot's name in messages.
         actuation: The stages from the joints toward the motor; none is rigid joints.
-        forces: Names of the constraint forces that are outputs, in their order; all if None.
+        forces: The force outputs z_2, in their order: names of constraint forces, and combinations
+            of forces, as a `Squeeze`; all constraint forces if None.
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
         loads: Known forces on frames, which are zero where nobody sets their parameters.
@@ -62,7 +65,7 @@ class RobotModel:
         dae: The `DaeSystem` (43)-(45).
         links, positions, name, loads: The arguments.
         constraints: The constraints, with those of the plant.
-        steered: Which of the constraint forces are outputs, in their order: the rows of S.
+        forces: The force outputs; a name is a `NamedForce`.
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
         control_limits: The largest |u| per actuator, infinite where there is none or where u is
@@ -81,7 +84,7 @@ class RobotModel:
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
-        forces: Sequence[str] | None = None,
+        forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
     ) -> None:
@@ -91,9 +94,11 @@ class RobotModel:
         self.name = name
         self.loads = tuple(loads)
         bound = ConstraintSet(self.constraints)
-        self.steered = bound.places(forces)
+        self.forces = force_outputs(forces, bound)
+        S = force_rows(self.forces, bound, links)
+        self._num_forces = S.shape[0]
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
-        self._check_outputs(len(self.steered), h_1.numel())
+        self._check_outputs(self._num_forces, h_1.numel())
         driven = chain(actuation, links)
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
@@ -102,11 +107,11 @@ class RobotModel:
             links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
         )
         nominal = self._nominal(nominal_positions)
-        self.dae = self._equations(bound, h_1, driven, nominal).with_exogenous(exogenous)
+        self.dae = self._equations(bound, h_1, S, driven, nominal).with_exogenous(exogenous)
         self._check_exogenous()
         self._check_mass_matrix(nominal)
         self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
-        self._balance = Balance(self.dae, links.q, links.v, self.steered)
+        self._balance = Balance(self.dae, links.q, links.v, S)
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
@@ -119,7 +124,7 @@ class RobotModel:
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
-        forces: Sequence[str] | None = None,
+        forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
     ) -> Self:
@@ -144,7 +149,7 @@ class RobotModel:
     @property
     def position_signals(self) -> tuple[Signal, ...]:
         """Names and units of z_1."""
-        return self.dae.output_signals[: self.dae.num_outputs - len(self.steered)]
+        return self.dae.output_signals[: self.dae.num_outputs - self._num_forces]
 
     def configuration(
         self, outputs: ArrayLike | None, guess: ArrayLike, parameters: ArrayLike | None = None
@@ -188,7 +193,7 @@ class RobotModel:
 
         Args:
             positions: q, shape (nq,), on the constraints.
-            forces: The constraint forces that are outputs, z_2, shape (k,): lambda if all are.
+            forces: The force outputs z_2, shape (k,): lambda if all forces are outputs.
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
@@ -199,8 +204,8 @@ class RobotModel:
         """
         values = self.dae.parameter_vector(parameters)
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
-        load = vector(f"{self.name}: forces", forces, len(self.steered))
-        state, left = self._balance.rest(q, load, values)
+        load = vector(f"{self.name}: forces", forces, self._num_forces)
+        state, _, left = self._balance.rest(q, load, values)
         if self.stages and left > 1e-6 * (1.0 + float(np.max(np.abs(load), initial=0.0))):
             raise ModelError(
                 f"{self.name}: no drive holds the robot at rest at q = "
@@ -208,6 +213,24 @@ class RobotModel:
                 "has fewer actuators than joints"
             )
         return state
+
+    def rest_forces(
+        self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """All constraint forces at rest in a configuration, of which some or none are outputs.
+
+        Args:
+            positions: q, shape (nq,), on the constraints.
+            forces: The force outputs z_2, shape (k,).
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            lambda, shape (m,), with S lambda = z_2.
+        """
+        values = self.dae.parameter_vector(parameters)
+        q = vector(f"{self.name}: positions", positions, self.links.q.numel())
+        load = vector(f"{self.name}: forces", forces, self._num_forces)
+        return self._balance.rest(q, load, values)[1]
 
     def _check_exogenous(self) -> None:
         """Refuses to move what restricts velocities alone: its own rate would lack a part."""
@@ -251,7 +274,12 @@ class RobotModel:
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
 
     def _equations(
-        self, bound: ConstraintSet, h_1: ca.SX, driven: ActuationChain, nominal: FloatArray
+        self,
+        bound: ConstraintSet,
+        h_1: ca.SX,
+        S: ca.SX,
+        driven: ActuationChain,
+        nominal: FloatArray,
     ) -> DaeSystem:
         """(43)-(45), with M on the left; below the rows of the links stand those of the stages."""
         links = self.links
@@ -275,8 +303,7 @@ class RobotModel:
             return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
         position_signals = tuple(s for p in self.positions for s in p.signals(links))
-        force_signals = bound.force_signals
-        S = ca.SX.eye(m)[list(self.steered), :]
+        force_outputs = tuple(s for f in self.forces for s in f.signals(bound))
         return DaeSystem(
             state=ca.vertcat(links.q, links.v, driven.state),
             mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
@@ -297,10 +324,10 @@ class RobotModel:
                 *links.velocity_signals,
                 *driven.state_signals,
             ),
-            constraint_input_signals=force_signals,
+            constraint_input_signals=bound.force_signals,
             constraint_output_signals=bound.residual_signals,
             control_signals=driven.control_signals,
-            output_signals=(*position_signals, *(force_signals[i] for i in self.steered)),
+            output_signals=(*position_signals, *force_outputs),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
             implicit=implicit,
@@ -324,7 +351,7 @@ class RobotModel:
         """The state at rest on the constraints: shafts off them would strain the springs."""
         with suppress(InconsistentStateError):
             nominal = self.configuration(None, nominal)
-        forces = np.zeros(len(self.steered))
+        forces = np.zeros(self._num_forces)
         return self._balance.rest(nominal, forces, self.dae.parameter_values)[0]
 
     def _check_mass_matrix(self, nominal: FloatArray) -> None:

@@ -1,7 +1,5 @@
 """Where a robot can stand (58), and what holds it there: two problems for Newton's method."""
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 
@@ -54,20 +52,32 @@ class Placing:
 
 
 class Balance:
-    """The equations 0 = f + g lambda + h u at v = 0, to be solved for the stages' s and for u.
+    """The equations 0 = f + g lambda + h u at v = 0, S lambda = z_2, for the stages' s, u, lambda.
+
+    Entries of lambda that are outputs as they are, as told by a row of the identity, are no
+    unknowns.
 
     Args:
         dae: The robot's system, with the state (q, v, s).
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
-        given: Which entries of lambda are given; the others are solved for as well.
+        S: What of lambda is given, shape (k, m).
     """
 
-    def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX, given: Sequence[int]) -> None:
+    def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX, S: ca.SX) -> None:
         links = q.numel() + v.numel()
         control = ca.SX.sym("u", dae.num_controls)
         force = ca.SX.sym("lambda", dae.num_constraints)
+        load = ca.SX.sym("z_2", S.shape[0])
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
         balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
+        alone = [_unit_row(S[i, :]) for i in range(S.shape[0])]
+        given = {place: i for i, place in enumerate(alone) if place is not None}
+        known = ca.SX(force)
+        for place, i in given.items():
+            known[place] = load[i]
+        combined = [i for i, place in enumerate(alone) if place is None]
+        rows = (ca.mtimes(S, force) - load)[combined]
+        balance = ca.substitute(ca.vertcat(balance, rows), force, known)
         free = [i for i in range(dae.num_constraints) if i not in given]
         unknown = ca.vertcat(dae.state[links:], control, force[free])
         self._unknowns = unknown.numel()
@@ -75,31 +85,30 @@ class Balance:
         self._still = np.zeros(v.numel())
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
+            {"q": q, "z_2": load, "s, u, free forces": unknown, "parameters": dae.parameter_symbol},
             {
-                "q": q,
-                "constraint_force": force[list(given)],
-                "s, u, free forces": unknown,
-                "parameters": dae.parameter_symbol,
+                "balance": balance,
+                "gradient": ca.jacobian(balance, unknown),
+                "constraint_force": known,
             },
-            {"balance": balance, "gradient": ca.jacobian(balance, unknown)},
         )
 
     def rest(
-        self, q: FloatArray, constraint_force: FloatArray, parameters: FloatArray
-    ) -> tuple[FloatArray, float]:
-        """The state at rest, and the largest entry of the balance that is left.
+        self, q: FloatArray, forces: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """The state at rest, lambda, and the largest entry of the equations that is left.
 
         Args:
             q: Positions, shape (nq,).
-            constraint_force: The entries of lambda that are given.
+            forces: The force outputs z_2, shape (k,).
             parameters: Values of all parameters.
         """
 
         def residual(unknown: FloatArray) -> FloatArray:
-            return self._function(q, constraint_force, unknown, parameters)[0]
+            return self._function(q, forces, unknown, parameters)[0]
 
         def linearize(unknown: FloatArray) -> Linearization | None:
-            balance, gradient = self._function(q, constraint_force, unknown, parameters)
+            balance, gradient, _ = self._function(q, forces, unknown, parameters)
             gradient = gradient.reshape(balance.size, -1)
             # Currents and forces differ by orders of magnitude.
             scale = np.maximum(np.linalg.norm(gradient, axis=0), np.finfo(float).tiny)
@@ -109,5 +118,13 @@ class Balance:
             return Linearization(lambda x: steps.step(x) / scale, steps.is_regular)
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
-        left = float(np.max(np.abs(residual(solution)), initial=0.0))
-        return np.concatenate([q, self._still, solution[: self._stages]]), left
+        left, _, constraint_force = self._function(q, forces, solution, parameters)
+        state = np.concatenate([q, self._still, solution[: self._stages]])
+        return state, constraint_force, float(np.max(np.abs(left), initial=0.0))
+
+
+def _unit_row(row: ca.SX) -> int | None:
+    """Where a row of the identity has its one; None of any other row."""
+    row = ca.sparsify(row)
+    place = row.sparsity().get_triplet()[1]
+    return place[0] if len(place) == 1 and row[place[0]].is_one() else None

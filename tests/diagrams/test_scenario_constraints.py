@@ -298,7 +298,7 @@ def test_a_cart_can_be_analyzed(tmp_path):
         ("wheels", ["constraints.1.name=left"], ["constraints.1.name: ", "name of its own"]),
         ("wheels", ["constraints.1.holds_side=true"], ["constraints: Assumption (2)"]),
         ("wheels", ["forces=null"], ["outputs: ", "3 constraint forces", "in `forces`"]),
-        ("wheels", ["forces=[left]"], ["forces: ", "'left'", "there are left.traction"]),
+        ("wheels", ["forces=[left]"], ["forces.0: ", "'left'", "there are left.traction"]),
         ("wheels", ["forces=left.traction"], ["forces: expected", "got 'left.traction'"]),
         (
             "ball",

@@ -43,21 +43,16 @@ class ConstraintSet:
         """The parameters of all constraints."""
         return tuple(p for c in self.constraints for p in c.parameters)
 
-    def places(self, forces: Sequence[str] | None) -> tuple[int, ...]:
-        """Where constraint forces stand, by their names; of all if None.
+    def place(self, name: str) -> int:
+        """Where the constraint force with a name stands in lambda.
 
         Raises:
-            ModelError: There is no such force, or one is named twice.
+            ModelError: There is no such force.
         """
         names = [signal.name for signal in self.force_signals]
-        if forces is None:
-            return tuple(range(len(names)))
-        for name in forces:
-            if name not in names:
-                raise ModelError(unknown_name("constraint force", name, names))
-        if len(set(forces)) < len(forces):
-            raise ModelError(f"a constraint force is named twice: {', '.join(forces)}")
-        return tuple(names.index(name) for name in forces)
+        if name not in names:
+            raise ModelError(unknown_name("constraint force", name, names))
+        return names.index(name)
 
     def parts(self) -> Iterator[tuple[Constraint, slice]]:
         """Each constraint, and where its constraint forces stand."""
@@ -91,6 +86,39 @@ class ConstraintSet:
         for constraint, part in self.parts():
             total += constraint.reaction(kinematics, constraint_force[part])
         return total
+
+    def force_on(
+        self, frame: str, name: str, kinematics: Kinematics, constraint_force: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Where a constraint pushes on a frame, and its force on that frame, both in the world.
+
+        Args:
+            frame: The name of the frame.
+            name: The name of the constraint.
+            kinematics: What the constraints are written in.
+            constraint_force: lambda, shape (m, 1).
+
+        Returns:
+            The point in m and the force in N, shapes (3, 1).
+
+        Raises:
+            ModelError: There is no such constraint, or it does not act on the frame at one point.
+        """
+        parts = {constraint.name: (constraint, part) for constraint, part in self.parts()}
+        if name not in parts:
+            raise ModelError(unknown_name("constraint", name, parts))
+        constraint, part = parts[name]
+        acting = constraint.applications(kinematics)
+        found = [a for a in acting if frame in (a.frame_a, a.frame_b)]
+        if len(found) != 1:
+            frames = ", ".join(dict.fromkeys(f for a in acting for f in (a.frame_a, a.frame_b)))
+            where = "at several points of" if found else "not on"
+            raise ModelError(
+                f"constraint '{name}' acts {where} '{frame}', but on it at one point is needed; "
+                f"it acts on {frames or 'no frame that is known'}"
+            )
+        sign = 1.0 if frame == found[0].frame_b else -1.0
+        return found[0].point, sign * ca.mtimes(found[0].force_axes, constraint_force[part])
 
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX

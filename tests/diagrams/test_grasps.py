@@ -1,0 +1,334 @@
+"""Scenarios whose outputs are internal forces, against MultibodyPlant and pencil and paper.
+
+The truth is [[M, -J^T], [J, 0]] (v', lambda) = (tau - H, -Jdot v) with M, H and J of Drake, and the
+errors (d/dt + w)^mu e = 0 of poles -w from a start at rest, solved by hand.
+"""
+
+from functools import cache
+from math import comb, factorial
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pydrake.multibody.tree import JacobianWrtVariable
+from recordings import animation
+from runs import run_scenario, scenario
+
+from drake_dae import build_scenario, make_animation
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.errors import ScenarioError
+
+HOURS = 120.0 * np.pi / 180.0 * np.arange(3)
+CORNERS = 0.035 * np.column_stack([np.cos(HOURS), np.sin(HOURS), np.zeros(3)])
+"""Where the fingers hold the puck, in its axes, m."""
+
+
+@cache
+def run(name, *settings):
+    return run_scenario(scenario(name, *settings))
+
+
+def drake(plant, q, v, contacts):
+    """M, C v - g, and J and Jdot v of contacts: (frame, point), another one or None, and rows."""
+    context, world = plant.CreateDefaultContext(), plant.world_frame()
+    plant.SetPositions(context, q)
+    plant.SetVelocities(context, v)
+    jacobian, bias = [], []
+    for (frame, point), other, rows in contacts:
+        total, own = 0.0, 0.0
+        for sign, part in ((1.0, (frame, point)), (-1.0, other)):
+            if part is not None:
+                where = context, JacobianWrtVariable.kV, part[0], np.array(part[1]), world, world
+                total = total + sign * plant.CalcJacobianTranslationalVelocity(*where)
+                own = own + sign * plant.CalcBiasTranslationalAcceleration(*where)[:, 0]
+        jacobian.append(total[rows])
+        bias.append(own[rows])
+    force = plant.CalcBiasTerm(context) - plant.CalcGravityGeneralizedForces(context)
+    return plant.CalcMassMatrix(context), force, np.vstack(jacobian), np.concatenate(bias), context
+
+
+def motion(mass, force, jacobian, bias, torque):
+    """(v', lambda)."""
+    m = len(bias)
+    matrix = np.block([[mass, -jacobian.T], [jacobian, np.zeros((m, m))]])
+    return np.split(np.linalg.solve(matrix, [*(torque - force), *-bias]), [len(mass)])
+
+
+def sinusoid(reference, time, order=0):
+    """The derivative of a shipped reference, by hand."""
+    amplitude, frequency = np.array(reference.amplitudes), np.array(reference.frequencies)
+    phases = np.zeros_like(amplitude) if reference.phases is None else np.array(reference.phases)
+    angle = np.outer(time, frequency) + phases + order * np.pi / 2
+    return np.sin(angle) @ (amplitude * frequency**order) + (reference.offset if not order else 0.0)
+
+
+def decay(time, start, rate):
+    """e(t) of (d/dt + rate)^mu e = 0 with e, e', ..., e^(mu-1) at the start."""
+    total = np.zeros_like(time)
+    for k in range(len(start)):  # (e exp(rate t))^(k) at the start
+        grown = sum(comb(k, j) * rate ** (k - j) * start[j] for j in range(k + 1))
+        total += grown * time**k / factorial(k)
+    return total * np.exp(-rate * time)
+
+
+def at_rest(record, reference, index, degree, rate=6.0):
+    """The error of an output from a start where all its derivatives are zero."""
+    first = record["controlled_output"][0, index] - sinusoid(reference, [0.0])[0]
+    derivatives = [-sinusoid(reference, [0.0], order)[0] for order in range(1, degree)]
+    return decay(record.time, [first, *derivatives], rate)
+
+
+# Three fingers: 9 joints, 6 positions of the puck, 9 forces of which 3 are internal.
+
+
+def fingers(record, step):
+    """(v', lambda) by Drake, lambda of the fingers on the puck, and the pose of the puck."""
+    loop, _, _ = run("three_fingers", *FINE)
+    plant = loop.plant.model.links.plant
+    q, v = np.split(record["state"][step], 2)
+    puck = plant.GetFrameByName("object")
+    contacts = []
+    for number, corner in enumerate(CORNERS, 1):
+        tip = plant.GetFrameByName("tip", plant.GetModelInstanceByName(f"finger{number}"))
+        contacts.append(((puck, corner), (tip, (0, 0, 0)), [0, 1, 2]))
+    mass, force, jacobian, bias, context = drake(plant, q, v, contacts)
+    pose = puck.CalcPoseInWorld(context)
+
+    def solved(control):
+        torque = plant.MakeActuationMatrix() @ control
+        return motion(mass, force, jacobian, bias, torque)
+
+    return solved, pose, jacobian, v
+
+
+FINE = ("duration=1", "integrator.accuracy=1e-11")
+
+
+def grasp_map(pose):
+    """G of force and moment on the puck at its middle, from the three forces, shape (6, 9)."""
+    levers = CORNERS @ pose.rotation().matrix().T
+    crosses = [np.cross(lever, np.eye(3), axisb=0, axisc=0) for lever in levers]
+    return np.vstack([np.tile(np.eye(3), 3), np.hstack(crosses)]), levers
+
+
+def test_squeezes_lie_in_the_null_space_of_the_grasp_map():
+    """G S^T = 0, and they are all of it; round-off."""
+    model = scenario_model(scenario("three_fingers"))
+    evaluate = model.dae.trace("S", {"S": model.dae.m[6:, :]})
+    _, _, record = run("three_fingers", *FINE)
+    for step in np.random.default_rng(0).integers(len(record.time), size=5):
+        _, pose, _, _ = fingers(record, step)
+        S = evaluate(record["state"][step], model.dae.parameter_values)[0].reshape(3, 9)
+        G, _ = grasp_map(pose)
+        assert_allclose(G @ S.T, 0.0, atol=1e-12)
+        assert np.linalg.matrix_rank(S) == 9 - np.linalg.matrix_rank(G) == 3
+
+
+def test_forces_and_squeezes_of_the_fingers_are_those_of_drake():
+    """Round-off of systems of 24 equations, with forces of some N and 1e3 rad/s^2 for each N."""
+    _, _, record = run("three_fingers", *FINE)
+    for step in range(0, len(record.time), 20):
+        solved, pose, jacobian, v = fingers(record, step)
+        _, force = solved(record["control"][step])
+        assert_allclose(record["constraint_force"][step], force, atol=1e-9)
+        assert_allclose(jacobian @ v, 0.0, atol=1e-9)
+        _, levers = grasp_map(pose)
+        force = force.reshape(3, 3)
+        for column, (i, j) in enumerate([(0, 1), (1, 2), (2, 0)], 6):
+            along = (levers[j] - levers[i]) / np.linalg.norm(levers[j] - levers[i])
+            squeeze = along @ (force[i] - force[j]) / 2.0
+            assert record["controlled_output"][step, column] == pytest.approx(squeeze, abs=1e-9)
+            wanted = 2.0 + 0.5 * np.sin(3.0 * record.time[step])
+            assert squeeze == pytest.approx(wanted, abs=1e-9)
+
+
+def test_a_squeeze_moves_nothing():
+    """Other squeezes at one state: other forces, in the null space, and the same acceleration."""
+    loop, _, record = run("three_fingers", *FINE)
+    law, reference = loop.controller.law, record["reference"][50].copy()
+    solved, pose, _, _ = fingers(record, 50)
+    before = solved(law.control(record["state"][50], reference))
+    reference[-3:] += [0.7, -0.3, 0.4]
+    after = solved(law.control(record["state"][50], reference))
+    assert_allclose(after[0], before[0], atol=1e-8)  # Of up to 10 rad/s^2.
+    change = after[1] - before[1]
+    assert np.max(np.abs(change)) > 0.2
+    assert_allclose(grasp_map(pose)[0] @ change, 0.0, atol=1e-9)
+
+
+def test_the_puck_goes_where_it_shall_with_the_error_by_hand():
+    """An accuracy of 1e-11 in each of some 150 steps."""
+    chosen = scenario("three_fingers", *FINE)
+    _, _, record = run("three_fingers", *FINE)
+    for index in range(6):
+        error = record["tracking_error"][:, index]
+        assert_allclose(error, at_rest(record, chosen.references[index], index, 2), atol=1e-9)
+    assert np.abs(record["tracking_error"][0, :6]).max() > 0.09
+
+
+def test_fingers_press_and_could_hold_by_friction():
+    """Each presses along the inward normal, with a ratio of tangential force below 0.7."""
+    _, _, record = run("three_fingers", *FINE)
+    for step in range(len(record.time)):
+        _, pose, _, _ = fingers(record, step)
+        force = record["constraint_force"][step].reshape(3, 3)
+        inward = -grasp_map(pose)[1] / 0.035
+        normal = np.sum(force * inward, axis=1)
+        across = np.linalg.norm(force - normal[:, None] * inward, axis=1)
+        assert np.all(normal > 1.0)
+        assert np.all(across < 0.7 * normal)
+
+
+# A biped with flexible joints: 4 joints, 3 positions of the trunk, 4 forces, 1 of them internal.
+
+
+def test_forces_of_the_biped_are_those_of_drake():
+    """Of some 100 N, with shaft angles of the spring's torque: round-off of 1e-12 relative."""
+    loop, _, record = run("biped", "duration=2")
+    plant = loop.plant.model.links.plant
+    front, rear = (plant.GetFrameByName(f"{side}_foot") for side in ("front", "rear"))
+    feet = [((foot, (0, 0, 0)), None, [row]) for row in (2, 0) for foot in (front, rear)]
+    rotors = np.diag([0.0, 0.0, 0.0, *[2e-5 * 50.0**2] * 4])
+    for step in range(0, len(record.time), 50):
+        q, v, shafts = np.split(record["state"][step], [7, 14])
+        mass, force, jacobian, bias, _ = drake(plant, q, v, feet)
+        torque = np.array([0.0, 0.0, 0.0, *2000.0 * (shafts[:4] - q[3:])])
+        _, found = motion(mass - rotors, force, jacobian, bias, torque)
+        assert_allclose(record["constraint_force"][step], found, atol=1e-9)
+        assert_allclose(record["controlled_output"][step, 3], (found[2] - found[3]) / 2, atol=1e-9)
+        assert_allclose(jacobian @ v, 0.0, atol=1e-9)
+
+
+def test_the_biped_follows_with_the_error_by_hand():
+    """Degrees 4, 4, 4 and 2; steps of 4 ms leave less than 1e-9."""
+    loop, _, record = run("biped", "duration=2")
+    assert loop.controller.law.degrees == (4, 4, 4, 2)
+    chosen = scenario("biped")
+    for index, degree in enumerate((4, 4, 4, 2)):
+        error = record["tracking_error"][:, index]
+        assert_allclose(error, at_rest(record, chosen.references[index], index, degree), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_feet_press_the_floor_and_could_stand_by_friction():
+    _, _, record = run("biped")
+    normal, across = np.split(record["constraint_force"], 2, axis=1)
+    assert np.min(normal) > 50.0
+    assert np.max(np.abs(across) / normal) < 0.5
+    # The weight goes from one foot to the other.
+    assert np.ptp(normal[:, 0] / normal.sum(axis=1)) > 0.3
+
+
+# Two arms with a free box: 14 joints, 6 positions of the box and 2 elbows, 12 forces, 6 internal.
+
+
+@pytest.mark.slow
+def test_forces_of_two_arms_on_a_free_box_are_those_of_drake():
+    """Round-off of systems of 32 equations with forces of 60 N and torques of 100 N m."""
+    loop, _, record = run("two_arms_free_box", *FINE)
+    plant = loop.plant.model.links.plant
+    context, box = plant.CreateDefaultContext(), plant.GetFrameByName("object")
+    arms = [plant.GetModelInstanceByName(side) for side in ("left", "right")]
+    for step in range(0, len(record.time), 10):
+        q, v = np.split(record["state"][step], 2)
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        jacobian, bias = [], []
+        for arm in arms:  # How the tool moves in the box, in the box's axes.
+            moving = plant.GetFrameByName("tool", arm), np.zeros(3), box, box
+            kind = JacobianWrtVariable.kV
+            own = plant.CalcJacobianSpatialVelocity(context, kind, *moving)
+            rate = plant.CalcBiasSpatialAcceleration(context, kind, *moving).get_coeffs()
+            jacobian.append(np.roll(own, 3, axis=0))
+            bias.append(np.roll(rate, 3))
+        jacobian, bias = np.vstack(jacobian), np.concatenate(bias)
+        force = plant.CalcBiasTerm(context) - plant.CalcGravityGeneralizedForces(context)
+        torque = plant.MakeActuationMatrix() @ record["control"][step]
+        _, found = motion(plant.CalcMassMatrix(context), force, jacobian, bias, torque)
+        assert_allclose(record["constraint_force"][step], found, atol=1e-9)
+        left, right = -found.reshape(2, 6)  # What the arms do to the box.
+        internal = (left - right) / 2.0
+        assert_allclose(record["controlled_output"][step, 8:], internal, atol=1e-9)
+        assert left[0] > 10.0 > -10.0 > right[0]  # Both press.
+
+
+@pytest.mark.slow
+def test_two_arms_carry_a_free_box_with_the_error_by_hand():
+    chosen = scenario("two_arms_free_box", *FINE)
+    _, _, record = run("two_arms_free_box", *FINE)
+    for index in (0, 1, 2):
+        error = record["tracking_error"][:, index]
+        wanted = at_rest(record, chosen.references[index], index, 2, rate=4.0)
+        assert_allclose(error, wanted, atol=1e-9)
+    assert_allclose(record["tracking_error"][:, 8:], 0.0, atol=1e-9)  # Met at once.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "body"),
+    [("three_fingers", "object"), ("biped", "trunk"), ("two_arms_free_box", "object")],
+)
+def test_what_is_free_moves_in_the_animation(name, body):
+    loop, context, record = run_scenario(scenario(name, "duration=0.5"))
+    found = animation(make_animation(loop, record, context))
+    (path,) = {path for path, what in found if path.endswith(f"/{body}")}
+    place = found[path, "position"]
+    plant = loop.plant.model.links.plant
+    own, frame = plant.CreateDefaultContext(), plant.GetFrameByName(body)
+    for time, value in zip(place.times, place.values, strict=True):
+        state = [np.interp(time, record.time, column) for column in record["state"].T]
+        plant.SetPositions(own, state[: plant.num_positions()])
+        wanted = frame.CalcPoseInWorld(own).translation()
+        assert_allclose(value, wanted, atol=1e-3)  # Between steps.
+
+
+# What does not fit.
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "words"),
+    [
+        ("three_fingers", "robot.free=[]", ["robot.file: ", "body 'object' is free", "robot.free"]),
+        ("three_fingers", "robot.free=[objct]", ["robot.free: 'objct' is no body that can"]),
+        ("three_fingers", "robot.free=[world]", ["robot.free: 'world' is no body that can"]),
+        ("biped", "robot.free=[trunk]", ["robot.free: 'trunk' is not free: joint 'pitch'"]),
+        ("three_fingers", "robot.free=object", ["robot.free: expected a list, got 'object'"]),
+        ("three_fingers", "forces.0.first=grip", ["forces.0: no constraint 'grip'; did you mean"]),
+        ("three_fingers", "forces.1.frame=obj", ["forces.1: constraint 'grip2' acts not on 'obj'"]),
+        ("three_fingers", "forces.1.second=grip2", ["forces.1: a squeeze is between two"]),
+        ("three_fingers", "forces.1.third=grip2", ["forces.1: !Squeeze has no key 'third'"]),
+        (
+            "three_fingers",
+            "forces.2=!Squeeze {frame: object}",
+            ["forces.2: !Squeeze needs", "'first'"],
+        ),
+        (
+            "three_fingers",
+            "forces.2=!Squeze {}",
+            ["forces.2: expected ", "!Squeeze", "got !Squeze"],
+        ),
+        ("three_fingers", "forces.2=3", ["forces.2: expected text or one of", "got 3"]),
+        (
+            "three_fingers",  # What moves the puck, too.
+            "forces.2=!ForceCombination {name: a, weights: {grip1.fx: 1, grip2.fx: 1, "
+            "grip3.fx: 1}}",
+            ["outputs: Assumption (5)", "object_x", "cannot be steered independently"],
+        ),
+        ("biped", "forces.0=!ForceCombination {weights: {}, name: a}", ["forces.0: 'a' needs"]),
+        (
+            "biped",
+            "forces.0=!ForceCombination {weights: {front.forc: 1}, name: a}",
+            ["forces.0: no constraint force 'front.forc'; did you mean 'front.force'?"],
+        ),
+        (
+            "biped",
+            "forces.0=!ForceCombination {weights: {front.force: a}, name: a}",
+            ["forces.0.weights.front.force: expected a number, got 'a'"],
+        ),
+    ],
+)
+def test_what_does_not_fit_is_told_with_its_key(name, setting, words):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(scenario(name, setting))
+    message = str(caught.value)
+    assert [word for word in words if word not in message] == [], message

@@ -1,0 +1,154 @@
+"""The rules of `ForceOutput`, on every member: on the puck that three fingers hold."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from members import Pull, subclasses
+from runs import scenario
+
+from drake_dae import (
+    CoincidentPoints,
+    ForceCombination,
+    ForceOutput,
+    JointCoupler,
+    NamedForce,
+    RobotModel,
+    Signal,
+    Squeeze,
+)
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.errors import ModelError
+from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.force_outputs import force_outputs, force_rows
+from drake_dae.trace.functions import TracedFunction
+
+MEMBERS = {
+    "name": NamedForce("grip2.fz"),
+    "combination": ForceCombination({"grip1.fz": 0.5, "grip3.fz": -0.5}, "share"),
+    "squeeze": Squeeze("object", "grip1", "grip2"),
+    "squeeze of the fingers": Squeeze("finger1::tip", "grip1", "other", name="pinch"),
+    "own": Pull("object", "grip3", (0.6, 0.0, 0.8)),
+}
+
+
+@cache
+def robot() -> RobotModel:
+    return scenario_model(scenario("three_fingers"))
+
+
+def bound() -> ConstraintSet:
+    coupler = JointCoupler("finger1::joint3", "finger1::joint2", name="gear")
+    tip = CoincidentPoints("finger1::tip", (0, 0, -0.02), "world", (0, 0, 0), name="other")
+    return ConstraintSet([*robot().constraints, tip, coupler])
+
+
+@pytest.fixture(params=MEMBERS)
+def output(request):
+    return MEMBERS[request.param]
+
+
+def rows(output: ForceOutput, q: np.ndarray) -> np.ndarray:
+    links, constraints = robot().links, bound()
+    S = force_rows([output], constraints, links)
+    parameters = robot().dae.parameter_symbol
+    function = TracedFunction("rows", {"q": links.q, "p": parameters}, {"S": S})
+    return function(q, robot().dae.parameter_values)[0].reshape(-1, constraints.size)
+
+
+def test_no_member_is_left_out():
+    assert subclasses(ForceOutput) <= {type(output) for output in MEMBERS.values()}
+
+
+def test_rows_are_as_many_as_names(output):
+    names = [signal.name for signal in output.signals(bound())]
+    q = np.random.default_rng(0).uniform(-0.5, 0.5, robot().links.q.numel())
+    S = rows(output, q)
+    assert len(set(names)) == len(names) == len(S) > 0
+    assert np.linalg.matrix_rank(S) == len(S)
+
+
+def test_rows_are_functions_of_positions_alone(output):
+    S = force_rows([output], bound(), robot().links)
+    assert not ca.depends_on(S, robot().links.v)
+
+
+def test_rows_of_names_and_combinations_are_their_weights():
+    q = np.zeros(robot().links.q.numel())
+    expected = np.zeros((1, bound().size))
+    expected[0, [2, 8]] = 0.5, -0.5
+    np.testing.assert_array_equal(rows(MEMBERS["combination"], q), expected)
+    np.testing.assert_array_equal(rows(MEMBERS["name"], q), np.eye(bound().size)[[5]])
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        (NamedForce("grip2.f"), r"no constraint force 'grip2.f'; did you mean 'grip2.f"),
+        (ForceCombination({"grip2.f": 1.0}, "a"), r"no constraint force 'grip2.f'; did you mean"),
+        (Squeeze("object", "grip1", "grip4"), r"no constraint 'grip4'; did you mean 'grip"),
+        (
+            Squeeze("finger1::tip", "grip1", "grip2"),
+            r"'grip2' acts not on 'finger1::tip', .*; it acts on finger2::tip, object",
+        ),
+        (Pull("object", "grip", (1, 0, 0)), r"no constraint 'grip'; did you mean 'grip"),
+    ],
+)
+def test_what_is_unknown_is_named(output, message):
+    with pytest.raises(ModelError, match=message):
+        force_rows([output], bound(), robot().links)
+
+
+@dataclass(frozen=True)
+class Pressed(ForceOutput):
+    """No member: it is not linear."""
+
+    shift: float = 0.0
+
+    def expression(self, constraints, kinematics, constraint_force):
+        return constraint_force[0] + self.shift if self.shift else constraint_force[0] ** 2
+
+    def signals(self, constraints):
+        return (Signal("pressed", "N"),)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Squeeze("object", "grip1", "grip1"), "between two constraints, both are 'grip1'"),
+        (lambda: ForceCombination({}, "none"), "'none' needs at least one weight"),
+        (lambda: ForceCombination({"a": 0.0}, "none"), "'none' needs at least one weight"),
+        (
+            lambda: ForceCombination({"grip1.fx": 1.0, "gear.moment": 1.0}, "a").signals(bound()),
+            "'a' adds what has different units: N, N m",
+        ),
+        (lambda: force_outputs(["grip1.fx", "grip1.fx"], bound()), "twice: grip1.fx"),
+        (
+            lambda: force_outputs([Squeeze("object", "grip1", "grip2")] * 2, bound()),
+            r"twice: grip1\.grip2\.squeeze",
+        ),
+        (lambda: force_rows([Pressed()], bound(), robot().links), "pressed is not linear"),
+        (lambda: force_rows([Pressed(2.0)], bound(), robot().links), "pressed is not linear"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(make, message):
+    with pytest.raises(ModelError, match=message):
+        make()
+
+
+def test_at_rest_all_forces_follow_from_the_outputs():
+    """Three fingers at rest: the forces on the puck carry it, and their squeezes are as given.
+
+    Newton's method leaves 1e-10 of forces of 2 N.
+    """
+    model = robot()
+    guess = np.tile([0.0, -0.205, 1.228], 3)
+    q = model.configuration([0, 0, 0.15, 0, 0, 0], [*guess, 0, 0, 0, 0, 0, 0.15])
+    forces = model.rest_forces(q, [2.0, 2.1, 2.2]).reshape(3, 3)
+    np.testing.assert_allclose(forces.sum(axis=0), [0.0, 0.0, 0.2 * 9.81], atol=1e-9)
+    corners = np.array([[1.0, 0.0], [-0.5, np.sqrt(0.75)], [-0.5, -np.sqrt(0.75)]])
+    for (i, j), wanted in {(0, 1): 2.0, (1, 2): 2.1, (2, 0): 2.2}.items():
+        along = (corners[j] - corners[i]) / np.sqrt(3.0)
+        assert along @ (forces[i] - forces[j])[:2] / 2 == pytest.approx(wanted, abs=1e-9)
