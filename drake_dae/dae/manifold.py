@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.layout import Layout
+from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import (
@@ -48,6 +48,7 @@ class Manifold:
         layout = Layout(tuple(len(chain) for chain in chains))
         self.residual_signals = layout.chain_signals(system.constraint_output_signals)
         gradient = ca.jacobian(residual, system.state)
+        self._levels = _levels(layout, gradient)
         self._residual = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
         # The Newton step of least norm from a state, by the gradients at another one: from
@@ -121,6 +122,50 @@ class Manifold:
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
 
+    def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """The consistent state next to a given one, level by level: for a start that someone gave.
+
+        The constraints are met first, by the states that they depend on; then their derivatives, by
+        the states that are new in them, and so on: positions first, then velocities, so that no
+        velocity moves a position. Where that leads nowhere it is `project`.
+
+        Args:
+            state: A state near N*, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            The consistent state, shape (n,).
+
+        Raises:
+            InconsistentStateError: Newton's method does not reach N* from there.
+            ModelError: The state has a wrong shape.
+        """
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        found = start.copy()
+        for rows, columns in self._levels:
+            if not self._settle_level(found, rows, columns, p):
+                return self.project(start, p)
+        return self.project(found, p)
+
+    def _settle_level(
+        self, state: FloatArray, rows: Indices, columns: Indices, parameters: FloatArray
+    ) -> bool:
+        """Moves some states so that some rows of the residual vanish, and says whether they do."""
+
+        def filled(values: FloatArray) -> FloatArray:
+            x = state.copy()
+            x[columns] = values
+            return x
+
+        def linearize(values: FloatArray) -> Linearization | None:
+            gradients = self.gradients(filled(values), parameters)[np.ix_(rows, columns)]
+            return shortest_steps(
+                gradients, lambda x: self._residual(filled(x), parameters)[0][rows]
+            )
+
+        state[columns], converged = newton(state[columns], linearize)
+        return converged
+
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""
         x = numbers(f"{self.system.name}: a state", state).reshape(-1)
@@ -175,3 +220,18 @@ class Manifold:
                 "contradict each other, or start away from this state"
             )
         return left + "Start nearer to the constraint, away from its singular states"
+
+
+def _levels(layout: Layout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
+    """The rows of each order of derivatives, and the states that are new in them."""
+    used = np.zeros(gradient.shape, dtype=bool)
+    rows, columns = gradient.sparsity().get_triplet()
+    used[rows, columns] = True
+    known = np.zeros(gradient.shape[1], dtype=bool)
+    levels = []
+    for order in range(max(layout.degrees, default=0)):
+        own = np.flatnonzero(layout.orders == order)
+        new = used[own].any(axis=0) & ~known
+        known |= new
+        levels.append((own, np.flatnonzero(new)))
+    return levels

@@ -153,7 +153,7 @@ class DaePlant(ParameterizedSystem):
             InconsistentStateError: None is found near the guess.
         """
         self.check_context(context)
-        state = self.structure.manifold.project(guess, self._values(context))
+        state = self.structure.manifold.settle(guess, self._values(context))
         self.set_state(context, state)
         return state
 

@@ -234,3 +234,33 @@ def test_projection_in_mixed_units_reaches_the_manifold():
             left = manifold.residual(manifold.project(start))
             # CONSISTENT, where the search ends without another proof.
             np.testing.assert_allclose(left, 0.0, atol=1e-8)
+
+
+def test_a_given_start_is_settled_level_by_level():
+    """A fast pendulum whose velocity is 1e-6 off: the position that was right stays as it is.
+
+    The velocity loses its part along the rod, as it would by hand. A joint step of least norm moves
+    the position by some 1e-9 instead, since the velocity is large.
+    """
+    manifold = find_structure(pendulum().system).manifold
+    x = manifold.project([0.6, 0.8, 120.0, -90.0])
+    wrong = x + np.array([0.0, 0.0, 1e-6, 0.0])
+    found = manifold.settle(wrong)
+    np.testing.assert_array_equal(found[:2], wrong[:2])
+    along = wrong[:2] / np.linalg.norm(wrong[:2])
+    np.testing.assert_allclose(
+        found[2:], wrong[2:] - along * (along @ wrong[2:]), rtol=0, atol=1e-13
+    )
+    assert np.abs(manifold.project(wrong)[:2] - wrong[:2]).max() > 1e-10
+    assert np.max(np.abs(manifold.residual(found))) < 1e-13
+
+
+def test_settling_reaches_the_manifold(problem):
+    """As projection does, also where a level has no states of its own."""
+    structure = find_structure(problem.system)
+    random = np.random.default_rng(3)
+    for state in structure.states[:4]:
+        start = state + 1e-3 * structure.scale * random.standard_normal(state.size)
+        found = structure.manifold.settle(start)
+        assert structure.manifold.is_consistent(found)
+        assert np.max(np.abs(found - start) / structure.scale, initial=0.0) < 0.1
