@@ -147,7 +147,7 @@ def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference
     """
     moving: list[Reference] = []
     degrees = list(law.exogenous_degrees)
-    for parameter in law.system.exogenous:
+    for parameter in law.system.exogenous.moving:
         key, references = f"exogenous.{parameter.name}", scenario.exogenous[parameter.name]
         size = sum(reference.size for reference in references)
         if size != parameter.value.size:

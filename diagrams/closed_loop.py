@@ -172,7 +172,7 @@ def make_closed_loop(
     if law.measured_force and sensor is not None:
         named["measured_force"] = (sensor, dae.constraint_input_signals)
     if moving[0] is not None:
-        signals = plant.exogenous_layout.reference_signals(dae.exogenous_signals)
+        signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         builder.ExportOutput(moving[0].get_output_port(), "exogenous")
         sink = LogVectorOutput(moving[0].get_output_port(), builder, {TriggerType.kPerStep})
         loggers["exogenous"] = (sink, signals)
@@ -214,7 +214,7 @@ def _add_exogenous(
     Raises:
         WiringError: The references are not as many as the signals.
     """
-    names = [signal.name for signal in block.dae.exogenous_signals]
+    names = [signal.name for signal in block.dae.exogenous.signals]
     size = sum(reference.size for reference in exogenous)
     if exogenous and size != len(names):
         raise WiringError(

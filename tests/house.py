@@ -39,6 +39,7 @@ WITHOUT_DRAKE = ("errors", "arrays", "arguments", "trace", "dae", "analysis")
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
     "signals",
+    "exogenous",
     "expressions",
     "system",
     "layout",

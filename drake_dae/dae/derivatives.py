@@ -186,7 +186,7 @@ class Derivatives:
         balance -= ca.mtimes(system.g, self.constraint_input)
         constraint_rate = ca.jtimes(constraint, system.state, rate)
         if system.exogenous:
-            constraint_rate += system.exogenous_rate(constraint)
+            constraint_rate += system.exogenous.rate(constraint)
         if system.implicit is None:
             return balance, constraint_rate
         shorter = ca.vertcat(*system.implicit(rate, self.constraint_input))
@@ -208,7 +208,7 @@ class Derivatives:
     def _total_derivative(self, expression: ca.SX) -> ca.SX:
         moving = self._symbols[: len(self._rates)]
         rate = ca.jtimes(expression, ca.vertcat(*moving), ca.densify(ca.vertcat(*self._rates)))
-        return rate + self.system.exogenous_rate(expression) if self.system.exogenous else rate
+        return rate + self.system.exogenous.rate(expression) if self.system.exogenous else rate
 
     def _add_order(self) -> None:
         following = self._next_unknown()

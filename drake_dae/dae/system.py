@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
+from drake_dae.dae.exogenous import Exogenous
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
@@ -243,7 +244,7 @@ class DaeSystem:
     @cached_property
     def parameter_symbol(self) -> ca.SX:
         """The symbols of all parameters, below each other; then w', w'', ... of those that move."""
-        rates = [rate for p in self.exogenous for rate in p.derivatives]
+        rates = [rate for p in self.exogenous.moving for rate in p.derivatives]
         return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters], *rates)
 
     @property
@@ -256,10 +257,10 @@ class DaeSystem:
         values = np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
         return np.pad(values, (0, self.parameter_symbol.numel() - values.size))
 
-    @property
-    def exogenous(self) -> tuple[Parameter, ...]:
-        """The parameters that move, w."""
-        return tuple(p for p in self.parameters if p.exogenous)
+    @cached_property
+    def exogenous(self) -> Exogenous:
+        """The parameters that move, w, and how they enter time derivatives."""
+        return Exogenous(self.name, self.parameters)
 
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """The same system, some of whose parameters move.
@@ -273,54 +274,6 @@ class DaeSystem:
                 raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
         changed = [replace(p, exogenous=True) if p.name in names else p for p in self.parameters]
         return replace(self, parameters=tuple(changed))
-
-    @property
-    def exogenous_signals(self) -> tuple[Signal, ...]:
-        """Names and units of the entries of w."""
-        return tuple(signal for p in self.exogenous for signal in p.signals)
-
-    def exogenous_rate(self, expression: ca.SX) -> ca.SX:
-        """The part sum_j (d/dw^(j)) w^(j+1) of the time derivative of an expression, shape (k, 1).
-
-        Raises:
-            ModelError: The expression needs more derivatives of w than there are.
-        """
-        rate = ca.SX(expression.numel(), 1)
-        for p in self.exogenous:
-            known = (p.symbol, *p.derivatives)
-            if ca.depends_on(expression, known[-1]):
-                raise ModelError(
-                    f"{self.name}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
-                    "needed"
-                )
-            rate += ca.jtimes(expression, ca.vertcat(*known[:-1]), ca.vertcat(*known[1:]))
-        return rate
-
-    def exogenous_degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
-        """How many derivatives of each entry of w some expressions depend on."""
-        every = ca.veccat(*expressions)
-        degrees: list[int] = []
-        for p in self.exogenous:
-            for i in range(p.value.size):
-                orders = [k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])]
-                degrees.append(max(orders, default=0))
-        return tuple(degrees)
-
-    def exogenous_places(self, degrees: Sequence[int]) -> list[int]:
-        """Where W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) stands in `parameter_symbol`.
-
-        Args:
-            degrees: d_1, d_2, ..., one for each entry of w.
-        """
-        following = sum(p.value.size for p in self.parameters)
-        places, left = [], iter(degrees)
-        for p in self.exogenous:
-            size, first = p.value.size, self.parameter_slice(p.name).start
-            for i in range(size):
-                rates = range(next(left))
-                places += [first + i, *(following + order * size + i for order in rates)]
-            following += size * len(p.derivatives)
-        return places
 
     @property
     def nominal_spread(self) -> FloatArray:

@@ -91,7 +91,7 @@ class TrackingLaw:
         # By the model; what the control reaches at once is as wanted.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
-        self.exogenous_degrees = self.system.exogenous_degrees(control, output)
+        self.exogenous_degrees = self.system.exogenous.degrees(control, output)
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         return TracedFunction(
             f"{self.system.name} tracking law",

@@ -234,7 +234,7 @@ class RobotModel:
 
     def _check_exogenous(self) -> None:
         """Refuses to move what restricts velocities alone: its own rate would lack a part."""
-        moving = {p.name for p in self.dae.exogenous}
+        moving = {p.name for p in self.dae.exogenous.moving}
         for constraint in self.constraints:
             names = [p.name for p in constraint.parameters if p.name in moving]
             rows = constraint.residual(self.links).numel()

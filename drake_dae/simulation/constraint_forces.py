@@ -147,7 +147,7 @@ class ForceArrows:
             time: The time in a recording, s.
         """
         dae = self._model.dae
-        moving = {p.name for p in dae.exogenous}
+        moving = {p.name for p in dae.exogenous.moving}
         for constraint in self._model.constraints:
             if not moving.isdisjoint(p.name for p in constraint.parameters):
                 stands = constraint.placement(own_values(constraint, dae, parameters))

@@ -12,11 +12,8 @@ from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, NonMinimumPhaseWarning
-from drake_dae.systems.block import (
-    Formula,
-    ParameterizedSystem,
-    TracedFormula,
-)
+from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 
 

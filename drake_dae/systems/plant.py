@@ -16,11 +16,8 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
-from drake_dae.systems.block import (
-    Formula,
-    ParameterizedSystem,
-    TracedFormula,
-)
+from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
@@ -104,7 +101,7 @@ class DaePlant(ParameterizedSystem):
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
         residual = structure.manifold.residual_expression
-        degrees = system.exogenous_degrees(rate, force, output, residual)
+        degrees = system.exogenous.degrees(rate, force, output, residual)
         by_state = self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
         self.DeclareVectorOutputPort(

@@ -16,7 +16,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
-from drake_dae.systems.block import Formula, ParameterizedSystem
+from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
@@ -80,7 +81,7 @@ class StateRealization(ParameterizedSystem):
         if normal_form.completion.numel():
             moving = derivatives.expand(derivatives.rate)
             rate = ca.jtimes(normal_form.completion, dae.state, moving)
-            rate += dae.exogenous_rate(normal_form.completion)
+            rate += dae.exogenous.rate(normal_form.completion)
         rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
         force = derivatives.expand(derivatives.constraint_input)
         self._force_needs_control = elimination.beta.nnz() > 0
@@ -94,7 +95,7 @@ class StateRealization(ParameterizedSystem):
         self.DeclareContinuousState(coordinates)
         self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
         chain = ca.vertcat(structure.manifold.residual_expression, structure.chain)
-        degrees = dae.exogenous_degrees(rates, force, direct, chain, normal_form.completion)
+        degrees = dae.exogenous.degrees(rates, force, direct, chain, normal_form.completion)
         by_state = state_tickets(self) | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
         # x, and where Newton's method starts: Drake hands the value before to the calculation.

@@ -13,7 +13,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.systems.block import DifferentiableSystem, Formula
+from drake_dae.systems.block import DifferentiableSystem
+from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 
 

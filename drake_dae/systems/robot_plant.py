@@ -8,7 +8,7 @@ from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.block import Formula, TracedFormula
+from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.trials import state_tickets

@@ -8,7 +8,8 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.errors import ModelError, NonFiniteError
-from drake_dae.systems.block import DifferentiableSystem, Formula, TracedFormula
+from drake_dae.systems.block import DifferentiableSystem
+from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import StepWatch, state_tickets
 from drake_dae.trace.functions import TracedFunction

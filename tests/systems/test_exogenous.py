@@ -82,9 +82,9 @@ def test_the_multiplier_is_that_of_the_moving_constraint():
     assert (structure.constraint_degrees, structure.output_degrees) == ((2,), (2, 0))
     values = system.parameter_values
     w, rate, acceleration = 1.3, -0.4, 0.7
-    degrees = system.exogenous_degrees(structure.elimination.alpha)
+    degrees = system.exogenous.degrees(structure.elimination.alpha)
     assert degrees == (2,)
-    values[system.exogenous_places(degrees)] = w, rate, acceleration
+    values[system.exogenous.places(degrees)] = w, rate, acceleration
     x = structure.manifold.project([0.5, -1.2, 0.3, 0.4], values)
     position, velocity = x[:2], x[2:]
     assert_allclose(position @ position, w**2, rtol=1e-14)
@@ -197,7 +197,7 @@ def test_the_realization_moves_as_the_plant():
     system = rod()
     structure = find_structure(system)
     values = system.parameter_values
-    values[system.exogenous_places([2])] = length(0.0)
+    values[system.exogenous.places([2])] = length(0.0)
     start = structure.manifold.project([0.4, -0.9, 0.0, 0.0], values)
     ends = []
     for block in (
@@ -217,7 +217,7 @@ def test_the_linear_model_knows_what_moves():
     system = rod(l=None, m=None)  # A law is not needed.
     structure = find_constraint_structure(system)
     values = system.parameter_values
-    values[system.exogenous_places([2])] = 1.3, -0.4, 0.7
+    values[system.exogenous.places([2])] = 1.3, -0.4, 0.7
     x, u = structure.manifold.project([0.5, -1.2, 0.3, 0.4], values), np.array([2.0, -3.0])
     found = linearize(system, x, u, structure=structure, parameters=values)
     plant = DaePlant(system, structure=structure)

@@ -174,7 +174,7 @@ class _Plant:
     def _carried(self) -> ca.SX:
         """c_t, shape (m, 1)."""
         ends = Layout(self.structure.constraint_degrees).ends.tolist()
-        return self.system.exogenous_rate(self.structure.manifold.residual_expression[ends, :])
+        return self.system.exogenous.rate(self.structure.manifold.residual_expression[ends, :])
 
     @cached_property
     def _symbols(self) -> dict[str, ca.SX]:

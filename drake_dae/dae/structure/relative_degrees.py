@@ -75,7 +75,7 @@ def constraint_chains(
         for i in still:
             following = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
-                following += system.exogenous_rate(chains[i][-1])
+                following += system.exogenous.rate(chains[i][-1])
             chains[i].append(following)
         undecided = still
     return chains

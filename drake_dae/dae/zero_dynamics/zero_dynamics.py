@@ -294,14 +294,14 @@ class ZeroDynamics:
         structure, system = self.structure, self.system
         residual, v = structure.manifold.residual_expression, structure.elimination.alpha
         matrices = (structure.control_matrix, structure.elimination.constraint_matrix)
-        degrees = system.exogenous_degrees(residual, structure.chain, structure.drift, v, *matrices)
+        degrees = system.exogenous.degrees(residual, structure.chain, structure.drift, v, *matrices)
         given = sum(reference.size for reference in exogenous)
         if given != len(degrees):
             raise ModelError(
                 f"{system.name}: exogenous covers {given} signals, the system has {len(degrees)}"
             )
         signals = references.stack_references(exogenous, degrees)
-        places = system.exogenous_places(degrees)
+        places = system.exogenous.places(degrees)
 
         def at(time: float) -> FloatArray:
             values = parameters.copy()
