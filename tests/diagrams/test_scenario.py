@@ -855,7 +855,7 @@ def test_all_problems_are_told_at_once():
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(ScenarioError, match="no scenario file 'nowhere'; there are .*five_bar,"):
+    with pytest.raises(ScenarioError, match=r"no scenario file 'nowhere'; there are .*five_bar,"):
         find_scenario("nowhere")
     with pytest.raises(ScenarioError, match=r"did you mean 'two_link_wall'\?"):
         find_scenario("two_link_wal")
