@@ -47,14 +47,14 @@ VALUES = {
 
 SIGNED = re.compile(
     r"values|offset|amplitudes|frequencies|phases|goal|start_time|positions|errors|point|normal|"
-    r"center|axis|translation|rpy_deg|bias|gain$|plant_parameters|seed|torque_constant|gear_ratio|geometry"
+    r"start\.\d|end\.\d|center|axis|translation|rpy_deg|bias|gain$|plant_parameters|seed|torque_constant|gear_ratio|geometry"
 )
 """Keys where zero or a negative number is as good as any other."""
 
 _NUMBERS_EACH = re.compile(r"actuation.*(stiffness|inertia|resistance|constant|ratio|damping|geom)")
 """Keys of one number for all joints, or one for each."""
 
-LOST = "so large that the time is lost beside it"
+LOST = "so large that what stands beside it is lost"
 
 NUMBERS = ("nan", "inf", "-1", "0", "1e300", "1e-300", "abc", "", "1 2", "0 0 0", "1,5", "1e3000")
 
@@ -134,7 +134,7 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
         return "a switch has two positions"
     if isinstance(after, bool) or not isinstance(after, (int, float)) or not isfinite(after):
         return ""
-    if path.startswith("references") and abs(after) > 1e15:
+    if path.startswith(("references", "actuation")) and abs(after) > 1e15:
         return LOST
     if isinstance(before, (int, float)) and (SIGNED.search(path) or after > 0):
         return "another finite number with a meaning"
