@@ -21,6 +21,9 @@ from drake_dae.errors import ScenarioError
 
 T = TypeVar("T")
 
+_TEXT = "text"
+"""What stands for plain text where tags choose."""
+
 
 @dataclass(frozen=True, eq=False)
 class Form:
@@ -106,21 +109,20 @@ class Choice:
     """Annotates a Union of dataclasses: a tag chooses one, by default the first.
 
     The tag is the name of the class. A member that is annotated with a `Form` has its tag and its
-    defaults.
+    defaults. A member `str` is plain text.
 
     Attributes:
         written: The types that stand for others in data, as in `Form`, for all members.
-        text: The only field of the first member, for which plain text stands; empty if none does.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
-    text: str = ""
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: pydantic.GetCoreSchemaHandler
     ) -> CoreSchema:
         forms: dict[type[Any], Form] = {}
-        for member in get_args(source):
+        members = get_args(source)
+        for member in (member for member in members if member is not str):
             cls, own = get_args(member) or (member, Form())
             tag = own.tag or f"!{cls.__name__}"
             forms[cls] = replace(own, written=self.written, tag=tag, needs_tag=bool(forms))
@@ -129,33 +131,16 @@ class Choice:
         def chosen(value: Any) -> str | None:
             if isinstance(value, dict):
                 return str(value.get(TAG, first))
+            if isinstance(value, str) and str in members:
+                return _TEXT
             return forms[type(value)].tag if type(value) in forms else None
 
         choices = {
             form.tag: handler.generate_schema(Annotated[cls, form]) for cls, form in forms.items()
         }
-        chosen_form = core_schema.tagged_union_schema(choices, chosen)
-        if not self.text:
-            return chosen_form
-        plain = next(iter(forms))
-
-        def written_out(value: Any) -> Any:
-            return {TAG: first, self.text: value} if isinstance(value, str) else value
-
-        def dump(made: Any, dump_data: Callable[[Any], Any]) -> Any:
-            return getattr(made, self.text) if type(made) is plain else dump_data(made)
-
-        return core_schema.no_info_before_validator_function(
-            written_out,
-            chosen_form,
-            serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=chosen_form),
-        )
-
-    def __get_pydantic_json_schema__(
-        self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        schema = handler(source)
-        return {"anyOf": [{"type": "string"}, schema]} if self.text else schema
+        if str in members:
+            choices[_TEXT] = core_schema.str_schema(strict=True)
+        return core_schema.tagged_union_schema(choices, chosen)
 
 
 def _numbers(value: Any) -> Any:
@@ -316,15 +301,13 @@ def _in_words(schema: Mapping[str, Any]) -> str:
     """What a plain value must be."""
     if "anyOf" in schema:
         return " or ".join(map(_in_words, schema["anyOf"]))
-    if "oneOf" in schema:
-        return f"one of {_tags(schema)}"
     if "enum" in schema or "const" in schema:
         return "one of " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
     return _IN_WORDS.get(schema.get("type", ""), "something else")
 
 
 def _tag(schema: Mapping[str, Any]) -> str:
-    return str(schema["properties"][TAG]["const"])
+    return str(schema["properties"][TAG]["const"]) if "properties" in schema else _TEXT
 
 
 def _tags(schema: Mapping[str, Any]) -> str:

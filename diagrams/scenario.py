@@ -61,8 +61,7 @@ Output = Annotated[
     Choice(_WRITTEN),
 ]
 ForceOutput = Annotated[
-    force_outputs.NamedForce | force_outputs.Squeeze | force_outputs.ForceCombination,
-    Choice(_WRITTEN, text="name"),
+    str | force_outputs.Squeeze | force_outputs.ForceCombination, Choice(_WRITTEN)
 ]
 Stage = Annotated[
     actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,

@@ -264,10 +264,10 @@ def _try(constraint: Constraint, links: Links) -> None:
 
 
 def _check_forces(
-    forces: Sequence[ForceOutput] | None, constraints: Sequence[Constraint], links: Links
+    forces: Sequence[str | ForceOutput] | None, constraints: Sequence[Constraint], links: Links
 ) -> None:
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
-    each("forces", forces or (), lambda output: force_rows([output], bound, links))
+    each("forces", forces or (), lambda one: force_rows(force_outputs([one], bound), bound, links))
     with at("forces"):
         force_outputs(forces, bound)
 

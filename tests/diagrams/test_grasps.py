@@ -307,7 +307,11 @@ def test_what_is_free_moves_in_the_animation(name, body):
             "forces.2=!Squeze {}",
             ["forces.2: expected ", "!Squeeze", "got !Squeze"],
         ),
-        ("three_fingers", "forces.2=3", ["forces.2: expected text or one of", "got 3"]),
+        (
+            "three_fingers",
+            "forces.2=3",
+            ["forces.2: expected one of !Squeeze, !ForceCombination, text", "got 3"],
+        ),
         (
             "three_fingers",  # What moves the puck, too.
             "forces.2=!ForceCombination {name: a, weights: {grip1.fx: 1, grip2.fx: 1, "

@@ -22,6 +22,7 @@ from drake_dae import (
     Ellipsoid,
     FixedDistance,
     FlexibleJoints,
+    ForceCombination,
     JointCoupler,
     JointPositions,
     Plane,
@@ -32,6 +33,7 @@ from drake_dae import (
     RollingWheel,
     SinusoidReference,
     Sphere,
+    Squeeze,
     Torus,
     build_scenario,
     load_scenario,
@@ -232,7 +234,12 @@ def test_every_form_reads_back_equal(tmp_path):
             forms.SurfaceCoordinates("c0"),
             JointPositions(["joint1", "2"]),
         ],
-        forces=["l.traction", "c0.force"],
+        forces=[
+            "l.traction",
+            "c0.force",
+            Squeeze("a", "w", "p"),
+            ForceCombination({"c1.force": 1 / 3, "c2.force": -1.0}, "d"),
+        ],
         actuation=[
             FlexibleJoints([[8e3, 5e2], [5e2, 6e3]], [1.0, 1 / 3], 2.0),
             DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
@@ -256,6 +263,7 @@ def test_every_form_reads_back_equal(tmp_path):
     # Not only equal as data: the objects are of their classes.
     assert copy.constraints == scenario.constraints
     assert copy.outputs == scenario.outputs
+    assert copy.forces == scenario.forces
     assert copy.references == scenario.references
     assert copy.gains == scenario.gains
     assert copy.force.sensor(2).sample_period == 0.001
@@ -681,7 +689,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("duration=", ["duration: expected a number, got nothing"]),
         ("duration=2020-01-01", ["duration: expected a number, got '2020-01-01'"]),
         ("constraints={}", ["constraints: expected a list, got {}"]),
-        ("robot=arm.urdf", ["robot: expected keys file, packages, got 'arm.urdf'"]),
+        ("robot=arm.urdf", ["robot: expected keys file, packages, free, got 'arm.urdf'"]),
         ("constraints.0.surface=3", ["constraints.0.surface: expected one of !Plane, ", "got 3"]),
         ("constraints.0.frame=3", ["constraints.0.frame: expected text, got 3; ", "quotes"]),
         ("write.plots=maybe", ["write.plots: expected true or false, got 'maybe'"]),
