@@ -262,6 +262,7 @@ class DaeSystem:
         """The parameters that move, w, and how they enter time derivatives."""
         return Exogenous(self.name, self.parameters)
 
+    @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """The same system, some of whose parameters move.
 
