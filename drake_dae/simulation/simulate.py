@@ -101,13 +101,11 @@ def simulate(
     start = context.get_time()
     ending = Ending()
     with ending_signals(ending), _Progress(duration, progress) as shown:
-        pace = _Pace(start, duration, config.max_step_size)
 
         def monitor(current: Context) -> EventStatus:
             shown.update(current.get_time() - start)
             if after_step is not None:
                 after_step(current)
-            pace.check(current)
             if ending.signal is not None:
                 return EventStatus.ReachedTermination(diagram, "interrupted")
             return EventStatus.DidNothing()
@@ -200,44 +198,6 @@ def check_config(config: SimulatorConfig) -> None:
             raise ModelError(
                 f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
                 "step, or choose runge_kutta5"
-            )
-
-
-class _Pace:
-    """Ends a run whose steps have become so small that it would never end.
-
-    Drake's error control goes down to steps of 1e-14 s and stays there: it cannot fail, since a
-    kink in a reference needs a few such steps.
-    """
-
-    STEPS = 1000
-    SLOWEST = 1e-7
-    """Of the duration that so many steps must simulate, or a tenth of what the longest would."""
-
-    def __init__(self, start: float, duration: float, max_step_size: float) -> None:
-        self._steps, self._time = 0, start
-        self._least = min(self.SLOWEST * duration, 0.1 * self.STEPS * max_step_size)
-
-    def check(self, context: Context) -> None:
-        """Counts a step, and looks at the pace now and then.
-
-        Raises:
-            SimulationError: The last steps led nowhere.
-        """
-        self._steps += 1
-        if self._steps % self.STEPS:
-            return
-        time, before = context.get_time(), self._time
-        self._time = time
-        if time - before < self._least:
-            state = context.get_continuous_state_vector().CopyToVector()
-            raise SimulationError(
-                f"the last {self.STEPS} steps led from t = {before:.9g} s only to {time:.9g} s: "
-                "the state grows without bound, or jumps. State: "
-                f"{np.array2string(state, precision=4, separator=', ')}. Look at the gains and at "
-                "what the model has wrong; where that is in order, choose a fixed step",
-                time,
-                state,
             )
 
 
