@@ -120,6 +120,7 @@ def test_a_closed_loop_of_links(name, link, force, tmp_path, capsys):
     assert "pulls" not in printed
 
 
+@pytest.mark.slow
 def test_the_scenario_as_run_gives_the_same_record(demo, tmp_path):
     folder, _, _ = demo
     path = folder / "scenario.yaml"
@@ -148,6 +149,7 @@ def test_it_writes_what_is_asked_for(settings, left, tmp_path, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_without_out_each_run_gets_a_new_folder_below_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for _ in range(3):
@@ -161,6 +163,7 @@ def test_without_out_each_run_gets_a_new_folder_below_runs(tmp_path, monkeypatch
 # Folders that are there already.
 
 
+@pytest.mark.slow
 def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
     assert main([*arguments, *QUICK]) == 0
@@ -236,6 +239,7 @@ def test_each_mistake_in_a_scenario_has_its_line(capsys):
     assert second.startswith("error: scenario: has no key 'foo'; ")
 
 
+@pytest.mark.slow
 def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, capsys):
     """The arm is stretched out at z = 1.6 m, which the reference passes after 0.13 s."""
     move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
@@ -301,6 +305,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
         assert lines[0].endswith(f" {record.time[-1]:.6g} s")
 
 
+@pytest.mark.slow
 def test_the_reason_of_a_failure_is_printed_too_when_files_fail(tmp_path, monkeypatch, capsys):
     def fill(self, path):
         raise OSError(28, "No space left on device")
@@ -445,6 +450,7 @@ def test_a_reader_that_has_enough():
         assert process.stderr.read() == ""
 
 
+@pytest.mark.slow
 def test_meshcat_tells_where_and_runs_in_real_time(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--meshcat", "--out", str(tmp_path), *QUICK]
     began = time.perf_counter()

@@ -86,6 +86,7 @@ def test_the_joint_force_behind_an_actuation():
     assert any("needs" in problem for problem in soft.problems)
 
 
+@pytest.mark.slow
 def test_a_torque_limit_that_is_exceeded(capsys):
     """At rest, u = g(q) - J' F with rods of 12 and 6 kg, 1 m long, and 400 N against the wall."""
     code, text = analyze(
@@ -112,6 +113,7 @@ def test_a_torque_limit_that_is_exceeded(capsys):
     assert row[-1] == "300"
 
 
+@pytest.mark.slow
 def test_a_reference_that_leaves_the_workspace(capsys):
     """Two links of 1 m reach z = 1.6 m on the wall at x = 1.2 m.
 
@@ -130,6 +132,7 @@ def test_a_reference_that_leaves_the_workspace(capsys):
     assert re.search(r"PROBLEM  joint2_w goes from .* its limits are -3 and 3, left at 0\.0", text)
 
 
+@pytest.mark.slow
 def test_a_contact_that_would_have_to_pull(capsys):
     """2 + 5 sin 2t is negative from t = (pi + asin 0.4) / 2 on; samples are 10 ms apart."""
     code, text = analyze(capsys, "two_link_wall", "--set", "references.1.offset=2")
@@ -145,6 +148,7 @@ def test_a_contact_that_would_have_to_pull(capsys):
     assert re.search(r"^wall\.force +N +-3 .* pulls: a real contact would open$", text, re.M)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periods", [10, 200, 1000])
 def test_times_follow_a_reference_that_even_times_would_not_see(periods):
     """1001 even times over 1000 periods see sin(2 pi t) as 0, and half as many as a beat."""
@@ -162,6 +166,7 @@ def test_times_follow_a_reference_that_even_times_would_not_see(periods):
     assert np.quantile(np.diff(times), 0.9) < 0.15
 
 
+@pytest.mark.slow
 def test_times_that_do_not_suffice_are_told():
     wanted = lambda t: np.array([np.sin(1e4 * t)])  # noqa: E731
     times, is_resolved = module.sample_times(wanted, 0.0, 100.0)
@@ -188,6 +193,7 @@ def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
     assert float(found[1]) == pytest.approx((np.pi + np.arcsin(0.4)) / (20 * np.pi), abs=0.01)
 
 
+@pytest.mark.slow
 def test_extremes_of_a_constant_have_no_time(capsys):
     settings = ["--set", "references.1=!Constant {values: [15]}", "--set", "duration=2"]
     _, text = analyze(capsys, "two_link_wall", *settings)
@@ -196,6 +202,7 @@ def test_extremes_of_a_constant_have_no_time(capsys):
     assert "Started without errors, and examined at 1001 times." in text
 
 
+@pytest.mark.slow
 def test_a_pin_may_pull():
     told = find_feasibility(scenario("five_bar", "references.2.offset=-15"))
     assert course(told.constraint_forces, "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
@@ -211,6 +218,7 @@ def test_a_pin_may_pull():
 # How it ends.
 
 
+@pytest.mark.slow
 def test_a_scenario_without_problems(capsys):
     code, text = analyze(capsys, "two_link_wall")
     assert code == 0
@@ -276,6 +284,7 @@ def test_an_error_as_json(capsys):
     assert captured.err.startswith(f"error: {text}")
 
 
+@pytest.mark.slow
 def test_objects_are_one_line_at_the_prompt():
     case = scenario("two_link_wall", "duration=0.1")
     assert repr(find_feasibility(case)) == "Feasibility('two_link_arm': no problem found)"
@@ -283,6 +292,7 @@ def test_objects_are_one_line_at_the_prompt():
     assert repr(loop).startswith("ClosedLoop('two_link_arm', logs state, constraint_force, ")
 
 
+@pytest.mark.slow
 def test_states_have_units(capsys):
     _, text = analyze(capsys, "two_link_wall")
     assert re.search(

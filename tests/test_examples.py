@@ -40,6 +40,7 @@ def test_every_example_has_its_claim():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(CLAIMS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CLAIMS)
 def test_example(name, tmp_path, capsys):
     figures = load(name).main(tmp_path)
@@ -51,6 +52,7 @@ def test_example(name, tmp_path, capsys):
     assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_not_there(tmp_path):
     command = [sys.executable, EXAMPLES / "textbook_robot.py", tmp_path / "none"]
     found = subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -58,6 +60,7 @@ def test_a_folder_that_is_not_there(tmp_path):
     assert re.fullmatch(r"no folder '.*none'; the picture goes into .*\n", found.stderr)
 
 
+@pytest.mark.slow
 def test_an_example_runs_by_itself(tmp_path):
     subprocess.run(
         [sys.executable, EXAMPLES / "textbook_robot.py", tmp_path], check=True, timeout=60

@@ -29,6 +29,7 @@ def test_every_import_points_down() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 def test_no_imports_go_round() -> None:
     assert circle(imports()) == []
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"d"}}) == []
@@ -122,12 +123,14 @@ def loaded_with(rooms: Collection[str]) -> set[str]:
     return set(printed.split())
 
 
+@pytest.mark.slow
 def test_the_mathematics_loads_no_drake() -> None:
     tops = {module.split(".")[0] for module in loaded_with(WITHOUT_DRAKE)}
     assert "casadi" in tops
     assert "pydrake" not in tops
 
 
+@pytest.mark.slow
 def test_traced_functions_load_no_system() -> None:
     loaded = {room(name) for name in loaded_with(["trace"]) if name.startswith("drake_dae.")}
     assert loaded == {"errors", "arrays", "trace"}

@@ -39,6 +39,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_wheel_from_sdist_holds_every_file_of_the_package(wheel: Path) -> None:
     expected = {
         Path(folder, file).relative_to(ROOT).as_posix()
@@ -53,6 +54,7 @@ def test_wheel_from_sdist_holds_every_file_of_the_package(wheel: Path) -> None:
     assert packed == expected
 
 
+@pytest.mark.slow
 def test_installed_wheel_simulates_a_shipped_scenario(wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=False, symlinks=True)
     python = tmp_path / "venv" / "bin" / "python"

@@ -37,6 +37,7 @@ YES, NO, OPEN = Finding.SATISFIED, Finding.VIOLATED, Finding.NOT_EXAMINED
 # ---- systems that satisfy the assumptions
 
 
+@pytest.mark.slow
 def test_what_is_known_of_the_problems(problem):
     analysis = analyze(problem.system, count=12)
     assert findings(analysis) == [YES] * 5
@@ -59,6 +60,7 @@ def test_what_is_known_of_the_problems(problem):
         assert a is None
 
 
+@pytest.mark.slow
 def test_margins_belong_to_their_states(problem):
     """The state of a margin is consistent, and A or B is as near to singular there as said."""
     analysis = analyze(problem.system, count=12)
@@ -269,6 +271,7 @@ def stretching() -> DaeSystem:
     )
 
 
+@pytest.mark.slow
 def test_an_arm_that_stretches_out():
     """On N* x1 = -2 x0 and s = 2 cos x0, so s is stationary at x0 = 0 and B vanishes there."""
     analysis = analyze(stretching(), region={"x1": (-2.5, 0.5)})
@@ -534,6 +537,7 @@ def test_a_reference_of_a_wrong_size():
 # ---- printed
 
 
+@pytest.mark.slow
 def test_text_is_aligned_and_not_too_wide(problem):
     lines = str(analyze(problem.system, count=3)).splitlines()
     assert max(map(len, lines)) <= 100
@@ -557,6 +561,7 @@ def test_markdown_has_the_same_words(problem):
         assert len({line.count("|") for line in table.splitlines()}) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*PROBLEMS, "redundant"])
 def test_the_dictionary_is_json(name):
     twice = redundant(lambda x: [x[0], x[0]])
@@ -584,6 +589,7 @@ def rising(changes=lambda t, wanted: wanted):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [1e-3, 5.0, 1e4])
 def test_references_that_agree_with_themselves(length):
     """Over any time: the differences of a slow and of a fast reference are within the tolerance."""

@@ -52,6 +52,7 @@ def test_derivatives_are_those_along_the_constrained_motion(problem):
         np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * np.abs(two).max())
 
 
+@pytest.mark.slow
 def test_the_rate_is_that_of_the_elimination(problem):
     system = problem.system
     motion, elimination = motion_of(system), find_structure(system).elimination

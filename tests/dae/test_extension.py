@@ -249,6 +249,7 @@ def extension_of(name: str) -> Extension:
     return dynamic_extension(make(), nominal_control=nominal)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REGULAR)
 def test_degrees_are_those_of_the_literature(name):
     """Unicycle: Isidori 1995, 5.4; the others are flat by their outputs (Fliess et al. 1995).
@@ -266,6 +267,7 @@ def test_degrees_are_those_of_the_literature(name):
     assert extension.system.num_states == make().num_states + sum(integrators.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REGULAR)
 def test_the_extension_moves_the_original_states_as_the_original_does(name):
     """f_e + h_e w, in the rows of x, is f + h u with the u that `original_control` recovers."""
@@ -485,6 +487,7 @@ def wave(center: float, size: float, rate: float, degree: int, phase: float = 0.
     return at
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "speed"), [(unicycle, {"v": 2.5}), (wheels, {"left": 10.0})])
 def test_a_figure_of_eight(make, speed):
     """x = 2 sin t, y = sin 2t from beside it: the error is the closed form, over both lobes."""
@@ -505,6 +508,7 @@ def test_a_figure_of_eight(make, speed):
     np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_load_on_a_crane():
     """The load moves on an ellipse with the predicted error, by trolley and winch."""
     extension = extension_of("crane")

@@ -51,6 +51,7 @@ def on_manifold(structure: Structure, x: Array, free: Array, values: Array) -> A
     return filled(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_minimal_form_is_that_of_finite_differences(problem, moving):
     """Central differences of the motion in the coordinates that were chosen, moving or not."""

@@ -43,6 +43,7 @@ def circle(**parameters: float) -> Manifold:
     return manifold_of(lambda x, p: x[0] ** 2 + x[1] ** 2 - p.radius**2, **parameters)
 
 
+@pytest.mark.slow
 def test_residual_and_dimension_are_those_found_by_hand(problem):
     manifold = find_structure(problem.system).manifold
     assert manifold.dimension == problem.manifold_dimension
@@ -57,6 +58,7 @@ def test_residual_and_dimension_are_those_found_by_hand(problem):
         np.testing.assert_allclose(manifold.residual(consistent), 0.0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_projection_reaches_the_manifold_to_round_off(problem):
     manifold = find_structure(problem.system).manifold
     random = np.random.default_rng(1)
@@ -71,6 +73,7 @@ def test_projection_reaches_the_manifold_to_round_off(problem):
         assert np.linalg.norm(state - start) < 3 * size * np.sqrt(start.size)
 
 
+@pytest.mark.slow
 def test_projection_leaves_consistent_states_alone(problem):
     manifold = find_structure(problem.system).manifold
     state = manifold.project(problem.consistent(np.random.default_rng(2)))

@@ -72,6 +72,7 @@ def test_phi_and_its_inverse_compose_to_the_identity(name):
     assert len(normal_form.coordinate_signals) == system.num_states
 
 
+@pytest.mark.slow
 def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
     """dPhi/dx (f + g v + h u): integrators, then a + B u by hand; y stays; v by hand."""
     system = problem.system

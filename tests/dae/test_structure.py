@@ -41,6 +41,7 @@ def violation(system: DaeSystem, **options) -> AssumptionError:
 # ---- systems that satisfy the assumptions
 
 
+@pytest.mark.slow
 def test_degrees_index_and_dimensions(problem):
     structure = find_structure(problem.system)
     assert structure.constraint_degrees == problem.constraint_degrees
@@ -52,6 +53,7 @@ def test_degrees_index_and_dimensions(problem):
     assert structure.num_dynamic_outputs == sum(d > 0 for d in problem.output_degrees)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_outputs_is_that_of_15(problem):
     """In the order found, n* has s rows of zeros first, and every row after has an entry."""
     structure = find_structure(problem.system)
@@ -69,6 +71,7 @@ def test_the_order_of_the_outputs_is_that_of_15(problem):
         assert np.abs(value[s:]).max(axis=1, initial=0.0).min(initial=1.0) > 1e-3
 
 
+@pytest.mark.slow
 def test_numbers_were_decided_at_consistent_states(problem):
     structure = find_structure(problem.system, count=5)
     assert structure.states.shape == (6, problem.system.num_states)
@@ -79,6 +82,7 @@ def test_numbers_were_decided_at_consistent_states(problem):
         np.testing.assert_allclose(problem.derivatives(state), 0.0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_margins_are_singular_values_at_the_states(problem):
     structure = find_structure(problem.system)
     b = [np.linalg.svd(problem.known(x).control_matrix)[1][-1] for x in structure.states]
@@ -612,6 +616,7 @@ def test_5_a_singular_b_hidden_in_a_random_system(seed):
     assert violation(changed(system, l=ca.vertcat(*outputs))).assumption == 5
 
 
+@pytest.mark.slow
 def test_examine_structure_finds_the_same(problem):
     structure, violation = examine_structure(problem.system)
     assert violation is None

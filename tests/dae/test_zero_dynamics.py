@@ -702,6 +702,7 @@ def test_zeros_of_the_four_tanks(plant):
     np.testing.assert_allclose(found, published, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_eigenvalues_of_linear_systems_are_their_invariant_zeros(seed):
     system = linear_system(seed, n=7 + seed % 3, m=seed % 3)
@@ -729,6 +730,7 @@ def test_zeros_with_feedthrough():
     assert_same_numbers(dynamics.eigenvalues(rest), found, rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "size"), [("two_link", 2), ("seven_joint", 7)])
 def test_damped_flexible_joints_leave_their_deflections(name, size):
     """K d + D d' = tau: the eigenvalues of -D^-1 K, whatever links and motors do."""
@@ -787,6 +789,7 @@ def test_pendulum_on_a_cart_is_not_minimum_phase():
     np.testing.assert_allclose(swung.state[:3], [0.3, 0.3, -0.7], rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("epsilon", [0.01, 0.25, 4.0])
 def test_the_aircraft_is_not_minimum_phase(epsilon):
     """eps a'' = sin a (Hauser, Sastry and Meyer, 1992, section 3)."""
@@ -854,6 +857,7 @@ def test_eigenvalues_do_not_depend_on_units():
     assert found.verdict is expected.verdict is Verdict.UNSTABLE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "chosen"),
     [
@@ -1009,6 +1013,7 @@ def test_tension_as_output():
     np.testing.assert_allclose(dynamics.eigenvalues(free.state).imag, free.eigenvalues.imag)
 
 
+@pytest.mark.slow
 def test_verdicts_on_known_systems(problem):
     stability = zero_dynamics(problem.system).stability()
     if problem.zero_dynamics == 0:
@@ -1063,6 +1068,7 @@ def slider() -> DaeSystem:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("force", "rate"), [(20.0, -20.0), (80.0, 40.0)])
 def test_the_force_that_is_asked_for_decides(force, rate):
     """The force is met at once, so that no state tells it: the eigenvalue is v - 40."""

@@ -86,6 +86,7 @@ def by_size(values: Array) -> Array:
 # Along a reference with a period.
 
 
+@pytest.mark.slow
 def test_growth_by_a_parameter_that_oscillates():
     """s'' = -(1 + 0.9 cos 2t) s - 0.02 s': each frozen system is stable, and it grows.
 
@@ -106,6 +107,7 @@ def test_growth_by_a_parameter_that_oscillates():
     assert ZeroDynamics(oscillator(mathieu)).stability().verdict is Verdict.STABLE
 
 
+@pytest.mark.slow
 def test_growth_by_an_exogenous_signal():
     """The same oscillator, pumped by a known signal while its output stands still."""
     system = DaeSystem.from_functions(
@@ -133,6 +135,7 @@ def test_growth_by_an_exogenous_signal():
     assert any("Floquet multiplier is 1.934" in problem for problem in report.problems)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.5, 0.02])
 def test_multipliers_of_a_stable_motion(damping):
     """s'' = -(1 + 0.1 sin 3t) s - d s' + 0.2 sin 3t: multipliers of size exp(-d P / 2)."""
@@ -152,6 +155,7 @@ def test_multipliers_of_a_stable_motion(damping):
     assert found.verdict is Verdict.STABLE
 
 
+@pytest.mark.slow
 def test_multipliers_of_a_motion_that_must_be_found():
     """A damped spring that hardens, driven: s'' = -s - s^3 - 0.4 s' + 0.5 cos 1.2t.
 
@@ -313,6 +317,7 @@ def test_arguments_that_do_not_fit_are_refused():
         ZeroDynamics(other).stability_along(sinusoid(2.0), motion)
 
 
+@pytest.mark.slow
 def test_a_constant_reference_is_judged_at_rest():
     found = along(oscillator(van_der_pol), lambda t: np.zeros(2), 10.0)
     assert (found.verdict, found.period) == (Verdict.BOUNDED, 0.0)
@@ -336,6 +341,7 @@ def test_without_zero_dynamics():
 # Away from equilibria, and between them.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strength", [0.3, 1.0, 5.0])
 def test_a_limit_cycle_is_bounded(strength):
     """Van der Pol: s = 0 has the eigenvalues of l^2 - e l + 1, and the cycle is about 2 wide."""
@@ -372,6 +378,7 @@ def test_where_nothing_rests_the_motion_is_examined():
     assert "grows without bound" in found.reason
 
 
+@pytest.mark.slow
 def test_several_equilibria():
     """s'' = s - s^3 - s': at rest at 0, with l^2 + l - 1, and at +-1, with l^2 + l + 2."""
     system = oscillator(lambda s, w, z: s - s**3 - w)
@@ -406,6 +413,7 @@ def test_a_continuum_of_equilibria_is_one():
 # What analyze tells.
 
 
+@pytest.mark.slow
 def test_analyze_tells_of_growth_along_a_reference():
     told = analyze(oscillator(mathieu), reference=sinusoid(2.0), times=np.linspace(0.0, 60.0, 61))
     assert told.zero_dynamics.verdict is Verdict.STABLE
@@ -419,6 +427,7 @@ def test_analyze_tells_of_growth_along_a_reference():
     assert data["verdict"] == "unstable"
 
 
+@pytest.mark.slow
 def test_a_limit_cycle_is_no_problem():
     told = analyze(oscillator(van_der_pol))
     assert told.problems == ()
@@ -430,6 +439,7 @@ def test_a_limit_cycle_is_no_problem():
 # Linearization.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("small", [-1e-3, 1e-3])
 def test_eigenvalues_eleven_orders_apart_are_decided(small):
     """Triangular: s1' = -1e8 s1 + 3e4 s2, s2' = small s2."""

@@ -156,6 +156,7 @@ def test_law_is_the_explicit_law_59(name):
         assert np.linalg.norm(control - explicit) < 1e-9 * np.linalg.norm(explicit)
 
 
+@pytest.mark.slow
 def test_residual_stays_at_zero_for_100_s_under_error_control():
     """At accuracy 1e-6; without projection the same run drifts off."""
     ends, largest = {}, {}

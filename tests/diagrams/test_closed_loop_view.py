@@ -135,6 +135,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_tool_leads_the_arrow():
     """The contact point is where MultibodyPlant has the tool's frame."""
     _, record, page = recorded("seven_joint_wall", "duration=1")
@@ -281,6 +282,7 @@ def test_live_view_draws_while_it_runs():
     np.testing.assert_allclose(link, pose, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_live_view_the_steps_are_those_without_any():
     """Drawing ends a step every 1/32 s; a recording is made after the run and changes nothing."""
     times = []

@@ -111,6 +111,7 @@ def grasp_map(pose):
     return np.vstack([np.tile(np.eye(3), 3), np.hstack(crosses)]), levers
 
 
+@pytest.mark.slow
 def test_squeezes_lie_in_the_null_space_of_the_grasp_map():
     """G S^T = 0, and they are all of it; round-off."""
     model = scenario_model(scenario("three_fingers"))
@@ -182,6 +183,7 @@ def test_fingers_press_and_could_hold_by_friction():
 # A biped with flexible joints: 4 joints, 3 positions of the trunk, 4 forces, 1 of them internal.
 
 
+@pytest.mark.slow
 def test_forces_of_the_biped_are_those_of_drake():
     """Of some 100 N, with shaft angles of the spring's torque: round-off of 1e-12 relative."""
     loop, _, record = run("biped", "duration=2")
@@ -285,6 +287,7 @@ def test_what_is_free_moves_in_the_animation(name, body):
 # What does not fit.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "setting", "words"),
     [

@@ -67,6 +67,7 @@ def test_the_analysis_knows_what_moves():
     assert_allclose(motion.controls[-1], record["control"][-1], rtol=1e-2, atol=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setting", "message"),
     [

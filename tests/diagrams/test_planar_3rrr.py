@@ -80,6 +80,7 @@ def by_hand(z: FloatArray, rate: FloatArray, second: FloatArray):
     return np.array(torques), forces
 
 
+@pytest.mark.slow
 def test_the_law_and_the_pins_are_those_of_newton_and_euler():
     """The law of double poles at -5 asks for z'' = r'' - 10 e' - 25 e, and for nothing else.
 

@@ -178,6 +178,7 @@ def test_shipped_scenario_runs_from_its_start_errors(name):
         assert np.max(distance) < 1e-5 * max(map(abs, scenario.start.errors.values()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_a_saved_scenario_reads_back_equal(name, tmp_path):
     scenario = load_scenario(find_scenario(name))
@@ -335,6 +336,7 @@ def test_later_settings_see_earlier_ones():
     assert two_link(*change).constraints[0].surface == Sphere((0, 0, 0), 2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "surface"),
     [
@@ -367,6 +369,7 @@ def test_surfaces(form, surface):
     np.testing.assert_allclose(record["constraint_force"], 20.0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "poles"),
     [
@@ -384,6 +387,7 @@ def test_gains(form, poles):
     np.testing.assert_allclose(found, poles, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "signal"),
     [
@@ -492,6 +496,7 @@ def test_coincident_points():
     np.testing.assert_allclose(left, [0.12 - 0.04, 0.0, 0.55 + 0.03], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "stage"),
     [
@@ -537,6 +542,7 @@ def test_stages(form, stage):
     np.testing.assert_array_equal(*rates)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gain", "matrix"),
     [

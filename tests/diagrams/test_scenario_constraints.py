@@ -246,6 +246,7 @@ CASES = {
 
 
 # A ball that spins freely has zero dynamics with eigenvalues 0 in pairs: round-off takes sides.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_dae.errors.NonMinimumPhaseWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_path):
@@ -269,6 +270,7 @@ def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_pat
         np.testing.assert_allclose(holds(plant, context, state), 0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_cart_can_be_analyzed(tmp_path):
     """Nothing fails on the way, and the report names the level of each constraint."""
     scenario = load_scenario(scenario_file(tmp_path, ROLL, CART))
@@ -277,6 +279,7 @@ def test_a_cart_can_be_analyzed(tmp_path):
     assert len(report.constraint_forces) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [

@@ -154,6 +154,7 @@ def test_a_second_motor_steers_one_force_of_the_pin():
         assert_allclose(found, force, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "order"), [("slider_crank", 2), ("slider_crank_flexible", 4)])
 def test_the_error_is_that_of_poles_in_one_place(name, order):
     """e = e_0 exp(-6 t) sum_(k < order) (6 t)^k / k!, from rest; order poles at -6.

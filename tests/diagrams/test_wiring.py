@@ -128,6 +128,7 @@ def test_scenarios_of_actuation_follow_their_prediction(name):
     assert off[1] < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "setting", "message"),
     [

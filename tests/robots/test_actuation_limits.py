@@ -50,6 +50,7 @@ def reference(name, t, degrees):
     return np.concatenate([r[: degree + 1, i] for i, degree in enumerate(degrees)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ARMS)
 def test_flexible_law_tends_to_the_rigid_law_at_rate_1_over_k(name):
     """u = u_rigid + M_2 K_2^-1 tau''(t) where the reference is met, whatever the gains.

@@ -491,6 +491,7 @@ def test_third_equation_of_a_plane_linkage_is_refused():
         find_structure(four_bar("xyz").dae)
 
 
+@pytest.mark.slow
 def test_two_arms_track_motion_and_squeeze():
     """Both poles at -4: e(t) = (e(0) + (e'(0) + 4 e(0)) t) exp(-4 t), and lambda = r_2 at once.
 

@@ -228,6 +228,7 @@ def given(request):
     return request.param[0], *case(*request.param)
 
 
+@pytest.mark.slow
 def test_rows_are_as_many_as_names(given):
     _, constraint, evaluate, *_ = given
     found, count = evaluate(), len(constraint.force_signals)

@@ -96,6 +96,7 @@ def test_rotors_turn_once(stage):
             chain([stage, stage], links())
 
 
+@pytest.mark.slow
 def test_a_drive_holds_any_force_at_rest(stage):
     """And the control does not reach the constraint force in the same instant."""
     model = touching("two_link", [stage])

@@ -75,6 +75,7 @@ def parsed(text, time_step=0.0):
 # What is read from a plant.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time_step", [0.0, 1e-3])
 @pytest.mark.parametrize("multiplier", [-0.7, 1.0, -1.0, 2.5])
 def test_a_mimic_joint_is_a_coupler(time_step, multiplier):

@@ -65,6 +65,7 @@ class Plate:
         return n[2], first, second
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_arm_stays_on_a_plate_that_moves_and_turns(seed):
     """phi = n . (p - c), phi' and phi'' vanish, and the forces balance: by MultibodyPlant.

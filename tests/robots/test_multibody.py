@@ -291,6 +291,7 @@ def test_frames_are_where_the_plant_has_them(seed):
         assert_close(J[3 * i : 3 * i + 3], expected, f"J of {frame.name()}", scale=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
     """J against the plant's frame Jacobians; the rest against M v' + H - J^T lambda and phi''.
@@ -361,6 +362,7 @@ def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
     assert_close(J[3], row, "J of an angle", 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_discrete_plant_has_the_same_terms(seed):
     continuous, discrete = random_robot(seed), random_robot(seed, time_step=1e-3)

@@ -218,6 +218,7 @@ def test_a_skate_on_a_slope_goes_along_a_cycloid():
 # A surface.
 
 
+@pytest.mark.slow
 def test_a_tool_stays_on_a_saddle():
     """z = 0.5 (x^2 - y^2) above its middle all along, and the normal force is the desired one."""
     contact = PointOnSurface("tool", Saddle((0.5, 0.0, 0.45), 0.5), name="saddle")

@@ -270,6 +270,7 @@ def run(model, structure, state, duration, step=1e-3):
     return block.state(context), block.GetOutputPort("constraint_force").Eval(context)
 
 
+@pytest.mark.slow
 def test_a_ball_rolls_down_a_slope_with_five_sevenths():
     """s = 5/14 g sin a t^2; the friction is 2/7 m g sin a up the slope, the rest carries it."""
     slope, duration = 0.4, 0.9

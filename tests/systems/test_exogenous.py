@@ -192,6 +192,7 @@ def test_gradients_by_the_exogenous_signals():
     assert_allclose(np.vstack([rate, force]), differences, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_realization_moves_as_the_plant():
     """Two integrations of the same motion in other coordinates, each to 1e-11 per step."""
     system = rod()

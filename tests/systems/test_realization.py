@@ -48,6 +48,7 @@ def through(system) -> set[str]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_ports_and_minimal_dimension(name):
     problem, system = PROBLEMS[name](), realization(name)
@@ -203,6 +204,7 @@ def test_a_free_fall_of_the_knife_edge_is_a_circle():
     np.testing.assert_allclose(minimal.state(context), expected, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_tracking_law_closes_the_loop():
     """(28) around the realization leaves (30), (31): errors as predicted, no algebraic loop."""
     builder = DiagramBuilder()

@@ -155,6 +155,7 @@ def test_a_reference_that_is_not_finite_raises():
         generator.GetOutputPort("reference").Eval(generator.CreateDefaultContext())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [8, 16, 30])
 def test_high_orders_do_not_cancel(order):
     """The move stays between its ends and mirrors itself; all its terms are positive."""

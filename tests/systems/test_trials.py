@@ -105,6 +105,7 @@ def level(time):
     return high**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ERROR_CONTROLLED)
 @pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
 def test_a_trial_that_leaves_the_domain_makes_the_step_shorter(run, name):
@@ -142,6 +143,7 @@ def test_an_accepted_state_out_of_the_domain_is_told(run):
         run(diagram, 1.0, config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ERROR_CONTROLLED)
 @pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
 def test_a_motion_that_ends_in_the_domain_ends_the_run(run, name):
@@ -182,6 +184,7 @@ class Broken(LeafSystem):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "since"), [*itertools.product(ERROR_CONTROLLED, (0.0, 0.3))], ids=str
 )
@@ -200,6 +203,7 @@ def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
     assert np.isfinite(logger.FindLog(simulator.get_context()).data()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [DaePlant, lambda s: StateRealization(NormalForm(s))])
 def test_a_closed_loop_with_both_plants(make):
     """Of poles at -500 rk3 tries x = -24 at first; the law then cancels the root it lacks there."""
@@ -253,6 +257,7 @@ class Reading(LeafSystem):
         derivatives.get_mutable_vector().SetFromVector([0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ERROR_CONTROLLED)
 def test_after_a_rejected_step_no_port_shows_the_state_of_the_trial(name):
     """Drake's own DeclareStateOutputPort does, with two of its integrators.
