@@ -127,18 +127,8 @@ class Manifold:
 
         The constraints are met first, by the states that they depend on; then their derivatives, by
         the states that are new in them, and so on: positions first, then velocities, so that no
-        velocity moves a position. Where that leads nowhere it is `project`.
-
-        Args:
-            state: A state near N*, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            The consistent state, shape (n,).
-
-        Raises:
-            InconsistentStateError: Newton's method does not reach N* from there.
-            ModelError: The state has a wrong shape.
+        velocity moves a position. Where that leads nowhere it is `project`, whose arguments, result
+        and exceptions it has.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
         found = start.copy()

@@ -128,7 +128,7 @@ class StepWatch:
     def _begin(self, context: Context) -> EventStatus:
         time = context.get_time()
         progress = self._progress(context)
-        progress.__init__(time=time, start=time, mark=time)  # type: ignore[misc]
+        vars(progress).update(vars(Progress(time=time, start=time, mark=time)))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
         return EventStatus.DidNothing()
