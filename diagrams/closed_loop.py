@@ -163,7 +163,7 @@ def make_closed_loop(
     loggers = {}
     named = {
         "state": (plant, dae.state_signals),
-        "constraint_force": (plant, dae.constraint_input_signals),
+        "constraint_force": (plant, dae.force_signals),
         "constraint_residual": (plant, plant.structure.manifold.residual_signals),
         "controlled_output": (plant, dae.output_signals),
         "control": (controller, dae.control_signals),

@@ -9,6 +9,8 @@ from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
+from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.diagrams.build import exogenous_references, wire_scenario
 from drake_dae.diagrams.feasibility_report import Feasibility, SignalRange
 from drake_dae.diagrams.scenario import Scenario
@@ -115,12 +117,12 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
         columns = zip(signals, values.T, low, high, strict=True)
         return tuple(_range(s, motion.times, v, float(a), float(b)) for s, v, a, b in columns)
 
-    highest, reactions = model.control_limits, dae.constraint_input_signals
+    highest, reactions = model.control_limits, dae.force_signals
     least = np.array([-np.inf if limits.can_pull(signal) else 0.0 for signal in reactions])
     found = {
         "controls": ranges(dae.control_signals, motion.controls, -highest, highest),
         "constraint_forces": ranges(
-            reactions, motion.constraint_inputs, least, np.full(least.size, np.inf)
+            reactions, _forces(dae, motion), least, np.full(least.size, np.inf)
         ),
     }
     if model.joint_force is not None:
@@ -134,6 +136,16 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
         values = motion.states[:, : low.size][:, bounded]
         found["joints"] = ranges(chosen, values, low[bounded], high[bounded])
     return found
+
+
+def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
+    """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
+    if dae.sharing is None:
+        return motion.constraint_inputs
+    v = ca.SX.sym("v", dae.num_constraints)
+    function = dae.trace("shared forces", {"forces": dae.forces(v)}, {"v": v})
+    pairs = zip(motion.states, motion.constraint_inputs, strict=True)
+    return np.array([function(x, given, dae.parameter_values)[0] for x, given in pairs])
 
 
 def _joint_forces(model: RobotModel, states: FloatArray) -> FloatArray:

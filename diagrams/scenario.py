@@ -113,6 +113,9 @@ class Scenario:
             `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
             for example.
+        compliances: Constraint force -> its compliance relative to the others, where constraints
+            are redundant: their forces are shared by least squares. {} is all alike; left out, no
+            constraint may be redundant.
         gains: The gains of the tracking law (28).
         references: The references, in the order of the outputs, the forces last.
         start: Where the robot starts.
@@ -131,6 +134,7 @@ class Scenario:
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
+    compliances: dict[str, float] | None = None
     gains: Gains = field(default_factory=parts.Poles)
     references: list[Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)

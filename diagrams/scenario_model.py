@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -57,6 +57,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
     _check_forces(scenario.forces, constraints, links)
+    _check_compliances(scenario.compliances, constraints, links)
     loads = each("loads", scenario.loads, lambda load: _load(load, links))
     _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages)
     with at("actuation" if stages else "outputs"):
@@ -70,6 +71,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
             scenario.forces,
             tuple(scenario.exogenous),
             loads,
+            scenario.compliances,
         )
 
 
@@ -270,6 +272,17 @@ def _check_forces(
     each("forces", forces or (), lambda one: force_rows(force_outputs([one], bound), bound, links))
     with at("forces"):
         force_outputs(forces, bound)
+
+
+def _check_compliances(
+    compliances: Mapping[str, float] | None, constraints: Sequence[Constraint], links: Links
+) -> None:
+    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    for name, value in (compliances or {}).items():
+        with at(f"compliances.{name}"):
+            bound.place(name)
+            if not value > 0.0:
+                raise ModelError(f"a compliance must be positive, got {value}")
 
 
 def _outputs(

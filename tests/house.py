@@ -41,6 +41,7 @@ PAPER = (
     "signals",
     "exogenous",
     "expressions",
+    "sharing",
     "system",
     "layout",
     "manifold",

@@ -11,6 +11,7 @@ from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR, Margin
 from drake_dae.dae.structure.structure import why_not_square
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
@@ -33,6 +34,12 @@ def as_dict(findings: Findings) -> dict[str, Any]:
         ),
         "index": findings.index,
         "manifold_dimension": findings.manifold_dimension,
+        "redundant": None
+        if system.sharing is None
+        else {
+            "left_out": [signal.name for signal in system.sharing.left_out_signals],
+            "undetermined_forces": list(system.sharing.undetermined),
+        },
         "output_degrees": _by_name(system.output_signals, findings.output_degrees),
         "output_order": None
         if findings.output_order is None
@@ -116,6 +123,8 @@ def parts_of(findings: Findings) -> list[Part]:
     )
     dimensions = f"index {index}, N* of dimension {manifold}"
     parts.append([f"{dimensions}, zero dynamics of dimension {zero}" if rows else dimensions])
+    if system.sharing is not None:
+        parts.append([_shared(system)])
     parts.append(_findings(findings))
     margins = [a.margin for a in findings.assumptions if a.margin] + [findings.independence]
     if any(margins):
@@ -129,6 +138,19 @@ def parts_of(findings: Findings) -> list[Part]:
     if findings.motion is not None and findings.motion.times.size:
         parts.append(_along(findings.motion))
     return parts
+
+
+def _shared(system: DaeSystem) -> str:
+    """Which redundant constraints were left out, and which forces are not determined."""
+    sharing = system.sharing
+    if sharing is None:
+        return ""
+    gone = ", ".join(f"'{signal.name}'" for signal in sharing.left_out_signals)
+    forces = ", ".join(sharing.undetermined)
+    return (
+        f"Left out as redundant: {gone}. The split of {forces} is not determined by (1)-(3): it is "
+        "that of least squares, and another one has the same motion."
+    )
 
 
 def _findings(findings: Findings) -> Table:

@@ -43,8 +43,13 @@ class MeasuredForce:
 
         Raises:
             GainError: The gain is not positive semidefinite, or is for an output with mu_i >= 1.
-            ModelError: No output is a constraint input.
+            ModelError: No output is a constraint input, or constraints share their forces.
         """
+        if system.sharing is not None:
+            raise ModelError(
+                f"{system.name}: measured_force does not know how redundant constraints share "
+                "their forces; leave them out with `drop_constraints`, or use the law's own force"
+            )
         inputs = _force_outputs(system)
         matrix = force_gain(gain, system.num_constraints)
         for i, j in inputs.items():

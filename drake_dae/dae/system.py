@@ -15,6 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
 from drake_dae.dae.exogenous import Exogenous
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
+from drake_dae.dae.sharing import Sharing
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -58,6 +59,8 @@ class DaeSystem:
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
+        sharing: How v is shared among redundant constraints, of which k holds those that stay;
+            None where v is all there is. `share_forces` makes it.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -82,6 +85,7 @@ class DaeSystem:
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
+    sharing: Sharing | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -240,6 +244,17 @@ class DaeSystem:
     def num_outputs(self) -> int:
         """The number of controlled outputs; that of the controls where there is a law (28)."""
         return int(self.l.numel())
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        """Names and units of all constraint inputs, those of redundant constraints included."""
+        return self.constraint_input_signals if self.sharing is None else self.sharing.signals
+
+    def forces(self, constraint_input: ca.SX) -> ca.SX:
+        """All constraint inputs, one for each of `force_signals`, of v, shape (m, 1)."""
+        if self.sharing is None:
+            return constraint_input
+        return ca.mtimes(self.sharing.split, constraint_input)
 
     @cached_property
     def parameter_symbol(self) -> ca.SX:

@@ -1,6 +1,6 @@
 """A constrained robot as a DaeSystem.                        (37)-(45), (64)-(68), (74)-(78)"""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Self
@@ -13,6 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.signals import Signal
+from drake_dae.dae.structure.redundancy import share_forces
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import ActuationChain, chain
@@ -60,6 +61,10 @@ class RobotModel:
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
         loads: Known forces on frames, which are zero where nobody sets their parameters.
+        compliances: For a robot whose constraints are redundant: name of a constraint force -> how
+            compliant it is relative to the others, 1 where not named, {} for all alike. The forces
+            are then shared by least squares, see `share_forces`: their split is not determined, and
+            an output that depends on it is refused. None takes no redundant constraints.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
@@ -87,6 +92,7 @@ class RobotModel:
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
+        compliances: Mapping[str, float] | None = None,
     ) -> None:
         self.links = links
         self.constraints = (*constraints, *plant_constraints(links))
@@ -109,9 +115,14 @@ class RobotModel:
         nominal = self._nominal(nominal_positions)
         self.dae = self._equations(bound, h_1, S, driven, nominal).with_exogenous(exogenous)
         self._check_exogenous()
+        if compliances is not None:
+            self.dae = share_forces(self.dae, compliances=compliances)
         self._check_mass_matrix(nominal)
-        self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
-        self._balance = Balance(self.dae, links.q, links.v, S)
+        # Redundant rows mislead Newton's method.
+        rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
+        phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
+        self._placing = Placing(self.dae, links.q, phi, h_1)
+        self._balance = Balance(self.dae, links.q, links.v, self.dae.m[h_1.numel() :, :])
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
@@ -127,6 +138,7 @@ class RobotModel:
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
+        compliances: Mapping[str, float] | None = None,
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -144,6 +156,7 @@ class RobotModel:
             forces,
             exogenous,
             loads,
+            compliances,
         )
 
     @property

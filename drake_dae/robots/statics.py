@@ -60,7 +60,7 @@ class Balance:
     Args:
         dae: The robot's system, with the state (q, v, s).
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
-        S: What of lambda is given, shape (k, m).
+        S: What of lambda is given, shape (k, m); of redundant constraints those that stay.
     """
 
     def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX, S: ca.SX) -> None:
@@ -78,6 +78,7 @@ class Balance:
         combined = [i for i, place in enumerate(alone) if place is None]
         rows = (ca.mtimes(S, force) - load)[combined]
         balance = ca.substitute(ca.vertcat(balance, rows), force, known)
+        every = ca.substitute(dae.forces(known), v, ca.SX.zeros(v.numel()))
         free = [i for i in range(dae.num_constraints) if i not in given]
         unknown = ca.vertcat(dae.state[links:], control, force[free])
         self._unknowns = unknown.numel()
@@ -89,7 +90,7 @@ class Balance:
             {
                 "balance": balance,
                 "gradient": ca.jacobian(balance, unknown),
-                "constraint_force": known,
+                "constraint_force": every,
             },
         )
 

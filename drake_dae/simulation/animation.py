@@ -79,7 +79,7 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
     _draw_paths(meshcat, loads, np.array([load.points for load in course]), "actual")
     wanted = _desired_states(model, states, desired, values)
     if wanted:
-        none = np.zeros(model.dae.num_constraints)
+        none = np.zeros(len(model.dae.force_signals))
         points = np.array(
             [loads(x, none, own).points for x, own in zip(wanted, values, strict=False)]
         )

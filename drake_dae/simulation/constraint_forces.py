@@ -196,7 +196,7 @@ class ConstraintForceVisualizer(LeafSystem):
         self._values, self._places = model.dae.parameter_values, plant.exogenous_places
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
-        self._force = self.DeclareVectorInputPort("constraint_force", model.dae.num_constraints)
+        self._force = self.DeclareVectorInputPort("constraint_force", len(model.dae.force_signals))
         self._exogenous = self.DeclareVectorInputPort("exogenous", len(self._places))
         self.DeclarePeriodicPublishEvent(period, 0.0, weakly(self._publish))
         self.DeclareForcedPublishEvent(weakly(self._publish))

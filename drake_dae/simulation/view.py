@@ -147,7 +147,7 @@ def draw_surroundings(
         parameters: Values of all parameters.
     """
     _, size = scene_extent(model, loads, state)
-    points = loads(state, np.zeros(model.dae.num_constraints)).points
+    points = loads(state, np.zeros(len(model.dae.force_signals))).points
     for constraint, point in zip(loads.constraints, points, strict=True):
         own = own_values(constraint, model.dae, parameters)
         picture = constraint.picture(own, point, size)
@@ -171,7 +171,7 @@ def scene_extent(
     links, dae = model.links, model.dae
     inputs = {"q": links.q, "parameters": dae.parameter_symbol}
     landmarks = TracedFunction("landmarks", inputs, {"points": links.landmarks()})
-    held = loads(state, np.zeros(dae.num_constraints)).points
+    held = loads(state, np.zeros(len(dae.force_signals))).points
     own = landmarks(state[: links.q.numel()], dae.parameter_values)[0].reshape(3, -1, order="F").T
     places = np.vstack([np.zeros((1, 3)), own, held])
     low, high = places.min(axis=0), places.max(axis=0)

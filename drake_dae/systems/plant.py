@@ -14,6 +14,7 @@ from pydrake.systems.framework import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
+from drake_dae.dae.structure.redundancy import manifold_of_left_out
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.systems.block import ParameterizedSystem
@@ -44,6 +45,9 @@ class DaePlant(ParameterizedSystem):
     Output ports:
         state: x, shape (n,).
         constraint_force: v, shape (m,); direct feedthrough from `control` where beta is not zero.
+            Where redundant constraints share their forces, those of all, in the order of
+            `system.force_signals`: their sum is determined, the split by least squares; see
+            `share_forces`.
         constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, constraint-major, shape
             (sum r_i,); zero on N*.
         controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
@@ -88,8 +92,9 @@ class DaePlant(ParameterizedSystem):
         self.structure = structure
         self.set_name(system.name)
         elimination, derivatives = structure.elimination, structure.derivatives
-        force = derivatives.expand(derivatives.constraint_input)
-        output = system.l + ca.mtimes(system.m, force)
+        constraint_input = derivatives.expand(derivatives.constraint_input)
+        output = system.l + ca.mtimes(system.m, constraint_input)
+        force = system.forces(constraint_input)
         self._force_needs_control = elimination.beta.nnz() > 0
         self._output_needs_control = elimination.n_star.nnz() > 0
         self._is_controlled = system.num_controls > 0
@@ -101,6 +106,7 @@ class DaePlant(ParameterizedSystem):
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
         residual = structure.manifold.residual_expression
+        self._left_out = manifold_of_left_out(system)
         degrees = system.exogenous.degrees(rate, force, output, residual)
         by_state = self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
@@ -109,7 +115,7 @@ class DaePlant(ParameterizedSystem):
         )
         self.DeclareVectorOutputPort(
             "constraint_force",
-            system.num_constraints,
+            len(system.force_signals),
             weakly(self._calc_force),
             by_control if self._force_needs_control else by_state,
         )
@@ -150,7 +156,9 @@ class DaePlant(ParameterizedSystem):
             InconsistentStateError: None is found near the guess.
         """
         self.check_context(context)
-        state = self.structure.manifold.settle(guess, self._values(context))
+        values = self._values(context)
+        state = self.structure.manifold.settle(guess, values)
+        self._check_left_out(state, values)
         self.set_state(context, state)
         return state
 
@@ -201,6 +209,7 @@ class DaePlant(ParameterizedSystem):
         manifold = self.structure.manifold
         state, parameters = self.state(context), self._values(context)
         if manifold.is_consistent(state, parameters):
+            self._check_left_out(state, parameters)
             return EventStatus.DidNothing()
         residual = manifold.residual(state, parameters)
         table = ", ".join(
@@ -211,6 +220,22 @@ class DaePlant(ParameterizedSystem):
         raise InconsistentStateError(
             f"{self.dae.name}: the start state is not on the constraint: {table}. Call "
             "set_consistent_state(context, guess) to start from the nearest consistent state",
+            residual,
+        )
+
+    def _check_left_out(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a state at which redundant constraints that were left out do not hold."""
+        left_out = self._left_out
+        if left_out is None or left_out.is_consistent(state, parameters):
+            return
+        residual = left_out.residual(state, parameters)
+        worst = int(np.argmax(np.abs(residual)))
+        signal = left_out.residual_signals[worst]
+        raise InconsistentStateError(
+            f"{self.dae.name}: the constraints that stay hold at state {show(state)}, but not "
+            f"the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
+            f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
+            "one of these constraints and not the others; start nearer to where all hold",
             residual,
         )
 

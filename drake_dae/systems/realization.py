@@ -83,7 +83,7 @@ class StateRealization(ParameterizedSystem):
             rate = ca.jtimes(normal_form.completion, dae.state, moving)
             rate += dae.exogenous.rate(normal_form.completion)
         rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
-        force = derivatives.expand(derivatives.constraint_input)
+        force = dae.forces(derivatives.expand(derivatives.constraint_input))
         self._force_needs_control = elimination.beta.nnz() > 0
         self._dynamics = structure.trace("state realization", rates, True)
         self._force = structure.trace("constraint force", force, self._force_needs_control)
@@ -113,7 +113,7 @@ class StateRealization(ParameterizedSystem):
         )
         self.DeclareVectorOutputPort(
             "constraint_force",
-            dae.num_constraints,
+            len(dae.force_signals),
             weakly(self._calc_force),
             by_control if self._force_needs_control else by_state,
         )

@@ -83,8 +83,8 @@ class RobotPlant(DaePlant):
 
     def _add_wrenches(self) -> None:
         model, dae = self.model, self.dae
-        force = ca.SX.sym("force", dae.num_constraints)
         bound = ConstraintSet(model.constraints)
+        force = ca.SX.sym("force", bound.size)
         wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
         inputs = {"state": dae.state, "force": force, "parameters": dae.parameter_symbol}
         self._wrenches = TracedFunction("constraint wrenches", inputs, {"value": wrenches})
@@ -112,7 +112,8 @@ class RobotPlant(DaePlant):
         formulas = super()._formulas()
         wrenches, force = self._wrench_formula
         derivatives = self.structure.derivatives
-        acting = ca.substitute(wrenches, force, derivatives.expand(derivatives.constraint_input))
+        constraint_input = derivatives.expand(derivatives.constraint_input)
+        acting = ca.substitute(wrenches, force, self.dae.forces(constraint_input))
         formulas["constraint_wrenches"] = TracedFormula(
             self.structure.trace("constraint wrenches", acting, self._force_needs_control),
             signals=self._signals,

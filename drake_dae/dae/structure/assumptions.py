@@ -32,7 +32,8 @@ class Cause(Enum):
     REDUNDANT = (
         "The constraints are redundant at every state: how the forces split among them is not "
         "determined. Remove a redundant constraint with its constraint input, as drop_constraints "
-        "does"
+        "does, or have the forces shared by least squares: share_forces, or `compliances` of a "
+        "robot or a scenario"
     )
     SINGULAR_CONFIGURATION = (
         "This is a singular configuration: the constraints are redundant there, and not around it, "
@@ -130,10 +131,10 @@ class Violation:
                 what = "gradients of constraints"
                 if self.cause in (Cause.CONSTRAINT_RANK, Cause.HIDDEN_DEGREE):
                     what = "rows of A(x)"
-                return (
-                    f"A(x) loses rank{where}: smallest singular value {value} (rows and columns "
-                    f"scaled){f'; {what}: {rows}' if rows else ''}"
-                )
+                found = [f"{what}: {rows}"] if rows else []
+                if value:
+                    found.insert(0, f"smallest singular value {value} (rows and columns scaled)")
+                return f"A(x) loses rank{where}: {'; '.join(found)}"
             case Cause.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "

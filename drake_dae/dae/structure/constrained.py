@@ -16,9 +16,10 @@ from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence
+from drake_dae.dae.structure.redundancy import find_redundant
 from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -175,7 +176,12 @@ def examine_constraints(
         InconsistentStateError: There is no consistent state near a guess.
         ModelError: A function is not finite, or the mass matrix is none.
     """
-    chains = constraint_chains(system, guesses, region)
+    try:
+        chains = constraint_chains(system, guesses, region)
+    except AssumptionError as error:
+        if error.violation is not None:
+            raise _as_redundant(system, error.violation).error() from None
+        raise
     samples = Samples(Manifold(system, chains), guesses, region)
     _check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
@@ -211,15 +217,33 @@ def constraint_violation(found: ConstraintStructure) -> Violation | None:
     causes = ((1, Cause.CONSTRAINT_DEGREE), (2, Cause.CONSTRAINT_RANK))
     signals, margin = found.system.constraint_output_signals, found.constraint_margin
     violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
-    if violation is None or violation.cause is not Cause.CONSTRAINT_RANK or margin is None:
+    if violation is None or margin is None:
         return violation
+    if violation.cause is not Cause.CONSTRAINT_RANK:
+        return _as_redundant(found.system, violation)
     dependence = find_dependence(found.manifold, found.elimination, found.states, margin.state)
     cause = Cause.CONSTRAINT_RANK
     if dependence.in_gradients:
         cause = Cause.REDUNDANT if dependence.everywhere else Cause.SINGULAR_CONFIGURATION
     elif dependence.everywhere:
         cause = Cause.HIDDEN_DEGREE
-    return replace(violation, cause=cause, combinations=dependence.combinations)
+    found_cause = replace(violation, cause=cause, combinations=dependence.combinations)
+    return _as_redundant(found.system, found_cause)
+
+
+def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
+    """What is really violated where redundant constraints led to a singular configuration.
+
+    Off N* they are more than there is to keep, and the states that keep them are those.
+    """
+    if violation.cause not in (Cause.CONSTRAINT_DEGREE, Cause.SINGULAR_CONFIGURATION):
+        return violation
+    combinations = find_redundant(system)
+    # A gradient that vanishes wherever its constraint holds follows from no other one.
+    if not combinations or not all(combination.others for combination in combinations):
+        return violation
+    names = tuple(signal.name for signal in system.constraint_output_signals)
+    return Violation(2, Cause.REDUNDANT, names, combinations=combinations)
 
 
 def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
