@@ -14,7 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint, RpyFloatingJoint
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.resources import check_resources, package_folder
 from drake_dae.diagrams.scenario import FOLDER, Scenario
@@ -24,6 +24,7 @@ from drake_dae.robots.actuation import Stage
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.control_choice import control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
@@ -58,7 +59,10 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     stages = _stages(scenario.actuation, links)
     _check_forces(scenario.forces, constraints, links)
     loads = each("loads", scenario.loads, lambda load: _load(load, links))
-    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages)
+    weights = scenario.control_weights or None
+    with at("control_weights"):
+        choice = control_choice(name, weights, links.actuator_signals)
+    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
     with at("actuation" if stages else "outputs"):
         return RobotModel(
             links,
@@ -70,6 +74,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
             scenario.forces,
             tuple(scenario.exogenous),
             loads,
+            weights,
         )
 
 
@@ -298,11 +303,12 @@ def _check_exogenous(
     links: Links,
     members: Sequence[Constraint | KnownForce],
     stages: Sequence[Stage],
+    choice: Sequence[Parameter],
 ) -> None:
     """Refuses to move what is no parameter."""
     attached = [stage.attach(links).parameters for stage in stages]
     groups = [links.parameters, *(member.parameters for member in members), *attached]
-    known = [parameter.name for group in groups for parameter in group]
+    known = [parameter.name for group in (*groups, choice) for parameter in group]
     for name in names:
         if name not in known:
             raise ModelError(unknown_name("parameter", name, known))

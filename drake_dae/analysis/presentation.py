@@ -10,7 +10,7 @@ from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR, Margin
-from drake_dae.dae.structure.structure import why_not_square
+from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
@@ -171,7 +171,7 @@ def _places(findings: Findings) -> list[Part]:
         for a in findings.assumptions
         if a.margin is not None and a.finding is Finding.SATISFIED and a.number in matrices
     ]
-    why = why_not_square(findings.system)
+    why = why_no_law(findings.system)
     if why and findings.constraint_structure is not None:
         lines.append(f"Not more was examined: {why}.")
     zero = findings.zero_dynamics

@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import ActuationChain, chain
@@ -20,6 +20,7 @@ from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
@@ -44,7 +45,13 @@ class RobotModel:
     position outputs as actuators less constraints. Where fewer forces can or shall be steered, as
     those of wheels and of mimic joints, or combinations of them, as in a grasp, `forces` tells
     which: z_2 = S(q) lambda, and there are as many position outputs as actuators less these. All of
-    lambda is on the plant's port nevertheless.
+    lambda is on the plant's port nevertheless. Where there are fewer outputs than actuators, as in
+    a parallel robot with more motors than freedoms, `control_weights` w says which control it shall
+    be: that with the least sum w_i (u_i - u_0i)^2 of all that steer the outputs alike; see
+    `DaeSystem`. u_0 is the parameter "free_control", zero where nobody sets or moves it: it presses
+    and moves what the outputs leave free, and no output. Behind springs that is one deflection for
+    each actuator too many, which nothing damps: rather make the force that it presses with an
+    output.
 
     Args:
         links: The links, which provide M, H and the frames.
@@ -60,6 +67,9 @@ class RobotModel:
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
         loads: Known forces on frames, which are zero where nobody sets their parameters.
+        control_weights: w, positive, for more actuators than outputs: one for each, shape (nu,), or
+            a number for all, where all controls have one unit. The squares of 1 / limit share the
+            load as the limits are. It becomes the parameter "control_weights".
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
@@ -87,6 +97,7 @@ class RobotModel:
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
+        control_weights: ArrayLike | None = None,
     ) -> None:
         self.links = links
         self.constraints = (*constraints, *plant_constraints(links))
@@ -98,8 +109,10 @@ class RobotModel:
         S = force_rows(self.forces, bound, links)
         self._num_forces = S.shape[0]
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
-        self._check_outputs(self._num_forces, h_1.numel())
+        signals = [signal for output in self.positions for signal in output.signals(links)]
+        check_outputs(name, links, self._num_forces, signals, control_weights is not None)
         driven = chain(actuation, links)
+        choice = control_choice(name, control_weights, driven.control_signals)
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
         is_joint_force = driven.control_signals == tuple(links.actuator_signals)
@@ -107,7 +120,8 @@ class RobotModel:
             links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
         )
         nominal = self._nominal(nominal_positions)
-        self.dae = self._equations(bound, h_1, S, driven, nominal).with_exogenous(exogenous)
+        dae = self._equations(bound, h_1, S, driven, nominal, choice)
+        self.dae = dae.with_exogenous(exogenous)
         self._check_exogenous()
         self._check_mass_matrix(nominal)
         self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
@@ -127,6 +141,7 @@ class RobotModel:
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
+        control_weights: ArrayLike | None = None,
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -144,6 +159,7 @@ class RobotModel:
             forces,
             exogenous,
             loads,
+            control_weights,
         )
 
     @property
@@ -244,31 +260,6 @@ class RobotModel:
                     "velocities"
                 )
 
-    def _check_outputs(self, m: int, count: int) -> None:
-        """Refuses outputs that, with m constraint forces, are not as many as the actuators."""
-        actuation = self.links.actuation_matrix
-        nu = actuation.shape[1]
-        rank = int(np.linalg.matrix_rank(actuation)) if nu else 0
-        if rank < nu:
-            actuators = ", ".join(signal.name for signal in self.links.actuator_signals)
-            raise ModelError(
-                f"{self.name}: the {nu} actuators {actuators} move the joints in {rank} "
-                "independent ways only, as where two drive one joint; leave one out"
-            )
-        if m > nu:
-            raise ModelError(
-                f"{self.name}: {m} constraint forces are outputs, but {nu} actuators can steer "
-                f"{nu} outputs; name in `forces` those that are outputs, take constraints "
-                "away, or add actuators"
-            )
-        if count + m and count + m != nu:  # A robot that is only simulated needs none.
-            names = [s.name for p in self.positions for s in p.signals(self.links)]
-            raise ModelError(
-                f"{self.name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces "
-                f"are outputs already, so {nu - m} position outputs are needed; given are "
-                f"{count} ({', '.join(names) or 'none'})"
-            )
-
     def _nominal(self, given: ArrayLike | None) -> FloatArray:
         nominal = self.links.default_positions if given is None else given
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
@@ -280,6 +271,7 @@ class RobotModel:
         S: ca.SX,
         driven: ActuationChain,
         nominal: FloatArray,
+        choice: tuple[Parameter, ...],
     ) -> DaeSystem:
         """(43)-(45), with M on the left; below the rows of the links stand those of the stages."""
         links = self.links
@@ -318,6 +310,7 @@ class RobotModel:
                 *driven.parameters,
                 *bound.parameters,
                 *(parameter for load in self.loads for parameter in load.parameters),
+                *choice,
             ),
             state_signals=(
                 *links.position_signals,
@@ -331,6 +324,8 @@ class RobotModel:
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
             implicit=implicit,
+            control_metric=ca.diag(choice[0].symbol) if choice else None,
+            free_control=choice[1].symbol if choice else None,
         )
 
     def _known_force(self) -> ca.SX:

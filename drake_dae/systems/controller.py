@@ -71,7 +71,7 @@ class TrackingController(ParameterizedSystem):
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
         self.DeclareVectorOutputPort(
-            "tracking_error", dae.num_controls, weakly(self._calc_tracking_error), sources
+            "tracking_error", dae.num_outputs, weakly(self._calc_tracking_error), sources
         )
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
