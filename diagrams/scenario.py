@@ -47,6 +47,8 @@ Constraint = Annotated[
     | contact.CoincidentPoints
     | contact.FixedDistance
     | contact.JointCoupler
+    | contact.RevoluteLoopJoint
+    | contact.PrismaticLoopJoint
     | contact.AxisNormalToSurface
     | contact.Blade
     | contact.RollingWheel

@@ -21,6 +21,7 @@ from drake_dae.diagrams.scenario import FOLDER, Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
+from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
@@ -52,6 +53,13 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 
     # What it touches or holds.
     constraints = _constraints(scenario.constraints, links)
+    actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
+    if not actuators:
+        text = (
+            f"'{Path(scenario.robot.file).name}' has no actuators; in a URDF, give each driven "
+            "joint a <transmission>"
+        )
+        raise ScenarioError(("robot.file", text))
 
     # What it shall steer, from where, and by what.
     outputs = _outputs(scenario.outputs, constraints, links)
@@ -61,7 +69,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     loads = each("loads", scenario.loads, lambda load: _load(load, links))
     weights = scenario.control_weights or None
     with at("control_weights"):
-        choice = control_choice(name, weights, links.actuator_signals)
+        choice = control_choice(name, weights, actuators)
     _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
     with at("actuation" if stages else "outputs"):
         return RobotModel(
@@ -123,11 +131,6 @@ def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
                 "quaternion is not supported: no force keeps its length"
             )
     links = MultibodyExpressions(plant)
-    if not links.actuator_signals:
-        raise ModelError(
-            f"'{Path(robot.file).name}' has no actuators; in a URDF, give each driven joint a "
-            "<transmission>"
-        )
     plant_constraints(links)
     return links
 
@@ -288,7 +291,11 @@ def _outputs(
 
 
 def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
-    each("actuation", stages, lambda stage: stage.attach(links))
+    if links.actuator_signals:
+        each("actuation", stages, lambda stage: stage.attach(links))
+    else:
+        with at("actuation"):
+            chain(stages, links)  # It refuses them.
     return stages
 
 

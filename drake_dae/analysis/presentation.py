@@ -175,6 +175,12 @@ def _places(findings: Findings) -> list[Part]:
     if why and findings.constraint_structure is not None:
         lines.append(f"Not more was examined: {why}.")
     zero = findings.zero_dynamics
+    spare = findings.system.num_controls - findings.system.num_outputs
+    if findings.system.control_metric is not None and findings.structure is not None:
+        lines.append(
+            f"B(x) leaves {count_of(spare, 'combination')} of the controls open: they are next to "
+            "free_control in the system's control_metric."
+        )
     if zero is not None and zero.eigenvalues.size:
         lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")
     if zero is not None and findings.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:

@@ -12,13 +12,19 @@ from drake_dae.robots.links.links import Links
 
 
 def check_outputs(
-    name: str, links: Links, forces: int, positions: Sequence[Signal], is_chosen: bool
+    name: str,
+    links: Links,
+    motors: Sequence[Signal],
+    forces: int,
+    positions: Sequence[Signal],
+    is_chosen: bool,
 ) -> None:
     """Refuses outputs that are not as many as the actuators, or no fewer where weights choose.
 
     Args:
         name: The robot's name in messages.
         links: The robot.
+        motors: The actuators beside those of the links, in joints that close loops.
         forces: How many outputs are forces.
         positions: Names and units of the position outputs.
         is_chosen: Whether there are weights that choose the control.
@@ -26,8 +32,9 @@ def check_outputs(
     Raises:
         ModelError: The numbers do not fit.
     """
-    nu, count = len(links.actuator_signals), len(positions)
-    rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if nu else 0
+    own, count = len(links.actuator_signals), len(positions)
+    rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if own else 0
+    nu = own + len(motors)
     if is_chosen:
         if not 0 < count + forces < nu:
             raise ModelError(
@@ -36,10 +43,10 @@ def check_outputs(
                 "out"
             )
         return
-    if rank < nu:
+    if rank < own:
         actuators = ", ".join(signal.name for signal in links.actuator_signals)
         raise ModelError(
-            f"{name}: the {nu} actuators {actuators} move the joints in {rank} independent ways "
+            f"{name}: the {own} actuators {actuators} move the joints in {rank} independent ways "
             "only, as where two drive one joint; leave one out, or give control_weights and fewer "
             "outputs"
         )

@@ -25,6 +25,7 @@ from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_row
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
+from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
 from drake_dae.trace.functions import TracedFunction
@@ -79,7 +80,8 @@ class RobotModel:
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
         control_limits: The largest |u| per actuator, infinite where there is none or where u is
-            no joint force.
+            no joint force; those in joints that close loops come last.
+        loop_joints: The joints that close loops, with their coordinates and limits.
 
     Raises:
         ModelError: There are too many or too few outputs, M is not positive definite, stages do not
@@ -110,15 +112,26 @@ class RobotModel:
         self._num_forces = S.shape[0]
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
         signals = [signal for output in self.positions for signal in output.signals(links)]
-        check_outputs(name, links, self._num_forces, signals, control_weights is not None)
+        weighted = control_weights is not None
+        check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)
         driven = chain(actuation, links)
-        choice = control_choice(name, control_weights, driven.control_signals)
+        if driven.stages and bound.motors:
+            raise ModelError(
+                f"{name}: '{bound.motors[0].name}' drives its joint at once, and the others drive "
+                "theirs through stages: the control would reach the outputs at different orders. "
+                "Cut the loop at a joint without motor"
+            )
+        self._controls = (*driven.control_signals, *bound.motors)
+        choice = control_choice(name, control_weights, self._controls)
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
         is_joint_force = driven.control_signals == tuple(links.actuator_signals)
-        self.control_limits = (
-            links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
-        )
+        efforts = links.effort_limits
+        if not is_joint_force:
+            efforts = np.full(efforts.size, np.inf)
+        motors = [joint.effort_limit for _, joint in bound.joints if joint.motor is not None]
+        self.control_limits = np.concatenate([efforts, motors])
+        self.loop_joints = LoopState.of(bound, links)
         nominal = self._nominal(nominal_positions)
         dae = self._equations(bound, h_1, S, driven, nominal, choice)
         self.dae = dae.with_exogenous(exogenous)
@@ -276,10 +289,11 @@ class RobotModel:
         """(43)-(45), with M on the left; below the rows of the links stand those of the stages."""
         links = self.links
         nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
-        m, nu = bound.size, len(links.actuator_signals)
+        m, nu = bound.size, len(self._controls)
         B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(B, driven.joint_force) + self._known_force()
+        torque = ca.mtimes(B, driven.joint_force) + self._known_force() + self.loop_joints.force
+        motors = self.loop_joints.motors
         rotors = self._moved_rotors(driven)
 
         def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -301,7 +315,11 @@ class RobotModel:
             mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
             f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
             g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
-            h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(B, driven.direct), driven.drive),
+            h=ca.vertcat(
+                ca.SX(nq, nu),
+                ca.horzcat(ca.mtimes(B, driven.direct), motors),
+                ca.horzcat(driven.drive, ca.SX(k, motors.shape[1])),
+            ),
             k=bound.constraint_output(links.kinematics()),  # (44)
             l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
             m=ca.vertcat(ca.SX(h_1.numel(), m), S),
@@ -319,7 +337,7 @@ class RobotModel:
             ),
             constraint_input_signals=bound.force_signals,
             constraint_output_signals=bound.residual_signals,
-            control_signals=driven.control_signals,
+            control_signals=self._controls,
             output_signals=(*position_signals, *force_outputs),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,

@@ -30,7 +30,7 @@ class TrackingController(ParameterizedSystem):
 
     Output ports:
         control: u, shape (p,).
-        tracking_error: e = z - r (29) by the controller's own model, shape (p,).
+        tracking_error: e = z - r (29) by the controller's own model, one entry per output.
 
     Both output ports have direct feedthrough from all input ports. The context holds the model's
     parameters and then the gains as one numeric parameter; see `set_parameter` and `set_gains`.

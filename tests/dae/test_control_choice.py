@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.systems.analysis import Simulator
 
 from drake_dae import (
@@ -15,6 +16,7 @@ from drake_dae import (
     Parameter,
     SinusoidReference,
     StateRealization,
+    TrackingController,
     TrackingLaw,
     ZeroDynamics,
     analyze,
@@ -209,6 +211,40 @@ def test_its_closed_loop_has_the_poles_of_the_gains():
     rate = np.sqrt(4.0 - 0.01)
     # A double root moves by the square root of round-off.
     assert_allclose(found, np.sort_complex([-3, -3, -0.1 - rate * 1j, -0.1 + rate * 1j]), atol=1e-6)
+
+
+def test_a_measured_force_takes_the_place_of_the_model_in_the_same_choice(law):
+    """ubar of the force is r - Gbar (v - r), as by (59); all else is as above."""
+    random = np.random.default_rng(5)
+    measuring = TrackingLaw(
+        law.system, poles(-3.0), structure=law.structure, measured_force=True, force_gain=0.5
+    )
+    x, R = consistent(law, random), random.uniform(-1.0, 1.0, 4)
+    ubar = [R[2] - 6.0 * (x[3] - R[1]) - 9.0 * (x[0] - R[0]), R[3] - 0.5 * (4.0 - R[3])]
+    expected, *_ = by_hand(x, np.array(ubar))
+    assert_allclose(measuring.control(x, R, measured_force=[4.0]), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_the_controller_has_the_gradients_of_the_choice(law):
+    """By AutoDiffXd and by central differences of 1e-6, so 1e-7."""
+    random = np.random.default_rng(6)
+    controller = TrackingController(law)
+    assert controller.GetOutputPort("control").size() == 4
+    assert controller.GetOutputPort("tracking_error").size() == 2
+    converted = controller.ToAutoDiffXd()
+    context = converted.CreateDefaultContext()
+    x, R = consistent(law, random), random.uniform(-1.0, 1.0, 4)
+    converted.GetInputPort("estimated_state").FixValue(context, InitializeAutoDiff(x))
+    converted.GetInputPort("reference").FixValue(context, R)
+    value = converted.GetOutputPort("control").Eval(context)
+    assert_allclose(ExtractValue(value).ravel(), law.control(x, R), rtol=1e-14)
+    steps = 1e-6 * np.eye(6)
+    expected = [(law.control(x + dx, R) - law.control(x - dx, R)) / 2e-6 for dx in steps]
+    assert_allclose(ExtractGradient(value), np.array(expected).T, rtol=1e-6, atol=1e-7)
+
+
+def test_the_report_tells_what_is_left_to_choose(law):
+    assert "B(x) leaves 2 combinations of the controls open" in str(analyze(law.system, count=5))
 
 
 def test_units_of_the_controls_change_nothing_but_their_numbers(law):
