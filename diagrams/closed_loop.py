@@ -36,7 +36,7 @@ class ClosedLoop:
     Attributes:
         diagram: The diagram, with the output ports `state`, `constraint_force`,
             `constraint_residual`, `controlled_output`, `control`, `reference` and
-            `tracking_error`; `link_state` for a robot.
+            `tracking_error`; `link_state` for a robot, and `loop_state` if joints close its loops.
         plant, controller, reference: The systems in it.
         loggers: Port name -> (sink, names and units), one sample per step.
         scene_graph: The geometry of the robot, or None.
@@ -171,6 +171,8 @@ def make_closed_loop(
     }
     if law.measured_force and sensor is not None:
         named["measured_force"] = (sensor, dae.constraint_input_signals)
+    if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
+        named["loop_state"] = (plant, plant.model.loop_joints.signals)
     if moving[0] is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         builder.ExportOutput(moving[0].get_output_port(), "exogenous")

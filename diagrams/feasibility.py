@@ -127,7 +127,7 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
     }
     if model.joint_force is not None:
         effort = model.links.effort_limits
-        forces = _joint_forces(model, motion.states)
+        forces = _along(model, model.joint_force, motion.states)
         found["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
     if limits.state is not None:
         low, high = limits.state
@@ -135,6 +135,14 @@ def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRang
         chosen = [s for s, yes in zip(dae.state_signals, bounded, strict=False) if yes]
         values = motion.states[:, : low.size][:, bounded]
         found["joints"] = ranges(chosen, values, low[bounded], high[bounded])
+    if limits.loops is not None:
+        low, high = limits.loops
+        bounded = np.isfinite(low) | np.isfinite(high)
+        loops = model.loop_joints
+        chosen = [s for s, yes in zip(loops.signals, bounded, strict=True) if yes]
+        values = _along(model, loops.state, motion.states)[:, bounded]
+        own = ranges(chosen, values, low[bounded], high[bounded])
+        found["joints"] = (*found.get("joints", ()), *own)
     return found
 
 
@@ -148,11 +156,11 @@ def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
     return np.array([function(x, given, dae.parameter_values)[0] for x, given in pairs])
 
 
-def _joint_forces(model: RobotModel, states: FloatArray) -> FloatArray:
-    """tau at each state, shape (k, nu)."""
+def _along(model: RobotModel, expression: ca.SX, states: FloatArray) -> FloatArray:
+    """The values of an expression of the state at each state, shape (k, size)."""
     dae = model.dae
     inputs = {"state": dae.state, "parameters": dae.parameter_symbol}
-    function = TracedFunction("joint force", inputs, {"tau": ca.densify(model.joint_force)})
+    function = TracedFunction("along the motion", inputs, {"value": ca.densify(expression)})
     return np.array([function(state, dae.parameter_values)[0] for state in states])
 
 

@@ -47,6 +47,8 @@ Constraint = Annotated[
     | contact.CoincidentPoints
     | contact.FixedDistance
     | contact.JointCoupler
+    | contact.RevoluteLoopJoint
+    | contact.PrismaticLoopJoint
     | contact.AxisNormalToSurface
     | contact.Blade
     | contact.RollingWheel
@@ -106,6 +108,9 @@ class Scenario:
         forces: The force outputs: names of constraint forces, and combinations of forces by tags;
             all constraint forces where left out. Forces that nobody can or shall steer, as those of
             wheels and of mimic joints, stay out: [] is none.
+        control_weights: One for each actuator, where they are more than the outputs: the law then
+            takes the control with the least sum of weight * (u - free_control)^2. The parameter
+            "free_control" is zero where `exogenous` has it not.
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not.
@@ -129,6 +134,7 @@ class Scenario:
     constraints: list[Constraint] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
     forces: list[ForceOutput] | None = None
+    control_weights: list[float] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, list[float]] = field(default_factory=dict)

@@ -14,16 +14,18 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint, RpyFloatingJoint
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.resources import check_resources, package_folder
 from drake_dae.diagrams.scenario import FOLDER, Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
+from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.control_choice import control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
@@ -51,6 +53,13 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 
     # What it touches or holds.
     constraints = _constraints(scenario.constraints, links)
+    actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
+    if not actuators:
+        text = (
+            f"'{Path(scenario.robot.file).name}' has no actuators; in a URDF, give each driven "
+            "joint a <transmission>"
+        )
+        raise ScenarioError(("robot.file", text))
 
     # What it shall steer, from where, and by what.
     outputs = _outputs(scenario.outputs, constraints, links)
@@ -59,7 +68,10 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     _check_forces(scenario.forces, constraints, links)
     _check_compliances(scenario.compliances, constraints, links)
     loads = each("loads", scenario.loads, lambda load: _load(load, links))
-    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages)
+    weights = scenario.control_weights or None
+    with at("control_weights"):
+        choice = control_choice(name, weights, actuators)
+    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
     with at("actuation" if stages else "outputs"):
         return RobotModel(
             links,
@@ -72,6 +84,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
             tuple(scenario.exogenous),
             loads,
             scenario.compliances,
+            weights,
         )
 
 
@@ -120,11 +133,6 @@ def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
                 "quaternion is not supported: no force keeps its length"
             )
     links = MultibodyExpressions(plant)
-    if not links.actuator_signals:
-        raise ModelError(
-            f"'{Path(robot.file).name}' has no actuators; in a URDF, give each driven joint a "
-            "<transmission>"
-        )
     plant_constraints(links)
     return links
 
@@ -296,7 +304,11 @@ def _outputs(
 
 
 def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
-    each("actuation", stages, lambda stage: stage.attach(links))
+    if links.actuator_signals:
+        each("actuation", stages, lambda stage: stage.attach(links))
+    else:
+        with at("actuation"):
+            chain(stages, links)  # It refuses them.
     return stages
 
 
@@ -311,11 +323,12 @@ def _check_exogenous(
     links: Links,
     members: Sequence[Constraint | KnownForce],
     stages: Sequence[Stage],
+    choice: Sequence[Parameter],
 ) -> None:
     """Refuses to move what is no parameter."""
     attached = [stage.attach(links).parameters for stage in stages]
     groups = [links.parameters, *(member.parameters for member in members), *attached]
-    known = [parameter.name for group in groups for parameter in group]
+    known = [parameter.name for group in (*groups, choice) for parameter in group]
     for name in names:
         if name not in known:
             raise ModelError(unknown_name("parameter", name, known))

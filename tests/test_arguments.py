@@ -186,6 +186,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "axes": lambda: "xz",
     "axis": lambda: (0.0, 0.0, 1.0),
     "axis of AxisCoordinates": lambda: "z",
+    "axis of PrismaticLoopJoint": lambda: "x",
+    "axis of RevoluteLoopJoint": lambda: "x",
     "major_radius": lambda: 2.0,
     "size": lambda: 1,
     "n": lambda: 1,

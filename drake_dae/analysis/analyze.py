@@ -31,7 +31,7 @@ from drake_dae.dae.structure.structure import (
     Structure,
     control_violation,
     examine_outputs,
-    why_not_square,
+    why_no_law,
 )
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Stability
@@ -207,7 +207,7 @@ def _examine(
         regular = is_regular(samples, matrix)
     if regular:
         known["constraint_structure"] = constrained
-    without_law = why_not_square(system)
+    without_law = why_no_law(system)
     if regular and not without_law:
         try:
             structure = examine_outputs(constrained, around)

@@ -10,7 +10,7 @@ from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR, Margin
-from drake_dae.dae.structure.structure import why_not_square
+from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
@@ -193,10 +193,16 @@ def _places(findings: Findings) -> list[Part]:
         for a in findings.assumptions
         if a.margin is not None and a.finding is Finding.SATISFIED and a.number in matrices
     ]
-    why = why_not_square(findings.system)
+    why = why_no_law(findings.system)
     if why and findings.constraint_structure is not None:
         lines.append(f"Not more was examined: {why}.")
     zero = findings.zero_dynamics
+    spare = findings.system.num_controls - findings.system.num_outputs
+    if findings.system.control_metric is not None and findings.structure is not None:
+        lines.append(
+            f"B(x) leaves {count_of(spare, 'combination')} of the controls open: they are next to "
+            "free_control in the system's control_metric."
+        )
     if zero is not None and zero.eigenvalues.size:
         lines.append(f"Zero dynamics: eigenvalues {_complex(zero.eigenvalues)} 1/s.")
     if zero is not None and findings.zero_dynamics_dimension and zero.verdict != Verdict.UNSTABLE:

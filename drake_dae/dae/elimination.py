@@ -27,7 +27,7 @@ class Elimination:
         f_star: f + g alpha (9), shape (n, 1).
         h_star: h + g beta (10), shape (n, p).
         l_star: l + m alpha (11), shape (p, 1).
-        n_star: m beta (12), shape (p, p).
+        n_star: m beta (12), a row for each output, shape (p, p).
         pivot: A scalar that is 0 exactly where A(x) is singular; see `trace.factorization`.
     """
 

@@ -46,7 +46,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 def as_functions(
     owner: str, given: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
-    """f, g, h, k, l, m of (1)-(3) and the mass matrix, of the shapes that they must have.
+    """f, g, h, k, l, m of (1)-(3), and what else there is, of the shapes that they must have.
 
     Args:
         owner: The name of the system, for messages.
@@ -62,12 +62,12 @@ def as_functions(
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
     q = values["l"].numel()
     shapes = {"f": (n, 1), "g": (n, m), "h": (n, p), "k": (m, 1), "l": (q, 1), "m": (q, m)}
-    shapes["mass_matrix"] = (n, n)
+    shapes |= {"mass_matrix": (n, n), "control_metric": (p, p), "free_control": (p, 1)}
     known = ca.vertcat(state, parameters)
     if len(ca.symvar(known)) != known.numel():
         raise ModelError(f"{owner}: a symbol stands twice among the states and parameters")
-    for key, shape in shapes.items():
-        value = values[key]
+    for key, value in values.items():
+        shape = shapes[key]
         if value.numel() == 0 and 0 in shape:
             value = ca.SX(*shape)
         if value.shape != shape and value.shape == shape[::-1] and 1 in shape:

@@ -117,7 +117,7 @@ def force_gain(value: ArrayLike, size: int) -> FloatArray:
 def _force_outputs(system: DaeSystem) -> dict[int, int]:
     """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
     found = {}
-    for i in range(system.num_controls):
+    for i in range(system.num_outputs):
         row = ca.sparsify(system.m[i, :])
         if row.nnz() == 1 and system.l[i].is_zero():
             j = row.sparsity().get_triplet()[1][0]

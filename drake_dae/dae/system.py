@@ -37,6 +37,16 @@ class DaeSystem:
     E^-1 f, E^-1 g, E^-1 h (see `explicit`). Giving E, as a robot has it in M(q), costs far fewer
     operations than giving its inverse.
 
+    Where there are more controls than outputs, B(x) of (16) leaves some of the control open. A
+    `control_metric` W says how controls compare: the law (28) takes the u next to `free_control`
+    u_0, of all with B u = ubar - a,
+
+        u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0).
+
+    Whatever u_0 is, it moves no output. W u . u means something only if it adds what is alike: of
+    torques in N m and forces in N, weights by the squares of what each may be. Such systems have
+    zero dynamics that depend on the choice, which pinned outputs and stability therefore make, too.
+
     The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers
     and NumPy arrays are taken as constants. The data checks itself when it is made.
 
@@ -46,8 +56,9 @@ class DaeSystem:
         g: How the constraint inputs v enter, shape (n, m).
         h: How the control inputs u enter, shape (n, p); p = 0 is a system that nobody steers.
         k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
-        l: The controlled outputs z at v = 0, as many as the controls for a law (28), shape (p, 1);
-            a system that is only simulated may have others, or none.
+        l: The controlled outputs z at v = 0, as many as the controls for a law (28), shape (p, 1),
+            or fewer with a `control_metric`; a system that is only simulated may have others, or
+            none.
         m: How v enters the controlled outputs, shape (p, m).
         parameters: Named numbers that the expressions depend on.
         state_signals, constraint_input_signals, control_signals, constraint_output_signals,
@@ -61,6 +72,9 @@ class DaeSystem:
             operations than the expressions above: for a robot it is inverse dynamics.
         sharing: How v is shared among redundant constraints, of which k holds those that stay;
             None where v is all there is. `share_forces` makes it.
+        control_metric: W, shape (p, p), symmetric positive definite, for more controls than
+            outputs; None if there is nothing to choose.
+        free_control: u_0, shape (p, 1); zero if None.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -86,6 +100,8 @@ class DaeSystem:
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
     sharing: Sharing | None = None
+    control_metric: ca.SX = None
+    free_control: ca.SX = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -108,6 +124,8 @@ class DaeSystem:
             self._put("mass_matrix", ca.SX.eye(self.state.numel()))
         functions = {key: getattr(self, key) for key in ("f", "g", "h", "k", "l", "m")}
         functions["mass_matrix"] = self.mass_matrix
+        chosen = {key: getattr(self, key) for key in ("control_metric", "free_control")}
+        functions |= {key: value for key, value in chosen.items() if value is not None}
         checked = as_functions(self.name, functions, self.state, self.parameter_symbol)
         for key, expression in checked.items():
             self._put(key, expression)
@@ -128,6 +146,20 @@ class DaeSystem:
         nominal = vector(f"{self.name}: nominal_state", start, self.num_states)
         nominal.setflags(write=False)
         self._put("nominal_state", nominal)
+        self._check_choice()
+
+    def _check_choice(self) -> None:
+        """Refuses a choice of the control where there is none, or no metric to choose by."""
+        if self.control_metric is not None and self.free_control is None:
+            self._put("free_control", ca.SX(self.num_controls, 1))
+        if self.control_metric is None and self.free_control is not None:
+            raise ModelError(f"{self.name}: free_control needs a control_metric that it is near in")
+        if self.control_metric is not None and self.num_controls <= self.num_outputs:
+            raise ModelError(
+                f"{self.name}: control_metric chooses among controls, but with "
+                f"{self.num_controls} controls and {self.num_outputs} controlled outputs there is "
+                "nothing to choose; leave it out"
+            )
 
     def _put(self, key: str, value: object) -> None:
         """Sets a field while the frozen system is made."""

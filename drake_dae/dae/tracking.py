@@ -25,8 +25,9 @@ class TrackingLaw:
         ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
 
     with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
-    exactly. The law needs the state x; it needs no measurement of the constraint inputs, but takes
-    one with `measured_force`; see `MeasuredForce`.
+    exactly. Where controls outnumber outputs, it is the u that the system's `control_metric`
+    chooses, next to its `free_control`. The law needs the state x; it needs no measurement of the
+    constraint inputs, but takes one with `measured_force`; see `MeasuredForce`.
 
     The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
     numbers.

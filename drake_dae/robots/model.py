@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.redundancy import share_forces
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -21,10 +21,12 @@ from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
+from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
 from drake_dae.trace.functions import TracedFunction
@@ -45,7 +47,13 @@ class RobotModel:
     position outputs as actuators less constraints. Where fewer forces can or shall be steered, as
     those of wheels and of mimic joints, or combinations of them, as in a grasp, `forces` tells
     which: z_2 = S(q) lambda, and there are as many position outputs as actuators less these. All of
-    lambda is on the plant's port nevertheless.
+    lambda is on the plant's port nevertheless. Where there are fewer outputs than actuators, as in
+    a parallel robot with more motors than freedoms, `control_weights` w says which control it shall
+    be: that with the least sum w_i (u_i - u_0i)^2 of all that steer the outputs alike; see
+    `DaeSystem`. u_0 is the parameter "free_control", zero where nobody sets or moves it: it presses
+    and moves what the outputs leave free, and no output. Behind springs that is one deflection for
+    each actuator too many, which nothing damps: rather make the force that it presses with an
+    output.
 
     Args:
         links: The links, which provide M, H and the frames.
@@ -65,6 +73,9 @@ class RobotModel:
             compliant it is relative to the others, 1 where not named, {} for all alike. The forces
             are then shared by least squares, see `share_forces`: their split is not determined, and
             an output that depends on it is refused. None takes no redundant constraints.
+        control_weights: w, positive, for more actuators than outputs: one for each, shape (nu,), or
+            a number for all, where all controls have one unit. The squares of 1 / limit share the
+            load as the limits are. It becomes the parameter "control_weights".
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
@@ -74,7 +85,8 @@ class RobotModel:
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
         control_limits: The largest |u| per actuator, infinite where there is none or where u is
-            no joint force.
+            no joint force; those in joints that close loops come last.
+        loop_joints: The joints that close loops, with their coordinates and limits.
 
     Raises:
         ModelError: There are too many or too few outputs, M is not positive definite, stages do not
@@ -93,6 +105,7 @@ class RobotModel:
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
+        control_weights: ArrayLike | None = None,
     ) -> None:
         self.links = links
         self.constraints = (*constraints, *plant_constraints(links))
@@ -104,16 +117,30 @@ class RobotModel:
         S = force_rows(self.forces, bound, links)
         self._num_forces = S.shape[0]
         h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
-        self._check_outputs(self._num_forces, h_1.numel())
+        signals = [signal for output in self.positions for signal in output.signals(links)]
+        weighted = control_weights is not None
+        check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)
         driven = chain(actuation, links)
+        if driven.stages and bound.motors:
+            raise ModelError(
+                f"{name}: '{bound.motors[0].name}' drives its joint at once, and the others drive "
+                "theirs through stages: the control would reach the outputs at different orders. "
+                "Cut the loop at a joint without motor"
+            )
+        self._controls = (*driven.control_signals, *bound.motors)
+        choice = control_choice(name, control_weights, self._controls)
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
         is_joint_force = driven.control_signals == tuple(links.actuator_signals)
-        self.control_limits = (
-            links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
-        )
+        efforts = links.effort_limits
+        if not is_joint_force:
+            efforts = np.full(efforts.size, np.inf)
+        motors = [joint.effort_limit for _, joint in bound.joints if joint.motor is not None]
+        self.control_limits = np.concatenate([efforts, motors])
+        self.loop_joints = LoopState.of(bound, links)
         nominal = self._nominal(nominal_positions)
-        self.dae = self._equations(bound, h_1, S, driven, nominal).with_exogenous(exogenous)
+        dae = self._equations(bound, h_1, S, driven, nominal, choice)
+        self.dae = dae.with_exogenous(exogenous)
         self._check_exogenous()
         if compliances is not None:
             self.dae = share_forces(self.dae, compliances=compliances)
@@ -139,6 +166,7 @@ class RobotModel:
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
+        control_weights: ArrayLike | None = None,
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -157,6 +185,7 @@ class RobotModel:
             exogenous,
             loads,
             compliances,
+            control_weights,
         )
 
     @property
@@ -257,31 +286,6 @@ class RobotModel:
                     "velocities"
                 )
 
-    def _check_outputs(self, m: int, count: int) -> None:
-        """Refuses outputs that, with m constraint forces, are not as many as the actuators."""
-        actuation = self.links.actuation_matrix
-        nu = actuation.shape[1]
-        rank = int(np.linalg.matrix_rank(actuation)) if nu else 0
-        if rank < nu:
-            actuators = ", ".join(signal.name for signal in self.links.actuator_signals)
-            raise ModelError(
-                f"{self.name}: the {nu} actuators {actuators} move the joints in {rank} "
-                "independent ways only, as where two drive one joint; leave one out"
-            )
-        if m > nu:
-            raise ModelError(
-                f"{self.name}: {m} constraint forces are outputs, but {nu} actuators can steer "
-                f"{nu} outputs; name in `forces` those that are outputs, take constraints "
-                "away, or add actuators"
-            )
-        if count + m and count + m != nu:  # A robot that is only simulated needs none.
-            names = [s.name for p in self.positions for s in p.signals(self.links)]
-            raise ModelError(
-                f"{self.name}: {nu} actuators can steer {nu} outputs. The {m} constraint forces "
-                f"are outputs already, so {nu - m} position outputs are needed; given are "
-                f"{count} ({', '.join(names) or 'none'})"
-            )
-
     def _nominal(self, given: ArrayLike | None) -> FloatArray:
         nominal = self.links.default_positions if given is None else given
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
@@ -293,14 +297,16 @@ class RobotModel:
         S: ca.SX,
         driven: ActuationChain,
         nominal: FloatArray,
+        choice: tuple[Parameter, ...],
     ) -> DaeSystem:
         """(43)-(45), with M on the left; below the rows of the links stand those of the stages."""
         links = self.links
         nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
-        m, nu = bound.size, len(links.actuator_signals)
+        m, nu = bound.size, len(self._controls)
         B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(B, driven.joint_force) + self._known_force()
+        torque = ca.mtimes(B, driven.joint_force) + self._known_force() + self.loop_joints.force
+        motors = self.loop_joints.motors
         rotors = self._moved_rotors(driven)
 
         def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -322,7 +328,11 @@ class RobotModel:
             mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
             f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
             g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
-            h=ca.vertcat(ca.SX(nq, nu), ca.mtimes(B, driven.direct), driven.drive),
+            h=ca.vertcat(
+                ca.SX(nq, nu),
+                ca.horzcat(ca.mtimes(B, driven.direct), motors),
+                ca.horzcat(driven.drive, ca.SX(k, motors.shape[1])),
+            ),
             k=bound.constraint_output(links.kinematics()),  # (44)
             l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
             m=ca.vertcat(ca.SX(h_1.numel(), m), S),
@@ -331,6 +341,7 @@ class RobotModel:
                 *driven.parameters,
                 *bound.parameters,
                 *(parameter for load in self.loads for parameter in load.parameters),
+                *choice,
             ),
             state_signals=(
                 *links.position_signals,
@@ -339,11 +350,13 @@ class RobotModel:
             ),
             constraint_input_signals=bound.force_signals,
             constraint_output_signals=bound.residual_signals,
-            control_signals=driven.control_signals,
+            control_signals=self._controls,
             output_signals=(*position_signals, *force_outputs),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
             implicit=implicit,
+            control_metric=ca.diag(choice[0].symbol) if choice else None,
+            free_control=choice[1].symbol if choice else None,
         )
 
     def _known_force(self) -> ca.SX:

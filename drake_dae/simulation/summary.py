@@ -23,12 +23,14 @@ class Limits:
     Attributes:
         control: The largest |u|, shape (p,).
         state: The lowest and the highest (q, v), shape (nq + nv,) each.
+        loops: The same of the joints that close loops, (c, c').
         pushing: Names of the constraint forces that can only push; None if that is all of them.
     """
 
     control: FloatArray | None = None
     state: tuple[FloatArray, FloatArray] | None = None
     pushing: frozenset[str] | None = None
+    loops: tuple[FloatArray, FloatArray] | None = None
 
     def can_pull(self, force: Signal) -> bool:
         """Whether a constraint force may be negative."""
@@ -48,7 +50,8 @@ class Limits:
             )
             if pushes
         )
-        return cls(model.control_limits, state, pushing)
+        loops = model.loop_joints.limits if model.loop_joints.signals else None
+        return cls(model.control_limits, state, pushing, loops)
 
 
 def summary(
@@ -152,10 +155,11 @@ def _controls(record: Record, limits: Limits) -> list[str]:
 
 def _beyond(record: Record, limits: Limits) -> list[str]:
     """Positions and velocities that leave their limits."""
-    if limits.state is None:
-        return []
-    states = record.signals["state"]
-    rows = zip(states.signals, states.values.T, *limits.state, strict=False)
+    rows: list[tuple[Signal, FloatArray, float, float]] = []
+    for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
+        if bounds is not None and key in record.signals:
+            found = record.signals[key]
+            rows += zip(found.signals, found.values.T, *bounds, strict=False)
     return [
         f"{signal.name} goes from {np.min(values):.4g} to {np.max(values):.4g} {signal.unit}, "
         f"its limits are {lower:.4g} and {upper:.4g}"

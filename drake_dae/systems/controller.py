@@ -30,7 +30,7 @@ class TrackingController(ParameterizedSystem):
 
     Output ports:
         control: u, shape (p,).
-        tracking_error: e = z - r (29) by the controller's own model, shape (p,).
+        tracking_error: e = z - r (29) by the controller's own model, one entry per output.
 
     Both output ports have direct feedthrough from all input ports. The context holds the model's
     parameters and then the gains as one numeric parameter; see `set_parameter` and `set_gains`.
@@ -71,7 +71,7 @@ class TrackingController(ParameterizedSystem):
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
         self.DeclareVectorOutputPort(
-            "tracking_error", dae.num_controls, weakly(self._calc_tracking_error), sources
+            "tracking_error", dae.num_outputs, weakly(self._calc_tracking_error), sources
         )
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:

@@ -119,7 +119,7 @@ class StateRealization(ParameterizedSystem):
         )
         self.DeclareVectorOutputPort(
             "controlled_output",
-            dae.num_controls,
+            dae.num_outputs,
             weakly(self._calc_output),
             by_control if layout.direct.size else state_tickets(self),
         )
@@ -226,7 +226,7 @@ class StateRealization(ParameterizedSystem):
         output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
-        layout, value = self._layout, np.empty(self.dae.num_controls)
+        layout, value = self._layout, np.empty(self.dae.num_outputs)
         coordinates = context.get_continuous_state_vector().CopyToVector()
         value[layout.dynamic] = coordinates[layout.heads]
         if layout.direct.size:

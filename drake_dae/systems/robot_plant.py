@@ -28,6 +28,8 @@ class RobotPlant(DaePlant):
             calls positive; A feels the opposite at the same point. Their power is zero where the
             constraint is ideal. `wrench_signals` tells the names,
             "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
+        loop_state: The coordinates of the joints that close loops, and then their rates, named by
+            `model.loop_joints.signals`; if there are such joints.
 
     A stage of actuation shows its state at ports of its own, which its class names: `motor_state`
     of `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
@@ -72,6 +74,11 @@ class RobotPlant(DaePlant):
                 state_tickets(self),
             )
         self._add_wrenches()
+        loops = model.loop_joints
+        if loops.signals:
+            self._loops = model.dae.trace("loop state", {"value": loops.state})
+            size, calc = len(loops.signals), weakly(self._calc_loop_state)
+            self.DeclareVectorOutputPort("loop_state", size, calc, self._by_state)
         if model.joint_force is not None:
             self._joint_force = model.dae.trace("joint torque", {"value": model.joint_force})
             self.DeclareVectorOutputPort(
@@ -104,6 +111,9 @@ class RobotPlant(DaePlant):
     def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self.state(context)[part])
 
+    def _calc_loop_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._loops(self.state(context), self._values(context))[0])
+
     def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._joint_force(self.state(context), self._values(context))[0])
 
@@ -121,6 +131,8 @@ class RobotPlant(DaePlant):
         for name, part in self._parts.items():
             function = TracedFunction(name, {"state": state}, {"value": state[part]})
             formulas[name] = TracedFormula(function)
+        if self.model.loop_joints.signals:
+            formulas["loop_state"] = TracedFormula(self._loops)
         if self.model.joint_force is not None:
             formulas["joint_torque"] = TracedFormula(self._joint_force)
         return formulas

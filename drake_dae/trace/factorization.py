@@ -10,7 +10,8 @@ class Factorization:
     error grows with the condition of A and not, as by Q^T B, with its square.
 
     Args:
-        matrix: A, shape (n, n), regular where the expressions are evaluated.
+        matrix: A, shape (n, n), regular where the expressions are evaluated; for `shortest` it may
+            have more rows, shape (l, n), and independent columns.
 
     Attributes:
         pivot: The smallest sine of the angle between a column of A and the span of the columns
@@ -18,11 +19,11 @@ class Factorization:
     """
 
     def __init__(self, matrix: ca.SX) -> None:
-        size = matrix.shape[0]
+        size = matrix.shape[1]
         self._triangle = ca.SX(size, size)
         self._directions: list[ca.SX] = []
         self.pivot = ca.SX(1)
-        if size == 1:
+        if matrix.shape == (1, 1):
             # Exact, and without a square root.
             self._directions, self._triangle = [ca.SX(1)], matrix
             self.pivot = ca.fabs(ca.sign(matrix))
@@ -51,6 +52,43 @@ class Factorization:
             rest -= ca.mtimes(direction, coordinates[-1])
         result[:, chosen] = ca.solve(self._triangle, ca.vertcat(*coordinates))
         return result
+
+    def shortest(self, right: ca.SX) -> ca.SX:
+        """The shortest x of A^T x = b, shape (l, 1), for b of shape (n, 1): x = Q R^-T b.
+
+        Summed so that directions which are not quite orthogonal do no harm (Bjorck, Numerical
+        Methods for Least Squares Problems, 1996, section 2.4.5).
+        """
+        result = ca.SX(self._directions[0].numel(), 1)
+        lengths = ca.solve(self._triangle.T, ca.densify(right))
+        for k, direction in reversed(list(enumerate(self._directions))):
+            result += direction * (lengths[k] - ca.dot(direction, result))
+        return result
+
+
+def nearest_solution(
+    matrix: ca.SX, right: ca.SX, metric: ca.SX, goal: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Of all u with B u = b the one next to u_0, for which (u - u_0)^T W (u - u_0) is least:
+
+        u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (b - B u_0).
+
+    With W = R^T R it is u_0 + R^-1 x for the shortest x of (B R^-1) x = b - B u_0, so that nothing
+    is squared.
+
+    Args:
+        matrix: B, shape (p, l), with independent rows.
+        right: b, shape (p, 1).
+        metric: W, shape (l, l), symmetric positive definite.
+        goal: u_0, shape (l, 1).
+
+    Returns:
+        u, shape (l, 1), and a scalar that is 0 exactly where the rows of B depend on each other.
+    """
+    root = ca.chol(metric)
+    factors = Factorization(ca.solve(root.T, ca.densify(matrix.T)))
+    shortest = factors.shortest(right - ca.mtimes(matrix, goal))
+    return goal + ca.solve(root, shortest), factors.pivot
 
 
 class PositiveDefiniteFactorization:

@@ -32,6 +32,8 @@ from drake_dae import (
     MultibodyExpressions,
     Plane,
     PointOnSurface,
+    PrismaticLoopJoint,
+    RevoluteLoopJoint,
     RollingBall,
     RollingWheel,
     Sphere,
@@ -90,6 +92,47 @@ def pin_at(place, base):
 
 def weld_at(place, base):
     return WeldedFrames("base", "tip", base.inverse() @ place)
+
+
+def turning(place, base, turn, **options):
+    """The tip turned in the base about the x axis of a frame that is nobody's own."""
+    own = RigidTransform(RollPitchYaw(-0.4, 0.5, 0.9), POINT)
+    joint = (
+        base.inverse()
+        @ place
+        @ own
+        @ RigidTransform(RollPitchYaw(-turn, 0.0, 0.0), [0.0, 0.0, 0.0])
+    )
+    point, rpy = joint.translation(), RollPitchYaw(joint.rotation()).vector()
+    return RevoluteLoopJoint(
+        "base", "tip", "x", tuple(point), tuple(rpy), POINT, (-0.4, 0.5, 0.9), **options
+    )
+
+
+def turning_at(place, base):
+    return turning(place, base, 2.5, damping=0.3, stiffness=2.0, rest=1.5, lower=1.0, upper=4.0)
+
+
+def turning_in_a_plane_at(place, base):
+    return turning(place, base, -0.7, planar=True, motor=True, effort_limit=5.0)
+
+
+def sliding(place, base, **options):
+    """The tip 0.3 m along the y axis of such a frame."""
+    own = RigidTransform(RollPitchYaw(-0.4, 0.5, 0.9), POINT)
+    joint = base.inverse() @ place @ own @ RigidTransform([0.0, -0.3, 0.0])
+    point, rpy = joint.translation(), RollPitchYaw(joint.rotation()).vector()
+    return PrismaticLoopJoint(
+        "base", "tip", "y", tuple(point), tuple(rpy), POINT, (-0.4, 0.5, 0.9), **options
+    )
+
+
+def sliding_at(place, base):
+    return sliding(place, base, damping=3.0, motor=True, lower=0.0, upper=0.5, velocity_limit=2.0)
+
+
+def sliding_in_a_plane_at(place, base):
+    return sliding(place, base, normal="x")
 
 
 def rod_at(place, base):
@@ -160,6 +203,10 @@ MEMBERS = {
     "saddle": (saddle_at, {"tip", "world"}),
     "pin": (pin_at, {"tip", "base"}),
     "weld": (weld_at, {"tip", "base"}),
+    "revolute": (turning_at, {"tip", "base"}),
+    "planar revolute": (turning_in_a_plane_at, {"tip", "base"}),
+    "prismatic": (sliding_at, {"tip", "base"}),
+    "planar prismatic": (sliding_in_a_plane_at, {"tip", "base"}),
     "rod": (rod_at, {"tip", "base"}),
     "rubbing": (rubbing_at, {"tip", "world"}),
     "blade": (blade_at, {"tip", "world"}),
@@ -324,6 +371,41 @@ def test_coordinates_are_as_many_as_names_or_refused(given):
     else:
         with pytest.raises(ModelError, match="has no coordinates"):
             constraint.coordinates(robot())
+
+
+JOINTS = {"revolute": 2.5, "planar revolute": -0.7, "prismatic": 0.3, "planar prismatic": 0.3}
+"""The members that are joints, and their coordinates."""
+
+
+def test_a_joint_has_a_coordinate_with_a_rate_that_is_power_of_a_unit_force(given):
+    """Rule 11, at any velocity where the positions keep the constraint."""
+    name, constraint, _, context, v, *_ = given
+    assert (constraint.joint is not None) == (name in JOINTS)
+    if constraint.joint is None:
+        return
+    links, plant = robot(), robot().plant
+    bound = ConstraintSet([constraint])
+    position, rate = bound.joint_state(links)
+    plain = ca.jtimes(constraint.coordinates(links), links.q, links.velocity_map @ links.v)
+    symbols = ca.vertcat(*[p.symbol for p in (*links.parameters, *constraint.parameters)])
+    function = TracedFunction(
+        name,
+        {"q": links.q, "v": links.v, "parameters": symbols},
+        {"c": position, "rate": rate, "plain": plain, "column": bound.joint_columns(links)},
+    )
+    values = np.concatenate([p.value for p in (*links.parameters, *constraint.parameters)])
+    c, speed, derivative, column = function(plant.GetPositions(context), v, values)
+    assert c.item() == pytest.approx(JOINTS[name], abs=1e-12)
+    assert speed.item() == pytest.approx(column @ v, abs=1e-12)
+    assert derivative.item() == pytest.approx(speed.item(), abs=1e-10)
+    assert abs(speed.item()) > 1e-3
+    expected = -0.3 * speed - 2.0 * (c - 1.5) if name == "revolute" else None
+    if expected is not None:
+        symbol = ca.SX.sym("c", 2)
+        force = TracedFunction(
+            name, {"c": symbol, "p": symbols}, {"f": constraint.joint.force(symbol[0], symbol[1])}
+        )(np.concatenate([c, speed]), values)[0]
+        np.testing.assert_allclose(force, expected, rtol=1e-12)
 
 
 def test_a_push_drives_the_residual_up():

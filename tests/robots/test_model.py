@@ -17,7 +17,9 @@ from drake_dae import (
     Signal,
     Sphere,
     SurfaceCoordinates,
+    TrackingLaw,
     find_structure,
+    poles,
 )
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -156,6 +158,20 @@ def test_underactuated_robot_takes_an_actuation_matrix():
     assert structure.output_degrees == (0,)
     # n - sum r = 2 states, none of them steered.
     assert structure.zero_dynamics_dimension == 2
+
+
+def test_two_motors_on_one_joint_share_its_torque_by_their_weights():
+    """With weights 1 and 3 the first has three quarters; by the law of one motor, to round-off."""
+    one = TrackingLaw(textbook().dae, poles(-4.0))
+    double = textbook_links(actuation_matrix=np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    wall, outputs = [WALL], [PointCoordinates("tool", "z")]
+    model = RobotModel(double, wall, outputs, [1.2, -1.6], control_weights=[1.0, 3.0, 2.0])
+    both = TrackingLaw(model.dae, poles(-4.0))
+    x, R = one.structure.states[1], [0.2, 0.1, -0.3, 5.0]
+    first, second = one.control(x, R)
+    np.testing.assert_allclose(both.control(x, R), [0.75 * first, 0.25 * first, second], rtol=1e-11)
+    with pytest.raises(ModelError, match="2 independent ways only"):
+        RobotModel(double, wall, outputs, [1.2, -1.6])
 
 
 @pytest.mark.parametrize(

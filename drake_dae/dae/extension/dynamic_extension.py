@@ -20,7 +20,12 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
-from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls
+from drake_dae.dae.extension.extension import (
+    Extension,
+    integrated,
+    nominal_controls,
+    refuse_metric,
+)
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR
@@ -65,8 +70,10 @@ def dynamic_extension(
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
             isolated states only, or more than max_integrators are needed.
-        ModelError, InconsistentStateError: There is no structure to find; see `find_structure`.
+        ModelError, InconsistentStateError: There is no structure to find, see `find_structure`; or
+            the system has a `control_metric`.
     """
+    refuse_metric(system)
     limit = system.num_states if max_integrators is None else max_integrators
     check_whole_number(f"{system.name}: max_integrators", limit, 0)
     chain = _Chain(system, nominal_controls(system, nominal_control), spread)

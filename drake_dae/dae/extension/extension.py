@@ -95,8 +95,10 @@ def extend(
         The system with the states (x, u_i, u_j, ..., u_i', ...).
 
     Raises:
-        ModelError: A control is unknown, or a number of integrators is below 1.
+        ModelError: A control is unknown, a number of integrators is below 1, or the system has a
+            `control_metric`.
     """
+    refuse_metric(system)
     if not isinstance(integrators, Mapping):
         integrators = dict.fromkeys(integrators, 1)
     bad = {name: count for name, count in integrators.items() if not _is_count(count)}
@@ -115,6 +117,19 @@ def extend(
             nominal=nominal[columns] if order == 0 else np.zeros(len(columns)),
         )
     return system
+
+
+def refuse_metric(system: DaeSystem) -> None:
+    """Refuses to put integrators before controls that a metric chooses.
+
+    Raises:
+        ModelError: The system has a `control_metric`.
+    """
+    if system.control_metric is not None:
+        raise ModelError(
+            f"{system.name}: control_metric compares controls, not their derivatives; leave it "
+            "out, and give the extended system one"
+        )
 
 
 def integrated(

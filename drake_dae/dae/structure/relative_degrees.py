@@ -107,12 +107,13 @@ def output_chains(
     """
     system, control = derivatives.system, derivatives.control
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
-    names, count = [s.name for s in system.output_signals], system.num_controls
+    names, count = [s.name for s in system.output_signals], system.num_outputs
+    controls = system.num_controls
     moving = system.l + ca.mtimes(system.m, derivatives.constraint_input)
     h_star_values, n_star_values = eliminated_at(samples, elimination)
-    drift, control_matrix = ca.SX(count, 1), ca.SX(count, count)
+    drift, control_matrix = ca.SX(count, 1), ca.SX(count, controls)
     highest_derivatives = ca.SX(count, 1)
-    round_off, need_force = np.zeros((count, count), dtype=bool), False
+    round_off, need_force = np.zeros((count, controls), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
     following, rows = elimination.l_star, elimination.n_star

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import casadi as ca
+import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import Booleans
+from drake_dae.arrays import Booleans, show
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.samples import Samples
@@ -22,7 +23,7 @@ from drake_dae.dae.structure.constrained import (
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.factorization import Factorization
+from drake_dae.trace.factorization import Factorization, nearest_solution
 
 
 @checked(ModelError)
@@ -36,10 +37,11 @@ class Structure(ConstraintStructure):
         output_chains: The chain l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output.
         highest_derivatives: z_i^(mu_i) in terms of the unknowns of `derivatives`, shape (p, 1).
         drift: a(x) of (28), L_f*^mu_i l*_i in the order of the outputs, shape (p, 1).
-        control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p).
+        control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p); of a
+            system with a `control_metric` it has more columns than rows.
         chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
-        round_off: Which entries of B(x) are zero but for round-off at all of many states, shape
-            (p, p). A column of nothing else would be scaled up to the size of the others.
+        round_off: Which entries of B(x) are zero but for round-off at all of many states, of its
+            shape. A column of nothing else would be scaled up to the size of the others.
         control_margin: The margin of B(x), Assumption (5).
     """
 
@@ -84,20 +86,38 @@ class Structure(ConstraintStructure):
     def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
         """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
 
+        Where B(x) leaves some of u open, it is the u that `DaeSystem.control_metric` chooses.
+
         Args:
             wanted: ubar of (28), shape (p, 1).
 
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
         """
-        found = self.derivatives.inverse(self.highest_derivatives, wanted)
+        found = None
+        if self.system.control_metric is None:
+            found = self.derivatives.inverse(self.highest_derivatives, wanted)
         if found is None:  # L_h* of an output vanishes, but not by structure.
-            factors = Factorization(self.control_matrix)
-            found = factors.solve(wanted - self.drift), factors.pivot
+            found = self.control_by_matrix(wanted)
         control, pivot = found
         if self.chains_need_force:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot
+
+    def control_by_matrix(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """The control of `control_for` by B(x) itself, where A(x) is regular.
+
+        Args:
+            wanted: ubar of (28), shape (p, 1).
+
+        Returns:
+            u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
+        """
+        needed, metric = wanted - self.drift, self.system.control_metric
+        if metric is not None:
+            return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
+        factors = Factorization(self.control_matrix)
+        return factors.solve(needed), factors.pivot
 
 
 @checked(ModelError)
@@ -119,9 +139,9 @@ def find_structure(
     Raises:
         AssumptionError: An assumption is violated; the exception has the state where.
         InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: The outputs are not as many as the controls, or there are none, a function is
-            not finite at the nominal state, the mass matrix is not symmetric and positive definite,
-            or count or spread make no sense.
+        ModelError: The outputs are not as many as the controls (or fewer, with a metric), or there
+            are none, a function is not finite at the nominal state, the mass matrix or the metric
+            is not symmetric and positive definite, or count or spread make no sense.
     """
     structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
     if violation:
@@ -165,7 +185,7 @@ def examine_structure(
             output has no degree.
         InconsistentStateError, ModelError: There is no structure to find; see `find_structure`.
     """
-    _check_square(system)
+    _check_counts(system)
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
     violation = constraint_violation(constrained)
     if violation:
@@ -175,21 +195,27 @@ def examine_structure(
     return structure, control_violation(system, degrees, margin)
 
 
-def why_not_square(system: DaeSystem) -> str:
+def why_no_law(system: DaeSystem) -> str:
     """Why there is no law (28) for a system, by counting alone; empty if there may be one."""
     p, q = system.num_controls, system.num_outputs
     if p == 0:
         return "there is no control input, so there is nothing to steer"
-    if p != q:
+    if q == 0 or p < q:
         return (
             f"there are {q} controlled outputs and {p} controls; the law (28) inverts B(x), so it "
             "needs as many outputs as controls"
         )
+    if p > q and system.control_metric is None:
+        return (
+            f"there are {q} controlled outputs and {p} controls; the law (28) inverts B(x), so it "
+            "needs as many outputs as controls, or a `control_metric` in which it takes the least "
+            "control"
+        )
     return ""
 
 
-def _check_square(system: DaeSystem) -> None:
-    why = why_not_square(system)
+def _check_counts(system: DaeSystem) -> None:
+    why = why_no_law(system)
     if why:
         raise ModelError(f"{system.name}: {why}. To simulate it, `DaePlant` needs neither")
 
@@ -200,8 +226,9 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
     Raises:
         AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
             B(x) is left to `control_violation`.
-        ModelError: A function is not finite.
+        ModelError: A function is not finite, or `control_metric` is no metric.
     """
+    _check_metric(samples)
     elimination = constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)
     degrees = tuple(len(chain) for chain in outputs.chains)
@@ -223,6 +250,29 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
         round_off=outputs.round_off,
         control_margin=find_margin(samples, outputs.control_matrix, outputs.round_off),
     )
+
+
+def _check_metric(samples: Samples) -> None:
+    """Refuses a `control_metric` that is none.
+
+    Raises:
+        ModelError: It is not symmetric and positive definite at a state.
+    """
+    system = samples.system
+    if system.control_metric is None:
+        return
+    values = samples.values(metric=system.control_metric)
+    for state, (metric,) in zip(samples.states, values, strict=True):
+        length = np.sqrt(np.abs(np.diag(metric)))
+        if np.all(length > 0.0):
+            scaled = metric / length / length[:, None]
+            symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+            if symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
+                continue
+        raise ModelError(
+            f"{system.name}: control_metric is not symmetric and positive definite at x = "
+            f"{show(state)}; give each control a positive weight"
+        )
 
 
 def control_violation(

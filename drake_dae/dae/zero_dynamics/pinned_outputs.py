@@ -4,8 +4,8 @@ Pinned outputs leave the states
 
     Z(R) = {x in N*: L_f*^j l*_i(x) = r_i^(j), j = 0, ..., mu_i - 1},
 
-and the control u = B^-1 (-a + r^(mu)), which is (28) without an error. On Z(R) the state moves by
-x' = f* + h* u.
+and the control u = B^-1 (-a + r^(mu)), which is (28) without an error; where controls outnumber
+outputs, the u that the system's metric chooses. On Z(R) the state moves by x' = f* + h* u.
 """
 
 from functools import cached_property
@@ -20,7 +20,6 @@ from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
 
@@ -52,8 +51,7 @@ class PinnedOutputs:
         errors = structure.chain - goal[layout.chained.tolist(), :]
         residual = ca.vertcat(structure.manifold.residual_expression, errors)
         derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
-        factors = Factorization(structure.control_matrix)
-        control = factors.solve(highest - structure.drift)
+        control, pivot = structure.control_by_matrix(highest)
         self._rate, constraint_input = (
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
@@ -78,7 +76,7 @@ class PinnedOutputs:
                 "constraint_input": constraint_input,
                 "constraint_matrix": structure.elimination.constraint_matrix,
                 "control_matrix": structure.control_matrix,
-                "pivot": ca.fmin(factors.pivot, structure.elimination.pivot),
+                "pivot": ca.fmin(pivot, structure.elimination.pivot),
                 "unrest": ca.fabs(ca.mtimes(system.mass_matrix, self._rate)) / sizes,
             },
             self._inputs,

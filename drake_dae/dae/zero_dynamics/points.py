@@ -48,16 +48,18 @@ class Point:
 
     @cached_property
     def signs(self) -> tuple[float, ...]:
-        """The signs of det A and det B."""
-        return tuple(float(np.linalg.slogdet(_square(matrix))[0]) for matrix in (self.A, self.B))
+        """The signs of det A and det B; a matrix that is not square has none."""
+        matrices = (_matrix(value) for value in (self.A, self.B))
+        square = (matrix for matrix in matrices if matrix.shape[0] == matrix.shape[1])
+        return tuple(float(np.linalg.slogdet(matrix)[0]) for matrix in square)
 
 
-def _square(matrix: FloatArray) -> FloatArray:
-    """A square matrix; one with one column comes as a vector."""
-    return matrix.reshape(round(matrix.size**0.5), round(matrix.size**0.5))
+def _matrix(value: FloatArray) -> FloatArray:
+    """A matrix of two dimensions; one with one column comes as a vector."""
+    return value if value.ndim == 2 else value.reshape(-1, 1)
 
 
 def _margin(matrix: FloatArray) -> float:
     """The smallest singular value; that of a matrix without columns is infinite."""
-    values = np.linalg.svd(_square(matrix), compute_uv=False)
+    values = np.linalg.svd(_matrix(matrix), compute_uv=False)
     return float(np.min(values, initial=np.inf))

@@ -327,5 +327,5 @@ class ZeroDynamics:
 
     def _constant(self, outputs: ArrayLike) -> FloatArray:
         """R with outputs that stay at given values."""
-        values = self._vector("outputs", outputs, self.system.num_controls)
+        values = self._vector("outputs", outputs, self.system.num_outputs)
         return self._pinned.layout.constant(values)

@@ -56,11 +56,16 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         links: The robot.
 
     Raises:
-        ModelError: A stage stands behind one that nothing can drive, or two stages carry the
-            rotors; or the actuators do not drive derivatives of positions, each its own.
+        ModelError: There are no actuators, a stage stands behind one that nothing can drive, or two
+            stages carry the rotors; or the actuators do not drive derivatives of positions, each
+            its own.
     """
     if not stages:
         return _rigid_joints(links)
+    if not links.actuator_signals:
+        raise ModelError(
+            f"{type(stages[0]).__name__} drives actuators of the links; there are none"
+        )
     position, velocity = _actuated(links)
     p = position.numel()
     attached = [stage.attach(links) for stage in stages]

@@ -1,10 +1,12 @@
 """What a constraint says of itself.                                             (38)"""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import casadi as ca
+import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
@@ -37,6 +39,26 @@ class Application:
     frame_a: str = "world"
 
 
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """What a joint has along its coordinate c.
+
+    Attributes:
+        force: (c, c') -> the force of its spring and damper, in N m (N), positive toward larger c.
+        lower, upper: The limits of c, infinite where there are none.
+        velocity_limit: The largest |c'|, infinite where there is none.
+        motor: Name and unit of the control that adds to the force; None without a motor.
+        effort_limit: The largest control, infinite where there is none.
+    """
+
+    force: Callable[[ca.SX, ca.SX], ca.SX]
+    lower: float = -np.inf
+    upper: float = np.inf
+    velocity_limit: float = np.inf
+    motor: Signal | None = None
+    effort_limit: float = np.inf
+
+
 @checked(ModelError)
 class Constraint(ABC):
     """m equations that a robot keeps, and the m constraint forces lambda that make it keep them.
@@ -64,6 +86,9 @@ class Constraint(ABC):
        together is zero; it may be negative where `is_ideal` is false, as with friction.
     10. Its parameters may move (see `RobotModel`) if k = m; `rate` is then that part of the
         derivative which velocities make.
+    11. `joint` tells what it has along its one coordinate, if it is a joint that closes a loop;
+        `coordinate_rate` is linear in velocities, and the derivative of `coordinates` where the
+        constraint holds. A force along the coordinate has the power of force times rate.
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
@@ -120,6 +145,15 @@ class Constraint(ABC):
         raise ModelError(
             f"'{self.name}' has no coordinates along it; use PointCoordinates or an expression"
         )
+
+    def coordinate_rate(self, kinematics: Kinematics) -> ca.SX:
+        """The rates of the coordinates, shape (k, 1)."""
+        return kinematics.derivative(self.coordinates(kinematics))
+
+    @property
+    def joint(self) -> Joint | None:
+        """What it has along its one coordinate; None if it is no joint."""
+        return None
 
     def placement(self, values: FloatArray) -> RigidTransform:
         """Where what the robot touches stands in the world.

@@ -8,7 +8,7 @@ import casadi as ca
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.constraint import Constraint
+from drake_dae.robots.contact.constraint import Constraint, Joint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.links.links import Links
 
@@ -159,6 +159,33 @@ class ConstraintSet:
         """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""
         kinematics, force = links.kinematics(), ca.SX.sym("force", self.size)
         columns = self.reaction(kinematics, force).map(lambda part: ca.jacobian(part, force))
+        return links.generalized_force(kinematics, columns)
+
+    @property
+    def joints(self) -> tuple[tuple[Constraint, Joint], ...]:
+        """The joints that close loops, and what each has along its coordinate."""
+        found = ((constraint, constraint.joint) for constraint in self.constraints)
+        return tuple((constraint, joint) for constraint, joint in found if joint is not None)
+
+    @property
+    def motors(self) -> tuple[Signal, ...]:
+        """Names and units of the controls in these joints."""
+        return tuple(joint.motor for _, joint in self.joints if joint.motor is not None)
+
+    def joint_state(self, links: Links) -> tuple[ca.SX, ca.SX]:
+        """The coordinates of these joints and their rates, shape (l, 1) each, in q and v."""
+        kinematics, parts = links.kinematics(), [c for c, _ in self.joints]
+        positions = ca.vertcat(ca.SX(0, 1), *[c.coordinates(kinematics) for c in parts])
+        rates = ca.vertcat(ca.SX(0, 1), *[c.coordinate_rate(kinematics) for c in parts])
+        return kinematics.value(positions), kinematics.value(rates)
+
+    def joint_columns(self, links: Links) -> ca.SX:
+        """The generalized force of a unit along each of these coordinates, shape (nv, l)."""
+        kinematics, count = links.kinematics(), len(self.joints)
+        unit, total = ca.SX.sym("unit", count), Reaction(ca.SX(links.v.numel(), 1))
+        for i, (constraint, _) in enumerate(self.joints):
+            total += kinematics.reaction(unit[i] * constraint.coordinate_rate(kinematics))
+        columns = total.map(lambda part: ca.jacobian(part, unit))
         return links.generalized_force(kinematics, columns)
 
     def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -1,0 +1,162 @@
+"""The shipped boom with a linear actuator against Lagrange's equation in its one coordinate."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
+from runs import run_scenario, scenario
+
+from drake_dae import (
+    RevoluteLoopJoint,
+    RobotModel,
+    RobotPlant,
+    TrackingLaw,
+    build_scenario,
+    poles,
+)
+from drake_dae.diagrams.feasibility import find_feasibility
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.errors import ScenarioError
+
+NAME = "boom"
+HINGE, FOOT, LUG, DAMPING = np.array([0.0, 0.8]), np.array([0.3, 0.0]), 0.7, 40.0
+
+
+def rod(mass, length, radius, end, along, rate):
+    """Kinetic and potential energy of a uniform round rod from its end, in the x-z plane.
+
+    Args:
+        end, along: Where it begins, and its direction, shape (2, 1).
+        rate: The time derivative of an expression.
+    """
+    centre = end + along * length / 2
+    moving, turning = rate(centre), rate(along)
+    inertia = mass * (3 * radius**2 + length**2) / 12
+    energy = mass / 2 * ca.sumsqr(moving) + inertia / 2 * ca.sumsqr(turning)
+    return energy, mass * 9.81 * centre[1]
+
+
+def lagrange():
+    """(angle, rate, acceleration) -> the actuator's force, its length, and the length's rate."""
+    angle, speed, second = (ca.SX.sym(name) for name in ("angle", "speed", "second"))
+
+    def rate(expression):
+        return ca.jtimes(expression, angle, speed)
+
+    boom = ca.vertcat(ca.cos(angle), ca.sin(angle))
+    lug = HINGE + LUG * boom
+    length = ca.norm_2(lug - FOOT)
+    along = (lug - FOOT) / length
+    parts = [
+        rod(12.0, 2.0, 0.04, ca.SX(HINGE), boom, rate),
+        rod(3.0, 0.5, 0.03, ca.SX(FOOT), along, rate),
+        rod(2.0, 0.5, 0.015, lug - 0.5 * along, along, rate),
+    ]
+    kinetic, potential = (sum(part[k] for part in parts) for k in (0, 1))
+    momentum = ca.jacobian(kinetic, speed)
+    force = rate(momentum) + ca.jtimes(momentum, speed, second)
+    force += -ca.jacobian(kinetic, angle) + ca.jacobian(potential, angle)
+    lever = ca.jacobian(length, angle)
+    needed = force / lever + DAMPING * rate(length)
+    return ca.Function("lagrange", [angle, speed, second], [needed, length, rate(length)])
+
+
+@pytest.mark.slow
+def test_the_actuator_pushes_as_lagrange_says_and_the_prediction_is_kept():
+    """The accuracy of 1e-8 in a step leaves some 1e-9 along the way; forces up to 300 N."""
+    loop, _, record = run_scenario(scenario(NAME, "duration=2"))
+    off = np.abs(record["tracking_error"] - loop.predicted_error(record))
+    assert np.max(off) < 1e-8
+    assert record["tracking_error"][0, 0] == pytest.approx(0.05, abs=1e-12)
+    law, by_hand = loop.controller.law, lagrange()
+    assert law.structure.constraint_degrees == (2, 2)
+    assert law.structure.output_degrees == (2,)
+    for row in range(0, len(record.time), 10):
+        (angle, speed), target = record["state"][row][[0, 3]], record["reference"][row]
+        names = [s.name for s in loop.plant.dae.state_signals]
+        assert (names[0], names[3]) == ("boom", "boom_w")
+        second = target[2] - 8.0 * (speed - target[1]) - 16.0 * (angle - target[0])
+        force, length, rate = (float(value) for value in by_hand(angle, speed, second))
+        assert record["control"][row, 0] == pytest.approx(force, rel=1e-9)
+        assert_allclose(record["loop_state"][row], [length, rate], rtol=1e-9, atol=1e-10)
+    assert np.abs(record["constraint_residual"]).max() < 1e-9
+
+
+def test_limits_of_the_actuator_are_told_before_it_runs():
+    report = find_feasibility(scenario(NAME, "constraints.0.upper=1.05", "duration=6"))
+    assert any("actuator.travel goes from" in problem for problem in report.problems)
+    assert not find_feasibility(scenario(NAME, "duration=6")).problems
+    weak = find_feasibility(scenario(NAME, "constraints.0.effort_limit=200", "duration=6"))
+    assert any("actuator.motor needs" in problem for problem in weak.problems)
+
+
+def test_its_damping_is_a_parameter_of_plant_and_law():
+    loop, root = build_scenario(scenario(NAME, "plant_parameters={actuator.damping: [100.0]}"))
+    for block, value in ((loop.plant, 100.0), (loop.controller, 40.0)):
+        context = block.GetMyContextFromRoot(root)
+        assert block.get_parameter(context, "actuator.damping") == [value]
+
+
+def test_its_loop_state_has_gradients():
+    """By AutoDiffXd: dL/dq of the length L is what the motor's force makes of it, its column."""
+    loop, root = build_scenario(scenario(NAME))
+    plant = loop.plant
+    state = plant.state(plant.GetMyContextFromRoot(root))
+    converted = plant.ToAutoDiffXd()
+    context = converted.CreateDefaultContext()
+    context.SetContinuousState(InitializeAutoDiff(state).ravel())
+    gradient = ExtractGradient(converted.GetOutputPort("loop_state").Eval(context))
+    dae = plant.dae
+    motors = plant.model.loop_joints.motors
+    column = ca.Function("B", [dae.state, dae.parameter_symbol], [motors])
+    expected = column(state, dae.parameter_values).full().ravel()
+    assert_allclose(gradient[0, :3], expected, atol=1e-12)
+    assert_allclose(gradient[1, 3:], expected, atol=1e-12)
+
+
+def test_without_a_motor_nothing_drives_it():
+    with pytest.raises(ScenarioError, match="no actuators"):
+        build_scenario(
+            scenario(NAME, "constraints.0.motor=false", "constraints.0.effort_limit=null")
+        )
+
+
+def test_stages_do_not_reach_a_motor_in_a_loop():
+    text = "actuation=[{_tag: '!FlexibleJoints', stiffness: 100.0}]"
+    with pytest.raises(ScenarioError, match="actuation"):
+        build_scenario(scenario(NAME, text))
+
+
+@pytest.mark.slow
+def test_a_revolute_joint_in_a_plane_does_as_a_pin():
+    """The five-bar linkage, four motors for two outputs, closed by either: 1e-10 of some 5 N m."""
+    given = scenario_model(scenario("five_bar"))
+    pin = given.constraints[0]
+    joint = RevoluteLoopJoint(
+        pin.frame_a, pin.frame_b, "y", pin.point_a, (0, 0, 0), pin.point_b, planar=True
+    )
+    found, state = [], np.zeros(0)
+    for constraint in (pin, joint):
+        model = RobotModel(
+            given.links,
+            [constraint],
+            given.positions,
+            given.dae.nominal_state[:4],
+            forces=[],
+            control_weights=[1.0, 2.0, 3.0, 4.0],
+        )
+        law = TrackingLaw(model.dae, poles(-5.0))
+        plant = RobotPlant(model, structure=law.structure)
+        context = plant.CreateDefaultContext()
+        if not state.size:
+            state = law.structure.manifold.project(given.dae.nominal_state + 0.1 * np.arange(8.0))
+        plant.set_state(context, state)
+        control = law.control(state, [0.1, 0.2, -0.3, 0.5, 0.1, 0.4])
+        plant.GetInputPort("control").FixValue(context, control)
+        assert [s.name.split(".")[1] for s in plant.wrench_signals[::6]] == ["right2", "left2"]
+        wrenches = plant.GetOutputPort("constraint_wrenches").Eval(context)
+        rate = plant.EvalTimeDerivatives(context).CopyToVector()
+        found.append(np.concatenate([control, wrenches, rate]))
+    assert np.abs(found[0][:4]).max() > 5.0
+    assert_allclose(found[1], found[0], rtol=1e-10, atol=1e-10)
