@@ -329,6 +329,7 @@ class RobotModel:
             control_signals=driven.control_signals,
             output_signals=(*position_signals, *force_outputs),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
+            state_scale=np.ones(nq + nv + k),  # Of SI units and angles.
             name=self.name,
             implicit=implicit,
         )
