@@ -41,6 +41,7 @@ PAPER = (
     "signals",
     "exogenous",
     "expressions",
+    "scale",
     "sharing",
     "system",
     "layout",

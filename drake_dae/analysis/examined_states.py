@@ -10,7 +10,7 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import Region
-from drake_dae.dae.system import DaeSystem, usual_spread
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 
 Bounds = Mapping[str, tuple[float, float]]
@@ -72,7 +72,7 @@ class ExaminedStates:
                 f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
                 f"got {states!r}"
             )
-        around = usual_spread(given[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
+        around = system.usual_spread(given[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
         return cls(np.vstack([given, given[0] + 0.1 * around]), len(given), {}, None)
 
     def describe(self, kept: int, noun: str) -> str:

@@ -51,11 +51,13 @@ class Manifold:
         self._levels = _levels(layout, gradient)
         self._residual = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
-        # The Newton step of least norm from a state, by the gradients at another one: from
-        # C' = Q R, dx = -Q R^-T r.
+        # The Newton step dx = S dz of least norm |dz| from a state, S its scale, by the gradients C
+        # at another one: from (C S)' = Q R, dz = -Q R^-T r.
+        self._scale = system.scale
         other, step = ca.SX.sym("other", system.num_states), ca.SX(system.num_states, 1)
         if residual.numel():
-            q, r = ca.qr(ca.substitute(gradient, system.state, other).T)
+            scaled = ca.mtimes(gradient, ca.diag(ca.SX(self._scale)))
+            q, r = ca.qr(ca.substitute(scaled, system.state, other).T)
             step = -ca.mtimes(q, ca.solve(r.T, residual))
         self._newton = system.trace("step to the manifold", {"step": step}, {"other": other})
 
@@ -86,7 +88,7 @@ class Manifold:
         x, p = self._state(state), self.system.parameter_vector(parameters)
         reach = norm(self._newton.evaluate(x, x, p)[0])
         if isfinite(reach) and reach > 0.0:
-            return reach <= CONSISTENT * norm(x) + FLOOR
+            return reach <= CONSISTENT * norm(x / self._scale) + FLOOR
         # Gradients that depend on each other; or nothing is left, or what no state changes.
         return self._residual_size(x, p) <= CONSISTENT
 
@@ -106,18 +108,22 @@ class Manifold:
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
         reach = norm(self._newton.evaluate(start, start, p)[0])
-        if 0.0 < reach <= ROUNDING or (reach == 0.0 and self._residual_size(start, p) == 0.0):
+        if 0.0 < reach <= ROUNDING or (
+            reach == 0.0 and not self._residual.evaluate(start, p)[0].any()
+        ):
             return start  # As in most steps of a simulation.
-        found, converged = newton(start, lambda x: self._linearize(x, p))
+        scale = self._scale
+        z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
         if not converged:
             # Gradients that depend on each other, or steps that mislead: least squares, downhill.
-            found, converged = newton(start, lambda x: self._downhill(x, p))
-        if converged and found is not start:
+            z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
+        found = scale * z
+        if converged and not np.array_equal(found, start):
+            return found
+        # Else it is round-off, in units in which that is much, or no state changes what is left.
+        if self._residual_size(found, p) <= CONSISTENT:
             return found
         residual = self._residual.evaluate(found, p)[0].copy()
-        # Else it is round-off, in units in which that is much, or no state changes what is left.
-        if np.linalg.norm(residual) <= CONSISTENT:
-            return found
         if converged and self._newton.evaluate(found, found, p)[0].any():
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
@@ -141,19 +147,21 @@ class Manifold:
         self, state: FloatArray, rows: Indices, columns: Indices, parameters: FloatArray
     ) -> bool:
         """Moves some states so that some rows of the residual vanish, and says whether they do."""
+        scale = self._scale[columns]
 
-        def filled(values: FloatArray) -> FloatArray:
+        def filled(z: FloatArray) -> FloatArray:
             x = state.copy()
-            x[columns] = values
+            x[columns] = scale * z
             return x
 
-        def linearize(values: FloatArray) -> Linearization | None:
-            gradients = self.gradients(filled(values), parameters)[np.ix_(rows, columns)]
+        def linearize(z: FloatArray) -> Linearization | None:
+            gradients = self.gradients(filled(z), parameters)[np.ix_(rows, columns)]
             return shortest_steps(
-                gradients, lambda x: self._residual(filled(x), parameters)[0][rows]
+                gradients * scale, lambda z: self._residual(filled(z), parameters)[0][rows]
             )
 
-        state[columns], converged = newton(state[columns], linearize)
+        z, converged = newton(state[columns] / scale, linearize)
+        state[columns] = scale * z
         return converged
 
     def _state(self, state: ArrayLike) -> FloatArray:
@@ -165,25 +173,30 @@ class Manifold:
             )
         return x
 
+    @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
     def _residual_size(self, state: FloatArray, parameters: FloatArray) -> float:
-        return norm(self._residual.evaluate(state, parameters)[0])
+        """The residual relative to how it changes over the scale of the states, if it does."""
+        length = np.linalg.norm(self.gradients(state, parameters) * self._scale, axis=1)
+        return norm(self._residual.evaluate(state, parameters)[0] / positive(length))
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
-        """Newton steps of least norm by the gradients at a state."""
+        """Newton steps of least norm by the gradients at a state, in states over their scale."""
+        scale = self._scale
         return Linearization(
-            lambda x: self._newton.evaluate(x, state, parameters)[0].copy(), is_regular=True
+            lambda z: self._newton.evaluate(scale * z, state, parameters)[0].copy(), is_regular=True
         )
 
     def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
         """Steps of least squares that make the residual smaller, its rows scaled to length one."""
-        gradients = self.gradients(state, parameters)
+        scale = self._scale
+        gradients = self.gradients(state, parameters) * scale
         length = positive(np.linalg.norm(gradients, axis=1))
 
-        def residual(x: FloatArray) -> FloatArray:
-            return self._residual(x, parameters)[0]
+        def residual(z: FloatArray) -> FloatArray:
+            return self._residual(scale * z, parameters)[0]
 
-        def measure(x: FloatArray) -> float:
-            return float(np.linalg.norm(residual(x) / length))
+        def measure(z: FloatArray) -> float:
+            return float(np.linalg.norm(residual(z) / length))
 
         steps = shortest_steps(gradients, residual)
         return None if steps is None else steps._replace(measure=measure)
@@ -204,7 +217,7 @@ class Manifold:
             f"{self.residual_signals[worst].name} = {residual[worst]:.3g} is left where Newton's "
             "method ends. "
         )
-        if are_dependent(self.gradients(state, parameters)):
+        if are_dependent(self.gradients(state, parameters) * self._scale):
             return left + (
                 "The gradients of the constraints depend on each other there: the constraints "
                 "contradict each other, or start away from this state"

@@ -15,6 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
 from drake_dae.dae.exogenous import Exogenous
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
+from drake_dae.dae.scale import natural_scale
 from drake_dae.dae.sharing import Sharing
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
@@ -65,6 +66,8 @@ class DaeSystem:
             output_signals: Names and units of x, v, u, y and z; a plain name is a Signal without
             unit. Made up ("x0", "x1", ...) where not given.
         nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
+        state_scale: How large the states are in use, positive, shape (n,): random states, searches
+            and tolerances are relative to it. If None, `scale` finds it from the equations.
         name: What messages call the system.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
@@ -96,6 +99,7 @@ class DaeSystem:
     control_signals: tuple[Signal, ...] = ()
     output_signals: tuple[Signal, ...] = ()
     nominal_state: FloatArray = field(default=None)  # type: ignore[arg-type]
+    state_scale: FloatArray | None = None
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
@@ -146,6 +150,12 @@ class DaeSystem:
         nominal = vector(f"{self.name}: nominal_state", start, self.num_states)
         nominal.setflags(write=False)
         self._put("nominal_state", nominal)
+        if self.state_scale is not None:
+            scale = vector(f"{self.name}: state_scale", self.state_scale, self.num_states)
+            if not np.all(scale > 0.0):
+                raise ModelError(f"{self.name}: state_scale must be positive, got {brief(scale)}")
+            scale.setflags(write=False)
+            self._put("state_scale", scale)
         self._check_choice()
 
     def _check_choice(self) -> None:
@@ -248,6 +258,7 @@ class DaeSystem:
             h=solved[:, 1 + m :],
             mass_matrix=None,
             implicit=None,
+            state_scale=self.scale,
         )
 
     @cached_property
@@ -323,10 +334,34 @@ class DaeSystem:
         changed = [replace(p, exogenous=True) if p.name in names else p for p in self.parameters]
         return replace(self, parameters=tuple(changed))
 
+    @cached_property
+    def scale(self) -> FloatArray:
+        """How large the states are in use, shape (n,): `state_scale`, or as the equations tell.
+
+        In other units the same sizes come out, in those units; see `natural_scale`. Do not change
+        the array.
+        """
+        if self.state_scale is not None:
+            return self.state_scale
+        keys = ("mass_matrix", "f", "g", "h", "k", "l", "m")
+        functions = {key: getattr(self, key) for key in keys}
+        parameters = (self.parameter_symbol, self._defaults)
+        return natural_scale(functions, self.state, parameters, self.nominal_state)
+
     @property
     def nominal_spread(self) -> FloatArray:
         """How far states are drawn from the nominal one where nobody says, shape (n,)."""
-        return usual_spread(self.nominal_state)
+        return self.usual_spread(self.nominal_state)
+
+    def usual_spread(self, state: FloatArray) -> FloatArray:
+        """How far states are drawn from one where nobody says, shape (n,): 0.1 of their scale.
+
+        It is a hundredth of a value that is above 10 of them, and a tenth of one that is below
+        1e-3 and not round-off.
+        """
+        size = np.abs(state) / self.scale
+        small = (size < 1e-3) & (size > 1e-12 * size.max())
+        return self.scale * np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
 
     def trace(
         self,
@@ -388,14 +423,3 @@ class DaeSystem:
             start += parameter.value.size
         known = [parameter.name for parameter in self.parameters]
         raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
-
-
-def usual_spread(state: FloatArray) -> FloatArray:
-    """How far states are drawn from one where nobody says, shape (n,): 0.1.
-
-    In unusual units a hundredth of the state's value where that is above 10, and a tenth where it
-    is below 1e-3 and not round-off.
-    """
-    size = np.abs(state)
-    small = (size < 1e-3) & (size > 1e-12 * size.max())
-    return np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))

@@ -353,6 +353,7 @@ class RobotModel:
             control_signals=self._controls,
             output_signals=(*position_signals, *force_outputs),
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
+            state_scale=np.ones(nq + nv + k),  # Of SI units and angles.
             name=self.name,
             implicit=implicit,
             control_metric=ca.diag(choice[0].symbol) if choice else None,

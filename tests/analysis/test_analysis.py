@@ -130,7 +130,7 @@ def test_1_a_degree_that_is_not_defined():
     assert problem.startswith("Assumption (1): the relative degree of constraint 'y0' is not")
     assert "index ?, N* of dimension ?, zero dynamics of dimension ?" in str(analysis)
     # Beside the nominal state only, and without a change of sign.
-    beside = system_of(3, g=lambda x: [0, (x[0] - 0.03) ** 2, 0], **fields)
+    beside = system_of(3, g=lambda x: [0, (x[0] - 0.03) ** 2, 0], state_scale=np.ones(3), **fields)
     find_structure(beside)
     analysis = analyze(beside)
     assert findings(analysis) == [NO, OPEN, YES, YES, YES]

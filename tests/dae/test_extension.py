@@ -663,7 +663,7 @@ def test_a_rank_that_changes_from_state_to_state():
         l=lambda x: x[:3],
         nominal_state=[0, 0, 0, 1],
     )
-    error = violation(system)
+    error = violation(system, spread=0.1)
     assert "the rank of B(x) of (16) falls from 2 to 1" in str(error)
     assert 0.5 < error.state[3] < 1.0
 

@@ -322,7 +322,8 @@ def test_1_a_degree_that_is_lost_between_the_sampled_states():
             k=lambda x: x[1] - 1,
             l=lambda x: x[0],
             m=lambda x: 0,
-        )
+        ),
+        spread=0.1,
     )
     assert error.assumption == 1
     assert "constraint 'y0'" in str(error)
@@ -439,7 +440,8 @@ def test_4_a_degree_that_is_not_defined_at_the_nominal_state():
 
 
 def test_4_a_degree_that_is_lost_between_the_sampled_states():
-    error = violation(double_integrator(l=lambda x: x[0] + x[1] ** 2, nominal_state=[0.0, -0.04]))
+    system = double_integrator(l=lambda x: x[0] + x[1] ** 2, nominal_state=[0.0, -0.04])
+    error = violation(system, spread=0.1)
     assert error.assumption == 4
     assert "output 'z0'" in str(error)
     assert error.state[1] == pytest.approx(0.0, abs=1e-12)
@@ -656,7 +658,7 @@ def test_a_vanishing_row_of_b():
         l=lambda x: x,
         nominal_state=[0.0, 0.02],
     )
-    structure, violation = examine_structure(system)
+    structure, violation = examine_structure(system, spread=0.1)
     assert violation.assumption == 4
     assert structure.control_margin.vanishing_row == 0
     assert structure.control_margin.state[1] == pytest.approx(0.0, abs=1e-12)
@@ -709,7 +711,7 @@ def test_a_constraint_that_is_not_finite_at_the_nominal_state():
 def test_samples_outside_the_domain_are_left_out():
     """A tank x' = u - sqrt(x) near empty: about a third of the states drawn are below zero."""
     tank = system_of(1, f=lambda x: -ca.sqrt(x), h=lambda x: 1, l=lambda x: x, nominal_state=[0.05])
-    structure = find_structure(tank)
+    structure = find_structure(tank, spread=0.1)
     assert structure.output_degrees == (1,)
     assert 1 < len(structure.states) < 13
     assert structure.states.min() > 0.0

@@ -982,6 +982,7 @@ def test_a_continuum_is_not_left_for_round_off():
         f=lambda x: turn @ shift @ turn.T @ x,
         h=lambda x: turn[:, 1],
         l=lambda x: ca.mtimes(turn[:, :1].T, x),
+        state_scale=np.ones(4),  # So that the nearest is that of the turned coordinates.
     )
     rest = zero_dynamics(system).equilibrium([0.7], turn @ [0.1, 0.2, 0.3, -0.4])
     np.testing.assert_allclose(turn.T @ rest, [0.7, 0.0, 0.3, -0.4], rtol=0, atol=1e-12)
@@ -1045,7 +1046,7 @@ def test_a_singular_b_leaves_undecided_what_has_no_zero_dynamics(columns, where)
     system = DaeSystem.from_functions(
         2, f=lambda x: [0, 0], h=columns, l=lambda x: [x[0], x[1]], nominal_state=[0.0, 0.05]
     )
-    structure, violation = examine_structure(system)
+    structure, violation = examine_structure(system, spread=0.1)
     assert violation is not None
     dynamics = ZeroDynamics(structure.system, structure=structure)
     assert dynamics.dimension == 0

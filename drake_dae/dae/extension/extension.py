@@ -15,6 +15,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import positive
 
 
 @checked(ModelError)
@@ -169,6 +170,11 @@ def integrated(
         state_signals=(*system.state_signals, *held),
         control_signals=tuple(controls),
         nominal_state=np.concatenate([system.nominal_state, nominal]),
+        state_scale=(
+            None
+            if system.state_scale is None
+            else np.concatenate([system.state_scale, positive(np.abs(nominal))])
+        ),
         mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
         implicit=None,  # The derivatives of the constraints may differ.
     )

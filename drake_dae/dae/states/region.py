@@ -109,7 +109,8 @@ class ConsistentRegion:
         region = self.region
         if region is None:
             return start
-        width = np.where(np.isfinite(region.high - region.low), region.high - region.low, 1.0)
+        scale = self.manifold.system.scale
+        width = np.where(np.isfinite(region.high - region.low), region.high - region.low, scale)
         state, (value, gradient) = start, function(start)
         for _ in range(40):
             direction = self._downhill(region, state, gradient, width)
@@ -162,19 +163,21 @@ class ConsistentRegion:
 
     def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
         """Where Newton's method for the constraints ends, with steps that do not leave the box."""
+        scale = self.manifold.system.scale
+        low, high = region.low / scale, region.high / scale
 
-        def linearize(state: FloatArray) -> Linearization | None:
-            gradient = self.manifold.gradients(state)
+        def linearize(z: FloatArray) -> Linearization | None:
+            gradient = self.manifold.gradients(scale * z) * scale
             if not np.all(np.isfinite(gradient)):
                 return None
 
-            def step(x: FloatArray) -> FloatArray:
-                residual = self.manifold.residual(x)
-                return _bounded_step(gradient, residual, region.low - x, region.high - x)
+            def step(z: FloatArray) -> FloatArray:
+                residual = self.manifold.residual(scale * z)
+                return _bounded_step(gradient, residual, low - z, high - z)
 
             return Linearization(step, True)
 
-        return newton(np.clip(guess, region.low, region.high), linearize)[0]
+        return scale * newton(np.clip(guess / scale, low, high), linearize)[0]
 
 
 def _bounded_step(

@@ -12,7 +12,7 @@ from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import Sized, multiply, positive
+from drake_dae.trace.round_off import Sized, multiply
 
 
 class Samples:
@@ -63,7 +63,8 @@ class Samples:
         if failure and not states:
             raise failure
         self.states = np.array(states)
-        self.scale = positive(np.abs(np.vstack([guesses, self.states])).max(axis=0))
+        largest = np.abs(np.vstack([guesses, self.states])).max(axis=0)
+        self.scale = np.where(largest > 0.0, largest, manifold.system.scale)
 
     def values(self, **expressions: ca.SX) -> list[tuple[FloatArray, ...]]:
         """Expressions of the state, as matrices, at each state.
@@ -112,7 +113,7 @@ class Samples:
     def dependent(self, functions: ca.SX) -> bool:
         """Whether the differentials of functions are linearly dependent at every state."""
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
-        return all(are_dependent(gradient) for (gradient,) in gradients)
+        return all(are_dependent(gradient * self.scale) for (gradient,) in gradients)
 
 
 def fields_at(system: DaeSystem, state: FloatArray) -> dict[str, FloatArray]:

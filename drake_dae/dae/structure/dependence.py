@@ -81,13 +81,13 @@ def find_dependence(
         return bool(np.linalg.svd(scaled, compute_uv=False)[-1] < SINGULAR)
 
     def in_gradients(state: FloatArray) -> bool:
-        return are_dependent(manifold.gradients(state))
+        return are_dependent(manifold.gradients(state) * system.scale)
 
     everywhere = all(is_singular(state) for state in states)
     examined = [where, *states] if everywhere else [where]
     dependent = all(in_gradients(state) for state in examined)
     # Chains may depend on each other below their last derivatives alone.
-    by_gradients = dependent and are_dependent(matrices(where)[1])
+    by_gradients = dependent and are_dependent(matrices(where)[1] * system.scale)
     values = [matrices(state)[1 if by_gradients else 0] for state in examined]
     return Dependence(tuple(_combinations(names, values)), everywhere, dependent)
 

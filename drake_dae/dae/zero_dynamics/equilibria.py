@@ -80,7 +80,8 @@ class Equilibria:
             _, slopes = pinned.slopes(state, reference, parameters)
             rate = pinned.rate(state, reference, parameters)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
-                nearest = -np.linalg.pinv(slopes, DEPENDENT) @ rate
+                scale = pinned.system.scale
+                nearest = -np.linalg.pinv(slopes / scale[:, None], DEPENDENT) @ (rate / scale)
                 reference[layout.lowest[layout.direct]] = nearest
         return reference
 
@@ -103,10 +104,15 @@ class Equilibria:
                 self._clocks,
             )
 
-        def linearize(x: FloatArray) -> Linearization | None:
-            gradients = pinned.gradients(x, parameters)
-            onto = shortest_steps(gradients, lambda x: pinned.residual(x, reference, parameters))
-            slopes, _ = pinned.slopes(x, reference, parameters)
+        scale = pinned.system.scale
+
+        def linearize(z: FloatArray) -> Linearization | None:
+            gradients = pinned.gradients(scale * z, parameters) * scale
+            onto = shortest_steps(
+                gradients, lambda z: pinned.residual(scale * z, reference, parameters)
+            )
+            slopes, _ = pinned.slopes(scale * z, reference, parameters)
+            slopes = slopes * scale / scale[:, None]
             if onto is None or not np.all(np.isfinite(slopes)):
                 return None
             tangent = scipy.linalg.null_space(gradients)
@@ -114,14 +120,16 @@ class Equilibria:
             noise = ROUND_OFF * balanced_norm(slopes) / (np.linalg.norm(along) or 1.0)
             inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
 
-            def step(x: FloatArray) -> FloatArray:
-                across = onto.step(x)
-                return across - inner @ (pinned.rate(x, reference, parameters) + slopes @ across)
+            def step(z: FloatArray) -> FloatArray:
+                across = onto.step(z)
+                rate = pinned.rate(scale * z, reference, parameters) / scale
+                return across - inner @ (rate + slopes @ across)
 
             return Linearization(step, onto.is_regular)
 
         start = pinned.state(reference, guess, parameters)
-        state, converged = newton(start, linearize)
+        z, converged = newton(start / scale, linearize)
+        state = scale * z
         point = pinned.point(state, reference, parameters)
         unrest = self.unrest(point, reference, parameters)
         if converged and not unrest:

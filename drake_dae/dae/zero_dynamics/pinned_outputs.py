@@ -66,7 +66,8 @@ class PinnedOutputs:
         )
         # E x' = f + g v + h u, and the sizes of what cancels in it at rest.
         mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
-        sizes = ca.mtimes(mass, ca.fmax(1.0, ca.fabs(system.state))) + ca.fabs(system.f)
+        states = ca.fmax(ca.DM(system.scale), ca.fabs(system.state))
+        sizes = ca.mtimes(mass, states) + ca.fabs(system.f)
         sizes += ca.mtimes(g, ca.fabs(constraint_input)) + ca.mtimes(h, ca.fabs(control))
         self._motion = system.trace(
             "pinned motion",
@@ -100,7 +101,7 @@ class PinnedOutputs:
                 residual,
             )
         # The distances by which they are missed, if these are small.
-        length = np.linalg.norm(self.gradients(found, parameters), axis=1)
+        length = np.linalg.norm(self.gradients(found, parameters) * self.system.scale, axis=1)
         missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
         worst = int(np.argmax(missed))
         if missed[worst] <= CONSISTENT:
@@ -119,14 +120,16 @@ class PinnedOutputs:
         self, start: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, bool]:
         """The state on Z(R) next to a start; or where Newton's method ended, and False."""
+        scale = self.system.scale
 
-        def residual(x: FloatArray) -> FloatArray:
-            return self._residual.evaluate(x, reference, parameters)[0]
+        def residual(z: FloatArray) -> FloatArray:
+            return self._residual.evaluate(scale * z, reference, parameters)[0]
 
-        def linearize(x: FloatArray) -> Linearization | None:
-            return shortest_steps(self.gradients(x, parameters), residual)
+        def linearize(z: FloatArray) -> Linearization | None:
+            return shortest_steps(self.gradients(scale * z, parameters) * scale, residual)
 
-        return newton(start, linearize)
+        found, converged = newton(start / scale, linearize)
+        return scale * found, converged
 
     def describe(self, reference: FloatArray) -> str:
         """The outputs of a reference, for a message."""

@@ -152,7 +152,8 @@ class _Pursuit:
 
     def _integrate(self) -> Iterator[Point]:
         """Goes on with zero dynamics, by an implicit integrator, since they may be stiff."""
-        bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state))))
+        scale = self._pinned.system.scale
+        bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
         integrator = None
         for end in self._times[1:]:
             interval = end - self._time
@@ -162,8 +163,8 @@ class _Pursuit:
                 integrator.step()
                 if integrator.status == "failed":
                     raise self._end(0.1 * interval)
-                worst = int(np.argmax(np.abs(integrator.y)))
-                if abs(integrator.y[worst]) > bound:
+                worst = int(np.argmax(np.abs(integrator.y) / scale))
+                if abs(integrator.y[worst]) > bound * scale[worst]:
                     raise self._stop(
                         Cause.UNBOUNDED,
                         f"{self._name}: {Cause.UNBOUNDED.value}: "
@@ -197,7 +198,7 @@ class _Pursuit:
             self._last.state,
             end,
             rtol=TOLERANCE,
-            atol=0.01 * TOLERANCE,
+            atol=0.01 * TOLERANCE * self._pinned.system.scale,
             jac=slopes,
             first_step=step,
         )
@@ -233,7 +234,9 @@ class _Pursuit:
             )
         goal, parameters = self._goal(time), self._parameters(time)
         found, converged = self._pinned.project(state, goal, parameters)
-        near = JUMP * np.maximum(1.0, np.abs(last.state)) + np.abs(state - last.state)
+        near = JUMP * np.maximum(self._pinned.system.scale, np.abs(last.state)) + np.abs(
+            state - last.state
+        )
         if not converged or np.any(np.abs(found - state) > near):
             return False
         point = self._pinned.point(found, goal, parameters)

@@ -12,7 +12,6 @@ from drake_dae.dae.zero_dynamics.pinned_motion import Cause
 from drake_dae.dae.zero_dynamics.stability import (
     Stability,
     Verdict,
-    balanced_norm,
     judge,
     linearized_eigenvalues,
 )
@@ -108,11 +107,11 @@ def watch_from(flow: Flow, state: FloatArray) -> tuple[Fate, FloatArray | None]:
     """
     basis = flow.basis(state, 0.0) / flow.scale[:, None]
     slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters(0.0))
-    scaled = basis.T @ (slopes * flow.scale / flow.scale[:, None]) @ basis
-    if not np.all(np.isfinite(scaled)):
+    slopes = slopes * flow.scale / flow.scale[:, None]
+    if not np.all(np.isfinite(slopes)):
         return Fate.UNCLEAR, None
-    rates = np.abs(np.linalg.eigvals(scaled))
-    rates = rates[rates > SLOWEST * balanced_norm(slopes)]
+    rates = np.abs(np.linalg.eigvals(basis.T @ slopes @ basis))
+    rates = rates[rates > SLOWEST * np.linalg.norm(slopes, 2)]
     if not rates.size:
         return Fate.UNCLEAR, None
     fate, passage = watch(flow, state, 0.0, FOLDINGS / float(rates.min()))

@@ -84,14 +84,15 @@ def linearized_eigenvalues(
     off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
     # The numbers of a model are rounded too, such as the cosine of a right angle.
     units = scale[free][:, None] / scale[free]
-    off += ROUNDED * np.linalg.norm((slopes @ moved)[free] / units, 2) * units
-    rounded = ROUNDED * balanced_norm(sizes)
-    values, errors = eigenvalues_of((slopes @ moved)[free], off, rounded)
+    matrix = (slopes @ moved)[free] / units
+    off = off / units + ROUNDED * np.linalg.norm(matrix, 2)
+    rounded = ROUNDED * balanced_norm(sizes * scale / scale[:, None])
+    values, errors = eigenvalues_of(matrix, off, rounded)
     along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
     beside, _ = pinned.slopes(state + SHIFT * along, reference, parameters)
     if np.all(np.isfinite(beside)):
-        others, _ = eigenvalues_of((beside @ moved)[free], 0.0 * off)
+        others, _ = eigenvalues_of((beside @ moved)[free] / units, 0.0 * off)
         errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
     return values, errors
 

@@ -166,7 +166,7 @@ class ZeroDynamics:
         goal = self._goal(x, outputs, p)
         onto, _ = self._pinned.project(x, goal, p)
         unrest = self._equilibria.unrest(self._pinned.point(x, goal, p), goal, p)
-        off = np.any(np.abs(onto - x) > AT_REST * np.maximum(1.0, np.abs(x)))
+        off = np.any(np.abs(onto - x) > AT_REST * np.maximum(self.system.scale, np.abs(x)))
         if off or unrest:
             reason = "it is off N*, or its outputs change" if off else unrest
             raise ModelError(

@@ -1,0 +1,217 @@
+"""How large the states of a system are, as its own equations tell.
+
+Units are a choice of whoever writes a system, and no verdict may hang on them. So random states,
+searches and tolerances measure a state relative to a size that changes with its unit.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from math import factorial, log
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import Booleans, FloatArray
+
+ORDER = 3
+"""Derivatives up to this order are compared: a pendulum that hangs shows its size in the third."""
+
+ENTRIES = 2000
+"""An order with more derivatives than this is left out, as are the orders after it."""
+
+OPERATIONS = 100_000
+"""An order whose derivatives may take more operations than this is left out, too."""
+
+SHARE = 0.5
+"""States are taken to be in use up to this part of where the terms of the equations are alike."""
+
+FAINT = 1e-3
+"""The weight of a nominal value beside that of a term: it decides where the equations do not."""
+
+NEGLIGIBLE = log(1e-10)
+"""The logarithm of a term, relative to the largest of its equation, that may be round-off."""
+
+ROUND_OFF = 1e-13
+"""A coefficient below this, relative to the largest of its order and function, looks like round-off
+in the units at hand: it is taken only if it turns out not to be negligible."""
+
+SELECTIONS = 10
+"""The terms that say something are chosen so often, or until the choice stays."""
+
+REPETITIONS = 300
+"""Weighted least squares are repeated so often, with weights by the last, or until `CONVERGED`."""
+
+CONVERGED = 1e-8
+"""A change of the logarithms below this ends the repetitions."""
+
+# Each function of (1)-(3), of which equations its rows are a part, and what its columns multiply.
+_PARTS = (
+    ("f", "dynamics", None),
+    ("g", "dynamics", "constraint_input"),
+    ("h", "dynamics", "control"),
+    ("mass_matrix", "dynamics", "state"),
+    ("k", "constraint", None),
+    ("l", "output", None),
+    ("m", "output", "constraint_input"),
+)
+
+
+class _Term(NamedTuple):
+    """A term of a Taylor series: in which entry, by columns, which states it multiplies."""
+
+    entry: int
+    states: tuple[int, ...]
+    coefficient: float
+
+
+class _Comparison(NamedTuple):
+    """A term of an equation: unknowns @ logarithms of sizes + logarithm is to be near zero."""
+
+    unknowns: FloatArray
+    logarithm: float
+    equation: int
+    weight: float
+    is_plain: bool
+
+
+@np.errstate(all="ignore")  # Terms that are not finite are left out.
+def natural_scale(
+    functions: Mapping[str, ca.SX],
+    state: ca.SX,
+    parameters: tuple[ca.SX, FloatArray],
+    nominal: FloatArray,
+) -> FloatArray:
+    """Half the sizes of the states at which the terms of the equations (1)-(3) are alike.
+
+    The equations are expanded in Taylor series around the nominal state. A term c x_i^a x_j^b has
+    the size |c| s_i^a s_j^b, where s are the sizes wanted; a derivative x_i' has the size w s_i
+    with a common rate w; inputs and equations have sizes of their own. The logarithms are linear
+    in those of the unknowns, so that a fit makes the terms of each equation as alike as they can
+    be. In other units of states, inputs and equations the same sizes come out, in those units.
+    What the equations leave open, such as the amplitude of a linear system, is like the nominal
+    state, or near 1.
+
+    Args:
+        functions: E, f, g, h, k, l and m as expressions; E under "mass_matrix".
+        state: The symbols x, shape (n, 1).
+        parameters: The symbols of the parameters, and their values.
+        nominal: The nominal state, shape (n,).
+
+    Returns:
+        The sizes, positive, shape (n,).
+    """
+    n, rate = nominal.size, nominal.size
+    counts = {
+        "constraint_input": functions["g"].shape[1],
+        "control": functions["h"].shape[1],
+        "dynamics": n,
+        "constraint": functions["k"].numel(),
+        "output": functions["l"].numel(),
+    }
+    first, end = {"state": 0}, n + 1
+    for kind, count in counts.items():
+        first[kind], end = end, end + count
+    comparisons = []
+    for key, kind, factor in _PARTS:
+        height = functions[key].shape[0]
+        terms = list(_terms(functions[key], state, parameters, nominal))
+        largest = [0.0] * (ORDER + 1)
+        for term in terms:
+            order = len(term.states)
+            largest[order] = max(largest[order], abs(term.coefficient))
+        for entry, states, coefficient in terms:
+            column, row = divmod(entry, height)
+            unknowns, equation = np.zeros(end), first[kind] + row
+            for i in states:
+                unknowns[i] += 1.0
+            unknowns[equation] = -1.0
+            if factor is not None:
+                unknowns[first[factor] + column] += 1.0
+            if key == "mass_matrix":
+                unknowns[rate] += 1.0
+            size = abs(coefficient)
+            is_plain = size > ROUND_OFF * largest[len(states)]
+            comparisons.append(_Comparison(unknowns, log(size), equation, 1.0, is_plain))
+    for i in np.flatnonzero(nominal).tolist():
+        unknowns = -np.eye(1, end, i)[0]
+        comparisons.append(_Comparison(unknowns, log(abs(nominal[i])), i, FAINT, True))
+    return np.asarray(SHARE * np.exp(np.clip(_alike(comparisons)[:n], -300.0, 300.0)))
+
+
+def _alike(comparisons: list[_Comparison]) -> FloatArray:
+    """Logarithms of sizes that make terms alike; terms that say nothing are left out.
+
+    The sum of sqrt(1 + left^2) is made least, which a few terms that are far off hardly move.
+    """
+    unknowns, logarithms, equation, weight, is_plain = map(np.array, zip(*comparisons, strict=True))
+    kept: Booleans = is_plain
+    found = np.zeros(unknowns.shape[1])
+    for _ in range(SELECTIONS):
+        weights = kept * weight
+        for _ in range(REPETITIONS):
+            factors, last = np.sqrt(weights), found
+            found = np.linalg.lstsq(factors[:, None] * unknowns, -factors * logarithms, rcond=1e-9)[
+                0
+            ]
+            left = unknowns @ found + logarithms
+            weights = kept * weight / np.sqrt(1.0 + left * left)
+            if np.max(np.abs(found - last)) < CONVERGED:
+                break
+        largest = np.zeros(unknowns.shape[1])
+        np.maximum.at(largest, equation, left)
+        tells = left > largest[equation] + NEGLIGIBLE
+        if np.array_equal(tells, kept):
+            break
+        kept = tells
+    return found
+
+
+def _terms(
+    expression: ca.SX, state: ca.SX, parameters: tuple[ca.SX, FloatArray], nominal: FloatArray
+) -> Iterator[_Term]:
+    """The terms of the Taylor series of a matrix; those that are zero or not finite are left out.
+
+    The constant one is without what the linear ones make of the nominal state.
+    """
+    symbol, values = parameters
+    places: list[tuple[int, tuple[int, ...]]] = [(i, ()) for i in range(expression.numel())]
+    derivatives = ca.vec(ca.densify(expression))
+    for order in range(ORDER + 1):
+        function = ca.Function("terms", [state, symbol], [derivatives])
+        numbers = function(nominal, values).full().ravel()
+        expensive = function.n_instructions() * nominal.size > OPERATIONS
+        jacobian = None if order == ORDER or expensive else ca.jacobian(derivatives, state)
+        if order == 0 and jacobian is not None:
+            numbers -= _linear_part(jacobian, state, parameters, nominal, numbers)
+        for (entry, states), value in zip(places, numbers.tolist(), strict=True):
+            if np.isfinite(value) and value != 0.0:
+                equal = np.prod([factorial(count) for count in Counter(states).values()])
+                yield _Term(entry, states, value / float(equal))
+        if jacobian is None:
+            return
+        following, chosen = [], []
+        triplets = zip(*jacobian.sparsity().get_triplet(), strict=True)
+        for number, (row, column) in enumerate(triplets):
+            entry, states = places[row]
+            if not states or column >= states[-1]:
+                following.append((entry, (*states, column)))
+                chosen.append(jacobian.nz[number])
+        if not chosen or len(chosen) > ENTRIES:
+            return
+        places, derivatives = following, ca.vertcat(*chosen)
+
+
+def _linear_part(
+    jacobian: ca.SX,
+    state: ca.SX,
+    parameters: tuple[ca.SX, FloatArray],
+    nominal: FloatArray,
+    values: FloatArray,
+) -> FloatArray:
+    """J x at the nominal state, or the values themselves where they differ by round-off alone."""
+    products = jacobian * ca.repmat(state.T, jacobian.shape[0], 1)
+    outputs = [ca.sum2(products), ca.sum2(ca.fabs(products))]
+    function = ca.Function("linear", [state, parameters[0]], [ca.densify(e) for e in outputs])
+    part, size = (v.full().ravel() for v in function(nominal, parameters[1]))
+    return np.where(np.abs(values - part) <= ROUND_OFF * size, values, part)
