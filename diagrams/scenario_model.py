@@ -70,6 +70,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
             scenario.forces,
             tuple(scenario.exogenous),
             loads,
+            scenario.compiled,
         )
 
 

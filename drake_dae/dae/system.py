@@ -17,6 +17,7 @@ from drake_dae.dae.exogenous import Exogenous
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import Compiled, check_choice
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -58,6 +59,9 @@ class DaeSystem:
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
+        compiled: Whether functions of the system that are called often become machine code, where a
+            C compiler is found: True, from the first call on; False; or "auto", what the cache has,
+            and else what was called so often that compiling it pays. See `trace.compiled`.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -82,6 +86,7 @@ class DaeSystem:
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
+    compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -91,6 +96,7 @@ class DaeSystem:
                 f"{self.name}: 'state' must be a CasADi SX column of symbols, "
                 f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
             )
+        check_choice(self.name, self.compiled)
         self._put("state", ca.vec(self.state))
         given = self.parameters if isinstance(self.parameters, (list, tuple)) else [None]
         if not all(isinstance(parameter, Parameter) for parameter in given):
@@ -298,7 +304,9 @@ class DaeSystem:
             inputs: Other symbols, which stand between "state" and "parameters".
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
-        return TracedFunction(f"{self.name} {name}", every, outputs, pivot, regular, often)
+        return TracedFunction(
+            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled
+        )
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
         """Values of all parameters in the order of `parameter_symbol`; the defaults if None.

@@ -26,6 +26,7 @@ from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
+from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -60,6 +61,7 @@ class RobotModel:
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
         loads: Known forces on frames, which are zero where nobody sets their parameters.
+        compiled: Whether functions become machine code: True, False or "auto"; see `DaeSystem`.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
@@ -87,6 +89,7 @@ class RobotModel:
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
+        compiled: Compiled = "auto",
     ) -> None:
         self.links = links
         self.constraints = (*constraints, *plant_constraints(links))
@@ -107,7 +110,8 @@ class RobotModel:
             links.effort_limits if is_joint_force else np.full(len(links.actuator_signals), np.inf)
         )
         nominal = self._nominal(nominal_positions)
-        self.dae = self._equations(bound, h_1, S, driven, nominal).with_exogenous(exogenous)
+        equations = self._equations(bound, h_1, S, driven, nominal)
+        self.dae = replace(equations, compiled=compiled).with_exogenous(exogenous)
         self._check_exogenous()
         self._check_mass_matrix(nominal)
         self._placing = Placing(self.dae, links.q, bound.residual(links), h_1)
@@ -127,6 +131,7 @@ class RobotModel:
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
         loads: Sequence[KnownForce] = (),
+        compiled: Compiled = "auto",
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -144,6 +149,7 @@ class RobotModel:
             forces,
             exogenous,
             loads,
+            compiled,
         )
 
     @property
