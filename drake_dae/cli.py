@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context
 import drake_dae
 from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.export.export import export_code
 from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.diagrams.scenario import (
     DEFAULT_SCENARIO,
@@ -105,6 +106,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     examine.add_argument(
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
+    written = commands.add_parser(
+        "export",
+        parents=[named],
+        help="write law, plant and projection as C99",
+        description="Writes the law, the plant and the projection of a scenario as plain C99 "
+        "without dependencies, with sizes, names and units, and a test program: `make` in the "
+        "folder compiles it and compares it with Python.",
+    )
+    written.add_argument("--out", type=Path, help="folder for the files (default: <scenario>_c99)")
     kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
     kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)
@@ -122,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with _warnings(NonMinimumPhaseWarning):  # The report tells it.
                 return _analyze(options)
         with _warnings():
-            return _simulate(options)
+            return _export(options) if options.command == "export" else _simulate(options)
     except DrakeDaeError as error:
         # A scenario has a line for each problem; other texts, as of Drake, are made one.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
@@ -190,6 +200,15 @@ def _analyze(options: argparse.Namespace) -> int:
     else:
         print(f"{path.stem}\n\n{found}")
     return 2 if found.problems else 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    path = find_scenario(options.scenario)
+    loop, context = build_scenario(load_scenario(path, _settings(options)))
+    folder = options.out or Path(f"{path.stem}_c99")
+    files = export_code(loop, context, path.stem, folder)
+    print(f"written to {folder}/: {', '.join(file.name for file in files)}")
+    return 0
 
 
 def _simulate(options: argparse.Namespace) -> int:

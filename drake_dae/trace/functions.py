@@ -171,6 +171,14 @@ class TracedFunction:
         return tuple(array.size for array in self._inputs)
 
     @property
+    def function(self) -> ca.Function:
+        """The function as CasADi has it: outputs, the pivot, and what is finite if all outputs are.
+
+        With a pivot follows what is finite if it is large enough, too.
+        """
+        return self._function
+
+    @property
     def is_valid(self) -> bool:
         """Whether the last values are of use: all finite, and what must be regular is."""
         return isfinite(self._valid[0])
