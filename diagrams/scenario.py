@@ -24,6 +24,7 @@ from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
+from drake_dae.trace.compiled import Compiled
 
 FOLDER = Path(__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
@@ -127,6 +128,8 @@ class Scenario:
         duration: How long the run lasts, in s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
         write: What the run leaves in its folder.
+        compiled: Whether functions become machine code, where a C compiler is found: true, false
+            or auto, which takes what the cache has and compiles what pays within the run.
     """
 
     description: str = field(default="", kw_only=True)
@@ -149,6 +152,7 @@ class Scenario:
         SimulatorConfig, Form(defaults=_INTEGRATOR), AfterValidator(_checked(check_config))
     ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
     write: parts.Write = field(default_factory=parts.Write)
+    compiled: Compiled = "auto"
 
     def __eq__(self, other: object) -> bool:
         # Arrays, and Drake's SimulatorConfig, do not compare as a whole.

@@ -85,6 +85,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
             loads,
             scenario.compliances,
             weights,
+            scenario.compiled,
         )
 
 

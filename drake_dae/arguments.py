@@ -6,7 +6,17 @@ from functools import wraps
 from math import isfinite
 from numbers import Complex, Integral, Real
 from types import NoneType, UnionType
-from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import casadi as ca
 import numpy as np
@@ -150,6 +160,11 @@ def _rule(hint: Any) -> _Rule:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _rule(arguments[0])
+    if origin is Literal:
+        return _Rule(
+            " or ".join(map(repr, arguments)),
+            lambda value: isinstance(value, str) and value in arguments,
+        )
     if origin in (Union, UnionType):
         return _any_of(set(arguments), arguments)
     if hint is ArrayLike:

@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context
 import drake_dae
 from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.export.export import export_code
 from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.diagrams.scenario import (
     DEFAULT_SCENARIO,
@@ -30,7 +31,13 @@ from drake_dae.diagrams.scenario import (
     save_scenario,
     shipped_scenarios,
 )
-from drake_dae.errors import DrakeDaeError, ModelError, NonMinimumPhaseWarning, ScenarioError
+from drake_dae.errors import (
+    DrakeDaeError,
+    MachineCodeError,
+    ModelError,
+    NonMinimumPhaseWarning,
+    ScenarioError,
+)
 from drake_dae.simulation.animation import make_animation
 from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.plots import PLOTS, save_plots
@@ -41,6 +48,8 @@ from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 from drake_dae.simulation.view import start_meshcat
 from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.trace.cache import cache_folder, clear, contents
+from drake_dae.trace.compiled import find_compiler
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,6 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="KEY=VALUE",
         help='change the scenario, for example "integrator.accuracy=1e-8"; may be repeated',
     )
+    named.add_argument(
+        "--compiled",
+        choices=["true", "false", "auto"],
+        help="whether functions become machine code, as the scenario's key `compiled`",
+    )
     run = commands.add_parser("simulate", parents=[named], help="run a scenario")
     run.add_argument(
         "--out", type=Path, help="folder for the results (default: runs/<scenario>-<time>)"
@@ -92,6 +106,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     examine.add_argument(
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
+    written = commands.add_parser(
+        "export",
+        parents=[named],
+        help="write law, plant and projection as C99",
+        description="Writes the law, the plant and the projection of a scenario as plain C99 "
+        "without dependencies, with sizes, names and units, and a test program: `make` in the "
+        "folder compiles it and compares it with Python.",
+    )
+    written.add_argument("--out", type=Path, help="folder for the files (default: <scenario>_c99)")
+    kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
+    kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)
     if isinstance(sys.stdout, TextIOWrapper):
         # Names may have letters that the terminal does not.
@@ -101,11 +126,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.command == "list":
             return _list()
+        if options.command == "cache":
+            return _cache(options)
         if options.command == "analyze":
             with _warnings(NonMinimumPhaseWarning):  # The report tells it.
                 return _analyze(options)
         with _warnings():
-            return _simulate(options)
+            return _export(options) if options.command == "export" else _simulate(options)
     except DrakeDaeError as error:
         # A scenario has a line for each problem; other texts, as of Drake, are made one.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
@@ -133,6 +160,28 @@ def _list() -> int:
     return 0
 
 
+def _cache(options: argparse.Namespace) -> int:
+    files = contents()
+    size = sum(path.stat().st_size for path in files if path.is_file())
+    what = f"{len(files)} files, {size / 1e6:.1f} MB"
+    if options.clear:
+        clear()
+        print(f"removed from {cache_folder()}: {what}")
+        return 0
+    print(f"cache     {cache_folder()}: {what}")
+    try:
+        print(f"compiler  {' '.join(find_compiler().command)}")
+    except MachineCodeError as error:
+        print(f"compiler  none: {error}")
+    return 0
+
+
+def _settings(options: argparse.Namespace) -> list[str]:
+    """The changes of the scenario, those by options of their own the last."""
+    own = [] if options.compiled is None else [f"compiled={options.compiled}"]
+    return [*options.settings, *own]
+
+
 @contextmanager
 def _warnings(*ignored: type[Warning]) -> Iterator[None]:
     """Prints warnings as errors are printed, without the line of code; some are ignored."""
@@ -145,7 +194,7 @@ def _warnings(*ignored: type[Warning]) -> Iterator[None]:
 
 def _analyze(options: argparse.Namespace) -> int:
     path = find_scenario(options.scenario)
-    found = find_feasibility(load_scenario(path, options.settings))
+    found = find_feasibility(load_scenario(path, _settings(options)))
     if options.json:
         print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
     else:
@@ -153,9 +202,18 @@ def _analyze(options: argparse.Namespace) -> int:
     return 2 if found.problems else 0
 
 
+def _export(options: argparse.Namespace) -> int:
+    path = find_scenario(options.scenario)
+    loop, context = build_scenario(load_scenario(path, _settings(options)))
+    folder = options.out or Path(f"{path.stem}_c99")
+    files = export_code(loop, context, path.stem, folder)
+    print(f"written to {folder}/: {', '.join(file.name for file in files)}")
+    return 0
+
+
 def _simulate(options: argparse.Namespace) -> int:
     path = find_scenario(options.scenario)
-    scenario = load_scenario(path, options.settings)
+    scenario = load_scenario(path, _settings(options))
     if options.meshcat:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None

@@ -77,6 +77,10 @@ class WiringError(DrakeDaeError, ValueError):
     """Blocks that must not be connected like this: an algebraic loop, or a loop that diverges."""
 
 
+class MachineCodeError(DrakeDaeError):
+    """Functions that cannot become machine code: no compiler, or no cache that can be trusted."""
+
+
 class SimulationError(DrakeDaeError):
     """A run that cannot go on.
 
@@ -101,3 +105,7 @@ class NonFiniteError(SimulationError):
 
 class NonMinimumPhaseWarning(UserWarning):
     """A law for a system with unstable zero dynamics: outputs follow, but states run off."""
+
+
+class MachineCodeWarning(UserWarning):
+    """Functions that run interpreted where machine code was asked for, or would have paid."""

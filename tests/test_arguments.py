@@ -460,7 +460,11 @@ EXAMPLES = 12
 
 EVERY = tuple(labels())
 # What a call does apart from its arguments is not wanted here.
-SIDE_EFFECTS = {"start_meshcat": "it opens a port", "Record.save": "it writes where it is told"}
+SIDE_EFFECTS = {
+    "start_meshcat": "it opens a port",
+    "Record.save": "it writes where it is told",
+    "export_code": "it writes where it is told",
+}
 
 
 @pytest.mark.slow

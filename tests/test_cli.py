@@ -417,6 +417,47 @@ def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, 
 # The rest of the command line.
 
 
+def test_cache(tmp_path, monkeypatch, capsys):
+    """A run with a flag that fills it; no other flag does."""
+    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "code"))
+    monkeypatch.delenv("CC", raising=False)
+    short = ["simulate", "two_link_wall", "--set", "duration=0.05", *BARE]
+    for flag in ("auto", "false"):
+        assert main([*short, "--out", str(tmp_path / flag), "--compiled", flag]) == 0
+    capsys.readouterr()
+    assert main(["cache"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{tmp_path}/code: 0 files, 0.0 MB\n" in printed
+    assert re.search(r"^compiler +(cc$|none: no C compiler)", printed, flags=re.MULTILINE)
+    if "none" not in printed:
+        assert main([*short, "--out", str(tmp_path / "run"), "--compiled", "true"]) == 0
+        assert "compiled: true" in (tmp_path / "run" / "scenario.yaml").read_text()
+        capsys.readouterr()
+        assert main(["cache"]) == 0
+        assert re.search(r"code: [5-9] files, 0\.\d MB", capsys.readouterr().out)
+    assert main(["cache", "--clear"]) == 0
+    assert re.search(r"removed from .*: \d files", capsys.readouterr().out)
+    assert not list((tmp_path / "code").glob("*"))
+    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "run" / "scenario.yaml"))
+    (tmp_path / "run").mkdir(exist_ok=True)
+    (tmp_path / "run" / "scenario.yaml").touch()
+    assert main(["cache"]) == 1
+    assert "is no folder" in error_line(capsys)
+
+
+def test_no_compiler_is_a_warning(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "code"))
+    monkeypatch.setenv("CC", "no-such-compiler")
+    short = ["simulate", "two_link_wall", "--set", "duration=0.05", *BARE]
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main([*short, "--out", str(tmp_path / "run"), "--compiled", "true"]) == 0
+    (line,) = capsys.readouterr().err.splitlines()  # Once, though for each of the functions.
+    assert line.startswith("warning: no C compiler: CC names 'no-such-compiler'")
+    assert main(["cache"]) == 0
+    assert "none: no C compiler" in capsys.readouterr().out
+
+
 def test_list(capsys):
     assert main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -11,6 +11,7 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     ROUNDING,
     Linearization,
@@ -79,6 +80,14 @@ class Manifold:
         """C = d(residual)/dx, shape (sum r_i, n); the arguments are those of `residual`."""
         values = self._gradient(state, self.system.parameter_vector(parameters))[0]
         return values.reshape(-1, self.system.num_states)
+
+    @property
+    def newton_step(self) -> TracedFunction:
+        """The Newton step of least norm from a state, by the gradients at another one.
+
+        A function of state, the other state and parameters.
+        """
+        return self._newton
 
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
         """Whether a state is on N* up to round-off: Newton's step to it is short, in any unit.

@@ -19,6 +19,7 @@ from drake_dae.dae.scale import natural_scale
 from drake_dae.dae.sharing import Sharing
 from drake_dae.dae.signals import Parameter, Signal, is_symbol
 from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import Compiled, check_choice
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -78,6 +79,9 @@ class DaeSystem:
         control_metric: W, shape (p, p), symmetric positive definite, for more controls than
             outputs; None if there is nothing to choose.
         free_control: u_0, shape (p, 1); zero if None.
+        compiled: Whether functions of the system that are called often become machine code, where a
+            C compiler is found: True, from the first call on; False; or "auto", what the cache has,
+            and else what was called so often that compiling it pays. See `trace.compiled`.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -106,6 +110,7 @@ class DaeSystem:
     sharing: Sharing | None = None
     control_metric: ca.SX = None
     free_control: ca.SX = None
+    compiled: Compiled = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -115,6 +120,7 @@ class DaeSystem:
                 f"{self.name}: 'state' must be a CasADi SX column of symbols, "
                 f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
             )
+        check_choice(self.name, self.compiled)
         self._put("state", ca.vec(self.state))
         given = self.parameters if isinstance(self.parameters, (list, tuple)) else [None]
         if not all(isinstance(parameter, Parameter) for parameter in given):
@@ -380,7 +386,9 @@ class DaeSystem:
             inputs: Other symbols, which stand between "state" and "parameters".
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
-        return TracedFunction(f"{self.name} {name}", every, outputs, pivot, regular, often)
+        return TracedFunction(
+            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled
+        )
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
         """Values of all parameters in the order of `parameter_symbol`; the defaults if None.

@@ -100,6 +100,7 @@ class TrackingLaw:
             {"control": control, "tracking_error": output - values},
             pivot,
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
+            compiled=self.system.compiled,
         )
 
     def _trace_error_coordinates(self) -> TracedFunction:

@@ -29,6 +29,7 @@ from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
+from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -76,6 +77,7 @@ class RobotModel:
         control_weights: w, positive, for more actuators than outputs: one for each, shape (nu,), or
             a number for all, where all controls have one unit. The squares of 1 / limit share the
             load as the limits are. It becomes the parameter "control_weights".
+        compiled: Whether functions become machine code: True, False or "auto"; see `DaeSystem`.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
@@ -106,6 +108,7 @@ class RobotModel:
         loads: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
+        compiled: Compiled = "auto",
     ) -> None:
         self.links = links
         self.constraints = (*constraints, *plant_constraints(links))
@@ -139,8 +142,8 @@ class RobotModel:
         self.control_limits = np.concatenate([efforts, motors])
         self.loop_joints = LoopState.of(bound, links)
         nominal = self._nominal(nominal_positions)
-        dae = self._equations(bound, h_1, S, driven, nominal, choice)
-        self.dae = dae.with_exogenous(exogenous)
+        equations = self._equations(bound, h_1, S, driven, nominal, choice)
+        self.dae = replace(equations, compiled=compiled).with_exogenous(exogenous)
         self._check_exogenous()
         if compliances is not None:
             self.dae = share_forces(self.dae, compliances=compliances)
@@ -167,6 +170,7 @@ class RobotModel:
         loads: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
+        compiled: Compiled = "auto",
     ) -> Self:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
@@ -186,6 +190,7 @@ class RobotModel:
             loads,
             compliances,
             control_weights,
+            compiled,
         )
 
     @property

@@ -2,6 +2,7 @@
 
 import warnings
 
+import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 
@@ -87,6 +88,11 @@ class TrackingController(ParameterizedSystem):
         """
         values = self.law.all_parameters(self.parameters(context), gains)
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+    def all_parameters(self, context: Context) -> FloatArray:
+        """What the law's function takes as parameters: the model's at the context's time, and K."""
+        self.check_context(context)
+        return np.array(self._values(context))
 
     def _calc_control(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(context)[0])

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import Compiled, attempts, machine_code
 
 HUGE = 1e30
 """A number above this, in whatever unit, says that something grew without bound. Its powers cancel
@@ -52,7 +53,8 @@ class TracedFunction:
     """CasADi expressions, evaluated on preallocated NumPy arrays.
 
     A call goes through CasADi's buffer interface and allocates nothing. Whether its values are of
-    use, `is_valid`, is one number that the call computes as well.
+    use, `is_valid`, is one number that the call computes as well. Whether it is interpreted or
+    machine code is decided here and nowhere else, by a choice that is handed down.
 
     Args:
         name: What messages call the function.
@@ -62,10 +64,14 @@ class TracedFunction:
         pivot: A scalar that is 0 where a matrix that must be regular is singular, such as
             `Factorization.pivot`; None if there is no such matrix.
         regular: What messages call that matrix.
-        often: Whether it is called often enough for common subexpressions to be worth removing.
+        often: Whether it is called often enough for common subexpressions to be worth removing, and
+            for machine code.
+        compiled: Whether a function that is called often becomes machine code; see
+            `trace.compiled`.
 
     Attributes:
         num_operations: How many scalar operations one call takes.
+        is_machine_code: Whether calls run machine code by now.
     """
 
     def __init__(
@@ -76,6 +82,7 @@ class TracedFunction:
         pivot: ca.SX | None = None,
         regular: str = "a matrix",
         often: bool = True,
+        compiled: Compiled = False,
     ) -> None:
         self.name = name
         self._regular = regular
@@ -97,19 +104,36 @@ class TracedFunction:
             {"cse": False},
         )
         self.num_operations = int(self._function.n_instructions())
-        self._buffer, self._evaluate = self._function.buffer()
         self._inputs = tuple(np.zeros(symbol.numel()) for symbol in inputs.values())
         self._num_inputs = len(self._inputs)
-        results = [np.zeros(e.shape, order="F") for e in expressions]
-        for index, array in enumerate(self._inputs):
-            self._buffer.set_arg(index, array.data)
-        for index, array in enumerate(results):
-            self._buffer.set_res(index, array.reshape(-1, order="F").data)
+        self._results = results = [np.zeros(e.shape, order="F") for e in expressions]
+        self._bind(self._function)
+        self._compiled = compiled
+        self._attempts = attempts(compiled, self.num_operations) if often else []
+        self._calls_left = self._attempts[0].calls if self._attempts else 0
         results, checks = results[: len(dense)], results[len(dense) :]
         self._pivot, self._finite, self._valid = (checks[i].reshape(-1) for i in (0, 1, -1))
         self._outputs = tuple(
             array.reshape(-1, order="F") if array.shape[1] == 1 else array for array in results
         )
+
+    def _bind(self, function: ca.Function) -> None:
+        """Makes a function the one that is called, on the same arrays."""
+        self.is_machine_code = function is not self._function
+        self._buffer, self._evaluate = function.buffer()
+        for index, array in enumerate(self._inputs):
+            self._buffer.set_arg(index, array.data)
+        for index, array in enumerate(self._results):
+            self._buffer.set_res(index, array.reshape(-1, order="F").data)
+
+    def _seek(self) -> None:
+        """Seeks machine code, after as many calls as the choice says."""
+        attempt = self._attempts.pop(0)
+        code = machine_code(self._function, self._compiled, attempt.make)
+        if code is not None:
+            self._bind(code)
+        elif self._attempts:
+            self._calls_left = self._attempts[0].calls
 
     def evaluate(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
         """Calls the function without allocation.
@@ -130,6 +154,10 @@ class TracedFunction:
         for given in arguments:
             inputs[index][...] = given
             index += 1  # noqa: SIM113 - enumerate takes longer.
+        if self._calls_left:
+            self._calls_left -= 1
+            if not self._calls_left:
+                self._seek()
         self._evaluate()
         return self._outputs
 
@@ -141,6 +169,14 @@ class TracedFunction:
     def sizes(self) -> tuple[int, ...]:
         """How many entries each input has."""
         return tuple(array.size for array in self._inputs)
+
+    @property
+    def function(self) -> ca.Function:
+        """The function as CasADi has it: outputs, the pivot, and what is finite if all outputs are.
+
+        With a pivot follows what is finite if it is large enough, too.
+        """
+        return self._function
 
     @property
     def is_valid(self) -> bool:

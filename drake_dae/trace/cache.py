@@ -1,0 +1,173 @@
+"""Where compiled code is kept: a folder of this user's, which nobody else can write.
+
+What stands there is loaded into the process, so it is trusted only where nobody else could have put
+it. A file's name ends in the digest of its bytes: files appear whole, by one `os.replace`, never
+change, and one that was damaged is known. So processes share the folder without locks.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import stat
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from drake_dae.errors import MachineCodeError, MachineCodeWarning
+
+SUFFIX = ".so"
+"""Of compiled code; on macOS too, where a library may bear any."""
+
+_OURS = re.compile(rf"[0-9a-f]{{32}}-[0-9a-f]{{32}}{re.escape(SUFFIX)}|new-\w+")
+
+
+def cache_folder() -> Path:
+    """The folder, whether it exists or not: what DRAKE_DAE_CACHE names, if it is set.
+
+    Else it is drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
+    macOS and ~/.cache elsewhere.
+
+    Raises:
+        MachineCodeError: The user has no home.
+    """
+    if os.environ.get("DRAKE_DAE_CACHE"):
+        return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if given.is_absolute():  # Others are to be ignored, says its specification.
+        return given / "drake_dae"
+    try:
+        home = Path.home()
+    except RuntimeError:
+        raise MachineCodeError(
+            "no folder for a cache: this user has no home; name one in DRAKE_DAE_CACHE"
+        ) from None
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "drake_dae"
+
+
+def open_cache(create: bool = False) -> Path | None:
+    """The folder, if it can be trusted; None if there is none.
+
+    Args:
+        create: Makes one where there is none, mode 0700.
+
+    Raises:
+        MachineCodeError: It belongs to another user, or others can write it; or it cannot be made.
+    """
+    folder = cache_folder()
+    try:
+        if create:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(FileExistsError):
+                folder.mkdir(0o700)
+        found = folder.stat()
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and not create:
+            return None
+        raise MachineCodeError(_told(folder, error)) from None
+    if not stat.S_ISDIR(found.st_mode):
+        raise MachineCodeError(f"the cache {folder} is no folder; take it away")
+    if found.st_uid != os.getuid():
+        raise MachineCodeError(
+            f"the cache {folder} belongs to another user (id {found.st_uid}), whose code is not "
+            "loaded; name a folder of your own in DRAKE_DAE_CACHE"
+        )
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise MachineCodeError(
+            f"others can write the cache {folder} (mode {stat.S_IMODE(found.st_mode):04o}), so its "
+            f"code is not loaded; chmod 700 {folder}"
+        )
+    return folder
+
+
+def find(key: str) -> Path | None:
+    """The code that was stored under a key; None if there is none.
+
+    Warns:
+        MachineCodeWarning: The file is damaged, and was removed.
+
+    Raises:
+        MachineCodeError: The cache cannot be trusted or read.
+    """
+    folder = open_cache()
+    if folder is None:
+        return None
+    try:
+        path = next(folder.glob(f"{key}-*{SUFFIX}"), None)
+        if path is None:
+            return None
+        if path.name == _name(key, path.read_bytes()):
+            return path
+        path.unlink()
+    except OSError as error:
+        raise MachineCodeError(_told(folder, error)) from None
+    warnings.warn(f"{path} was damaged, and is removed", MachineCodeWarning, stacklevel=1)
+    return None
+
+
+@contextmanager
+def workplace() -> Iterator[Path]:
+    """A folder in the cache for files on their way, which is removed in the end.
+
+    Raises:
+        MachineCodeError: The cache cannot be trusted or written.
+    """
+    folder = open_cache(create=True)
+    try:
+        place = tempfile.mkdtemp(prefix="new-", dir=folder)
+    except OSError as error:
+        raise MachineCodeError(_told(cache_folder(), error)) from None
+    try:
+        yield Path(place)
+    except OSError as error:
+        raise MachineCodeError(_told(cache_folder(), error)) from None
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def store(key: str, file: Path) -> Path:
+    """Moves a file from the `workplace` to where `find` finds it by a key."""
+    path = file.parents[1] / _name(key, file.read_bytes())
+    os.replace(file, path)
+    return path
+
+
+def contents() -> list[Path]:
+    """The files of the cache, and folders that processes left which were killed; nothing else.
+
+    Raises:
+        MachineCodeError: The cache cannot be trusted or read.
+    """
+    folder = open_cache()
+    try:
+        found = sorted(folder.iterdir()) if folder is not None else []
+        return [path for path in found if _OURS.fullmatch(path.name)]
+    except OSError as error:
+        raise MachineCodeError(_told(cache_folder(), error)) from None
+
+
+def clear() -> None:
+    """Removes everything from the cache; processes that run keep what they have loaded.
+
+    Raises:
+        MachineCodeError: The cache cannot be trusted or written.
+    """
+    for path in contents():
+        try:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise MachineCodeError(_told(path, error)) from None
+
+
+def _name(key: str, code: bytes) -> str:
+    return f"{key}-{hashlib.sha256(code).hexdigest()[:32]}{SUFFIX}"
+
+
+def _told(path: Path, error: OSError) -> str:
+    return f"the cache {path} cannot be used: {error.strerror or error}"

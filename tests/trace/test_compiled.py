@@ -1,0 +1,386 @@
+"""Machine code: the same values as the interpreter, and what happens where there can be none."""
+
+import gc
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from drake_dae import DaeSystem, build_scenario
+from drake_dae.diagrams.scenario import find_scenario, load_scenario, shipped_scenarios
+from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
+from drake_dae.trace.cache import cache_folder, clear, contents
+from drake_dae.trace.compiled import LIMIT, LOOK, attempts, find_compiler
+from drake_dae.trace.functions import TracedFunction
+
+needs_compiler = pytest.mark.skipif(
+    not os.environ.get("CC") and shutil.which("cc") is None, reason="there is no C compiler"
+)
+
+
+def made(compiled, name="test", **options) -> TracedFunction:
+    """A function with what may be not finite, and a matrix that may be singular."""
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+    outputs = {
+        "y": ca.vertcat(ca.sqrt(x[0]), ca.sin(x[1]) / p[0], ca.fmin(x[2], p[1])),
+        "z": ca.mtimes(x, p.T),
+        "none": ca.SX(0, 1),
+    }
+    return TracedFunction(
+        name, {"x": x, "p": p}, outputs, p[1] ** 2, "the square", compiled=compiled, **options
+    )
+
+
+X, P = np.array([1.0, 2.0, 3.0]), np.array([10.0, 20.0])
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of a test's own."""
+    folder = tmp_path / "kept" / "code"
+    monkeypatch.setenv("DRAKE_DAE_CACHE", str(folder))
+    return folder
+
+
+def runs_interpreted(match: str) -> None:
+    """A function warns, and has its values nevertheless."""
+    function = made(True)
+    with pytest.warns(MachineCodeWarning, match=match):
+        values = function(X, P)
+    assert not function.is_machine_code
+    for one, two in zip(values, made(False)(X, P), strict=True):
+        np.testing.assert_array_equal(one, two)
+    function(X, P)  # Warnings are errors: it is told once.
+
+
+# What it computes.
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("x", "p"),
+    [
+        (X, P),
+        ([-1.0, 2.0, 3.0], P),
+        (X, [0.0, 20.0]),
+        (X, [10.0, 0.0]),
+        ([np.nan, 1.0, 1.0], P),
+        ([1.0, np.inf, 1.0], P),
+        ([1.0, 1e31, np.nan], [1.0, -np.inf]),
+    ],
+)
+def test_values_that_are_not_finite_are_told_alike(x, p, cache):
+    code, interpreted = made(True), made(False)
+    for one, two in zip(code(x, p), interpreted(x, p), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert code.is_machine_code
+    assert not interpreted.is_machine_code
+    for name in ("is_valid", "is_finite", "pivot"):
+        np.testing.assert_equal(getattr(code, name), getattr(interpreted, name))
+    assert code.failure() == interpreted.failure()
+
+
+def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
+    """All functions that are made for a scenario, by name and sizes."""
+    before = [f for f in gc.get_objects() if isinstance(f, TracedFunction)]
+    loop, _ = build_scenario(load_scenario(find_scenario(name), [f"compiled={compiled}"]))
+    after = [f for f in gc.get_objects() if isinstance(f, TracedFunction)]
+    known = set(map(id, before))
+    found = {(f.name, f.sizes, f.num_operations): f for f in after if id(f) not in known}
+    assert any(f is loop.controller.law.function for f in found.values())
+    return found
+
+
+SLOW = [
+    pytest.param(name, marks=[] if name == "two_link_wall" else pytest.mark.slow)
+    for name in shipped_scenarios()
+]
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", SLOW)
+def test_machine_code_agrees_with_the_interpreter(name):
+    """To 1e-12 of the largest value: sums that cancel have the round-off of their terms."""
+    code, interpreted = (functions_of(name, compiled) for compiled in ("true", "false"))
+    random, compiled = np.random.default_rng(0), 0
+    for key, function in code.items():
+        for _ in range(3):
+            arguments = [random.normal(size=size) for size in function.sizes]
+            found = [np.array(value) for value in function.evaluate(*arguments)]
+            for one, two in zip(found, interpreted[key].evaluate(*arguments), strict=True):
+                size = np.max(np.abs(two[np.isfinite(two)]), initial=0.0)
+                np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12 * size)
+            np.testing.assert_equal(function.is_valid, interpreted[key].is_valid)
+        compiled += function.is_machine_code
+    # The law, the dynamics, the force, the outputs, the manifold and the step to it at least.
+    assert compiled >= 6
+
+
+@needs_compiler
+def test_what_is_compiled_has_derivatives(cache):
+    code, interpreted = made(True), made(False)
+    code(X, P)
+    one, two = (f.derivative(0, (0, 1))(X, P)[0] for f in (code, interpreted))
+    np.testing.assert_array_equal(one, two)
+
+
+# When.
+
+
+@needs_compiler
+def test_the_choice(cache):
+    calls = {True: 1, False: None, "auto": None}
+    for compiled, first in calls.items():
+        function = made(compiled)
+        function.evaluate(X, P)
+        assert function.is_machine_code == (first == 1)
+    assert not made(True, often=False).is_machine_code
+    for bad in ("yes", 1, None, 0.0, np.array([True])):
+        with pytest.raises(ModelError, match="compiled must be True, False or 'auto', got"):
+            DaeSystem.from_functions(1, f=lambda x: -x, compiled=bad)
+
+
+@needs_compiler
+def test_auto_takes_what_the_cache_has(cache):
+    def call(function, count):
+        for _ in range(count):
+            function.evaluate(X, P)
+        return function
+
+    assert not call(made("auto"), LOOK).is_machine_code
+    assert call(made(True), 1).is_machine_code
+    assert not call(made("auto"), LOOK - 1).is_machine_code
+    assert call(made("auto"), LOOK).is_machine_code
+
+
+@needs_compiler
+def test_auto_compiles_what_was_called_so_often_that_it_pays(cache):
+    function = made("auto")
+    look, make = attempts("auto", function.num_operations)
+    assert (look.make, make.make) == (False, True)
+    function.evaluate(X, P)
+    for _ in range(look.calls + make.calls - 2):
+        function.evaluate(X, P)
+    assert not function.is_machine_code
+    function.evaluate(X, P)
+    assert function.is_machine_code
+    np.testing.assert_array_equal(function(X, P)[0], made(False)(X, P)[0])
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_many_results_are_compiled_in_proportion(cache):
+    """2 s, and some 30 s with a branch for each of 1,600 results; other work may triple it."""
+    x = ca.SX.sym("x", 40)
+    function = TracedFunction("f", {"x": x}, {"y": ca.mtimes(x, ca.sin(x).T)}, compiled=True)
+    began = os.times().children_user
+    function(np.arange(40.0))
+    assert function.is_machine_code
+    assert os.times().children_user - began < 10.0
+
+
+def test_large_functions_are_compiled_without_being_asked_while_it_takes_ten_seconds():
+    def pays(operations):
+        return [attempt.calls for attempt in attempts("auto", operations) if attempt.make]
+
+    # As many seconds as it takes are saved, at some 5 ns an operation.
+    assert 40_000 < pays(25_000)[0] < 60_000
+    assert 5_000 < pays(100_000)[0] < 10_000
+    assert LIMIT == 10.0
+    assert pays(1_000_000) == []
+    assert attempts(True, 1_000_000)[0].make
+    assert attempts("auto", 0) == attempts(False, 100) == []
+
+
+# Where it cannot be.
+
+
+def test_without_a_compiler(cache, monkeypatch):
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    runs_interpreted("no C compiler: CC names '/nowhere/cc', which is not found; install gcc")
+    monkeypatch.setenv("CC", "'")
+    runs_interpreted("CC is no command")
+    monkeypatch.delenv("CC")
+    monkeypatch.setenv("PATH", "/nowhere")
+    runs_interpreted("no C compiler: 'cc' is not found")
+    assert contents() == []
+
+
+def script(path, text: str) -> str:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o700)
+    return str(path)
+
+
+def test_a_compiler_that_fails(cache, monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", script(tmp_path / "cc1", "echo 'error: out of order' >&2; exit 3"))
+    runs_interpreted(
+        r"the C compiler '.*cc1' fails \(exit 3\): error: out of order\. Functions run"
+    )
+    monkeypatch.setenv("CC", script(tmp_path / "cc2", "exit 0"))
+    runs_interpreted(r"the C compiler '.*cc2' fails \(exit 0\): no message")
+    monkeypatch.setenv("CC", str(tmp_path))
+    runs_interpreted("no C compiler")
+    monkeypatch.setenv("CC", script(tmp_path / "cc3", "sleep 60"))
+    monkeypatch.setattr("drake_dae.trace.compiled.LIMIT", 0.05)
+    runs_interpreted(r"the C compiler '.*cc3' takes longer than 0\.15 s")
+    assert contents() == []
+
+
+def test_a_compiler_that_makes_nonsense(cache, monkeypatch, tmp_path):
+    text = 'while [ $# -gt 0 ]; do [ "$1" = -o ] && echo nonsense > "$2"; shift; done'
+    monkeypatch.setenv("CC", script(tmp_path / "cc", text))
+    runs_interpreted("compiled code cannot be loaded")
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written(cache, monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "file"))
+    runs_interpreted("file is no folder; take it away")
+    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "file" / "code"))
+    runs_interpreted("file/code cannot be used: Not a directory")
+    monkeypatch.setenv("DRAKE_DAE_CACHE", "/proc/nobody/code")
+    runs_interpreted("/proc/nobody cannot be used|/proc/nobody/code cannot be used")
+
+
+@needs_compiler
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_cache_that_is_read_only(cache):
+    cache.mkdir(mode=0o500, parents=True)
+    runs_interpreted("code cannot be used: Permission denied")
+
+
+@needs_compiler
+def test_a_cache_that_is_full(cache):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        runs_interpreted("code cannot be used: File too large")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert contents() == []
+
+
+@needs_compiler
+def test_a_cache_of_another_user(cache, monkeypatch):
+    made(True)(X, P)
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    runs_interpreted("belongs to another user .*, whose code is not loaded")
+    with pytest.raises(MachineCodeError, match="belongs to another user"):
+        clear()
+
+
+@needs_compiler
+@pytest.mark.parametrize("mode", [0o777, 0o720, 0o702])
+def test_a_cache_that_others_can_write(mode, cache):
+    made(True)(X, P)
+    cache.chmod(mode)
+    runs_interpreted(f"others can write the cache .* {mode:04o}.*; chmod 700 {cache}")
+    cache.chmod(0o700)
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", [b"", b"nonsense", None])
+def test_code_that_was_damaged_is_made_anew(damage, cache):
+    made(True)(X, P)
+    (path,) = contents()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100] if damage is None else damage)
+    function = made(True)
+    with pytest.warns(MachineCodeWarning, match=r"\.so was damaged, and is removed"):
+        function(X, P)
+    assert function.is_machine_code
+    (path,) = contents()
+    assert path.read_bytes() == whole
+    np.testing.assert_array_equal(function(X, P)[0], made(False)(X, P)[0])
+
+
+# What is kept.
+
+
+@needs_compiler
+def test_what_is_kept(cache, monkeypatch):
+    assert cache_folder() == cache
+    assert contents() == []
+    made(True)(X, P)
+    assert cache.stat().st_mode & 0o777 == 0o700
+    (first,) = contents()
+    written = first.stat().st_mtime_ns
+    made(True)(X, P)
+    assert [path.stat().st_mtime_ns for path in contents()] == [written]
+    # Another function, and another compiler.
+    made(True, "other")(X, P)
+    assert len(contents()) == 2
+    monkeypatch.setenv("CC", f"{' '.join(find_compiler().command)} -g")
+    made(True)(X, P)
+    assert len(contents()) == 3
+    # What is not ours stays.
+    (cache / "mine.txt").touch()
+    (cache / "new-killed").mkdir()
+    assert len(contents()) == 4
+    clear()
+    assert contents() == []
+    assert [path.name for path in cache.iterdir()] == ["mine.txt"]
+
+
+def test_where_it_is_kept(monkeypatch, tmp_path):
+    monkeypatch.delenv("DRAKE_DAE_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "drake_dae"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for wrong in ("", "relative"):
+        monkeypatch.setenv("XDG_CACHE_HOME", wrong)
+        name = "Library/Caches" if sys.platform == "darwin" else ".cache"
+        assert cache_folder() == tmp_path / name / "drake_dae"
+
+
+@needs_compiler
+def test_a_compiler_that_is_told_to_be_careless_is_not(cache, monkeypatch):
+    """With -ffast-math, which CC asks for here, nan would pass for a number."""
+    command = " ".join(find_compiler().command)
+    monkeypatch.setenv("CC", f"{command} -ffast-math -O3")
+    function = made(True)
+    function([-1.0, 2.0, 3.0], P)
+    assert function.is_machine_code
+    assert not function.is_finite
+
+
+PROCESS = """
+import numpy as np, casadi as ca, sys
+from drake_dae.trace.functions import TracedFunction
+x = ca.SX.sym("x", 20)
+f = TracedFunction("f", {"x": x}, {"y": ca.mtimes(x, ca.sin(x).T)}, compiled=True)
+print(f(np.arange(20.0))[0].sum(), f.is_machine_code)
+"""
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_processes_share_the_cache(cache):
+    command = [sys.executable, "-W", "error", "-c", PROCESS]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(6)]
+    printed = [process.communicate(timeout=120)[0] for process in running]
+    assert len(set(printed)) == 1
+    assert printed[0].split()[1] == "True"
+    assert len(contents()) == 1
+    assert [path.suffix for path in cache.iterdir()] == [".so"]
+
+
+@needs_compiler
+def test_auto_looks_without_a_word(cache, monkeypatch):
+    """Nothing is lost yet: what keeps from compiling is told when it would pay."""
+    cache.mkdir(parents=True)
+    cache.chmod(0o777)
+    function = made("auto")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(LOOK):
+            function.evaluate(X, P)
+    assert not function.is_machine_code
