@@ -27,7 +27,8 @@ SHARE = 0.5
 """States are taken to be in use up to this part of where the terms of the equations are alike."""
 
 FAINT = 1e-3
-"""The weight of a nominal value beside that of a term: it decides where the equations do not."""
+"""The weight of nominal values and of constant terms, which hang on where the nominal state is:
+they decide where other terms do not."""
 
 NEGLIGIBLE = log(1e-10)
 """The logarithm of a term, relative to the largest of its equation, that may be round-off."""
@@ -89,8 +90,8 @@ def natural_scale(
     with a common rate w; inputs and equations have sizes of their own. The logarithms are linear
     in those of the unknowns, so that a fit makes the terms of each equation as alike as they can
     be. In other units of states, inputs and equations the same sizes come out, in those units.
-    What the equations leave open, such as the amplitude of a linear system, is like the nominal
-    state, or near 1.
+    What the equations leave open, such as the amplitude of a linear system, is as constant terms
+    and the nominal state tell, or near 1.
 
     Args:
         functions: E, f, g, h, k, l and m as expressions; E under "mass_matrix".
@@ -132,7 +133,8 @@ def natural_scale(
                 unknowns[rate] += 1.0
             size = abs(coefficient)
             is_plain = size > ROUND_OFF * largest[len(states)]
-            comparisons.append(_Comparison(unknowns, log(size), equation, 1.0, is_plain))
+            weight = FAINT if factor is None and not states else 1.0
+            comparisons.append(_Comparison(unknowns, log(size), equation, weight, is_plain))
     for i in np.flatnonzero(nominal).tolist():
         unknowns = -np.eye(1, end, i)[0]
         comparisons.append(_Comparison(unknowns, log(abs(nominal[i])), i, FAINT, True))
