@@ -40,6 +40,7 @@ WITHOUT_DRAKE = ("errors", "arrays", "arguments", "trace", "dae", "analysis")
 PAPER = (
     "signals",
     "exogenous",
+    "contacts",
     "expressions",
     "system",
     "layout",

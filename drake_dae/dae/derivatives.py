@@ -35,7 +35,8 @@ class Derivatives:
         control: The symbols u, shape (p, 1).
         constraint_gradient: dc/dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        pivot: A scalar that is 0 exactly where A(x) is singular; see `trace.factorization`.
+        pivot: A scalar that is 0 exactly where A(x) is singular, see `trace.factorization`, and not
+            positive where a contact jams, see `dae.contacts`.
     """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX) -> None:
@@ -77,6 +78,8 @@ class Derivatives:
         self._unknowns, self.constraint_matrix, self.pivot = _solver(
             mass[self._rows, self._rows], g_rows, gradient
         )
+        if system.rubbing:
+            self.pivot = ca.fmin(self.pivot, system.rubbing.reserve(self.constraint_matrix))
         self._equations: list[ca.SX] = []
         self._solve_order()
 

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
+from drake_dae.dae.contacts import Contact, Contacts
 from drake_dae.dae.exogenous import Exogenous
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
-from drake_dae.dae.signals import Parameter, Signal, is_symbol
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, moving
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
@@ -58,6 +59,8 @@ class DaeSystem:
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
+        contacts: Those constraint inputs that can only push, where friction acts on one of them:
+            the motion makes sense only where they are sure to push, see `dae.contacts`.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -82,6 +85,7 @@ class DaeSystem:
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
+    contacts: tuple[Contact, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -100,6 +104,9 @@ class DaeSystem:
             )
         self._put("parameters", tuple(given))
         check_unique(self.name, "parameter", [p.name for p in self.parameters])
+        for contact in self.contacts:
+            if contact.friction is not None:
+                self.parameter_slice(contact.friction)
         if self.mass_matrix is None:
             self._put("mass_matrix", ca.SX.eye(self.state.numel()))
         functions = {key: getattr(self, key) for key in ("f", "g", "h", "k", "l", "m")}
@@ -262,6 +269,11 @@ class DaeSystem:
         """The parameters that move, w, and how they enter time derivatives."""
         return Exogenous(self.name, self.parameters)
 
+    @cached_property
+    def rubbing(self) -> Contacts:
+        """The contacts that can only push, if friction acts on one of them; see `dae.contacts`."""
+        return Contacts(self.name, self.constraint_input_signals, self.parameters, self.contacts)
+
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """The same system, some of whose parameters move.
@@ -273,8 +285,7 @@ class DaeSystem:
         for name in names:
             if name not in known:
                 raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
-        changed = [replace(p, exogenous=True) if p.name in names else p for p in self.parameters]
-        return replace(self, parameters=tuple(changed))
+        return replace(self, parameters=moving(self.parameters, names))
 
     @property
     def nominal_spread(self) -> FloatArray:

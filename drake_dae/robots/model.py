@@ -36,15 +36,15 @@ class RobotModel:
         M(q) v' + H(q, v) = J(q)^T lambda + B tau,    q' = N(q) v,
         0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
 
-    with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T; one
-    that restricts velocities alone has its rate in place of phi, and r = 1. With rigid joints
-    tau = u; stages of actuation put their own dynamics between u and tau: E s' = drift(q, v, s) +
-    drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the
-    constraint input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many
-    position outputs as actuators less constraints. Where fewer forces can or shall be steered, as
-    those of wheels and of mimic joints, or combinations of them, as in a grasp, `forces` tells
-    which: z_2 = S(q) lambda, and there are as many position outputs as actuators less these. All of
-    lambda is on the plant's port nevertheless.
+    with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T;
+    viscous friction is a part of H; one that restricts velocities alone has its rate in place of
+    phi, and r = 1. With rigid joints tau = u; stages of actuation put their own dynamics between u
+    and tau: E s' = drift(q, v, s) + drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The
+    state is x = (q, v, s), the constraint input is lambda, and the controlled outputs are z = (z_1,
+    z_2), so there are as many position outputs as actuators less constraints. Where fewer forces
+    can or shall be steered, as those of wheels and of mimic joints, or combinations of them, as in
+    a grasp, `forces` tells which: z_2 = S(q) lambda, and there are as many position outputs as
+    actuators less these. All of lambda is on the plant's port nevertheless.
 
     Args:
         links: The links, which provide M, H and the frames.
@@ -89,7 +89,8 @@ class RobotModel:
         loads: Sequence[KnownForce] = (),
     ) -> None:
         self.links = links
-        self.constraints = (*constraints, *plant_constraints(links))
+        every = (*constraints, *plant_constraints(links))
+        self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
         self.positions = tuple(positions)
         self.name = name
         self.loads = tuple(loads)
@@ -287,7 +288,7 @@ class RobotModel:
         m, nu = bound.size, len(links.actuator_signals)
         B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(B, driven.joint_force) + self._known_force()
+        torque = ca.mtimes(B, driven.joint_force) + self._known_force() + bound.drag(links)
         rotors = self._moved_rotors(driven)
 
         def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -331,6 +332,7 @@ class RobotModel:
             nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
             name=self.name,
             implicit=implicit,
+            contacts=bound.contacts,
         )
 
     def _known_force(self) -> ca.SX:

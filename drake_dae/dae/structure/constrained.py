@@ -38,7 +38,8 @@ class ConstraintStructure:
         states: The consistent states at which numbers were decided, shape (samples, n).
         scale: How large each state is over them and the states near which they were sought, shape
             (n,).
-        constraint_margin: The margin of A(x), Assumption (2); None without constraints.
+        constraint_margin: The margin of A(x), Assumption (2), without friction; None without
+            constraints.
     """
 
     system: DaeSystem
@@ -180,6 +181,8 @@ def examine_constraints(
     _check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
+    # Where friction turns it around the contact jams, which is decided at the states of a motion.
+    matrix = system.rubbing.without_friction(elimination.constraint_matrix)
     found = ConstraintStructure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),
@@ -188,7 +191,7 @@ def examine_constraints(
         elimination=elimination,
         states=samples.states,
         scale=samples.scale,
-        constraint_margin=(find_margin(samples, elimination.constraint_matrix) if chains else None),
+        constraint_margin=find_margin(samples, matrix) if chains else None,
     )
     return found, samples
 
