@@ -114,6 +114,8 @@ class Scenario:
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
             for example.
         gains: The gains of the tracking law (28).
+        constraint_damping: What the law's model demands of constraints that give way, written as
+            gains are, for r_i - 1 poles per constraint; none where left out.
         references: The references, in the order of the outputs, the forces last.
         start: Where the robot starts.
         duration: How long the run lasts, in s.
@@ -132,6 +134,7 @@ class Scenario:
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     gains: Gains = field(default_factory=parts.Poles)
+    constraint_damping: Gains | None = None
     references: list[Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0

@@ -51,6 +51,7 @@ PAPER = (
     "structure",
     "normal_form",
     "gains",
+    "constraint_damping",
     "references",
     "measured_force",
     "tracking",

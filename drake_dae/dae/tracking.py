@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked, result_of
 from drake_dae.arrays import FloatArray, brief, numbers
+from drake_dae.dae.constraint_damping import damped
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.measured_force import MeasuredForce
@@ -39,6 +40,9 @@ class TrackingLaw:
             with state where mu_i = 0; see `ForceSensor`.
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
+        constraint_damping: What the law's own model demands of the constraints that its plant may
+            break, as a contact that gives way does: a design such as `poles(-200.0)`, with r_i - 1
+            poles of phi'; see `dae.constraint_damping`. On N* it changes nothing. None for none.
 
     Attributes:
         layout: How references and chains are stacked.
@@ -63,8 +67,12 @@ class TrackingLaw:
         structure: Structure | None = None,
         measured_force: bool = False,
         force_gain: ArrayLike = 0.0,
+        constraint_damping: GainDesign | FeedbackGains | None = None,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure)
+        self._model = self.structure
+        if constraint_damping is not None:
+            self._model = damped(self.structure, constraint_damping)
         self.system = system
         self.layout = Layout(self.structure.output_degrees)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
@@ -75,7 +83,7 @@ class TrackingLaw:
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""
-        structure, layout, measured = self.structure, self.layout, self.measured_force
+        structure, layout, measured = self._model, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols where K is not zero: the errors of most outputs are not coupled.
         gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
@@ -104,7 +112,7 @@ class TrackingLaw:
     def _trace_error_coordinates(self) -> TracedFunction:
         """The error coordinates as a function of state and reference: the initial value of (30)."""
         reference = ca.SX.sym("R", self.layout.reference_size)
-        chain = self.structure.chain - reference[self.layout.chained.tolist(), :]
+        chain = self._model.chain - reference[self.layout.chained.tolist(), :]
         inputs = {"reference": reference}
         return self.system.trace("error coordinates", {"coordinates": chain}, inputs, often=False)
 

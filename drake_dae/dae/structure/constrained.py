@@ -60,6 +60,20 @@ class ConstraintStructure:
         """max r_i + 1, the index of the DAE; 0 without constraints."""
         return max(self.constraint_degrees) + 1 if self.constraint_degrees else 0
 
+    def constraint_matrix(
+        self, state: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """A(x) at a state, shape (m, m): of a contact without friction its mobility in 1/kg.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+        """
+        matrix = self.elimination.constraint_matrix
+        function = self.system.trace("A(x)", {"value": matrix}, often=False)
+        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
+        return function(x, p)[0].reshape(matrix.shape)
+
     def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
         """An expression on N* as a function of state, control and parameters.
 
