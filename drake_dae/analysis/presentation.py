@@ -212,10 +212,15 @@ def _friction(findings: Findings, where: str, margin: ContactMargin) -> str:
     if not np.all(np.isfinite([*margin.critical_friction.values()])):
         return f"Friction: {where} no amount of it jams a contact."
     when = "" if margin.time is None else f"t = {margin.time:.4g} s, "
-    place = named_values(findings.system.state_signals, margin.state)
+    constrained, system = findings.constraint_structure, findings.system
+    used = None
+    if constrained is not None:
+        matrix = ca.vec(constrained.elimination.constraint_matrix)
+        used = ca.which_depends(matrix, system.state, 1, False)
+    place = named_values(system.state_signals, margin.state, used)
     return (
-        f"Friction: {where} at least {margin.reserve:.3g} of A(x) is left, and less than "
-        f"{critical} jams no contact; that is at {when}{place}."
+        f"Friction: {where} at least {margin.reserve:.3g} of A(x) is left, and a contact would jam "
+        f"at {critical}, nearest at {when}{place}."
     )
 
 

@@ -13,6 +13,9 @@ from drake_dae.dae.states.region import ConsistentRegion
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.system import DaeSystem
 
+MEANINGLESS = 1e6
+"""No coefficient of friction is so large: what slides but by round-off has such a critical one."""
+
 CLOSER = (0.9, 0.99)
 """The parts of the friction found critical so far for which a state that jams is sought."""
 
@@ -75,6 +78,8 @@ class ContactMargins:
             for values in (without, self._with_friction(parameters, unit))
         )
         factor = critical_factor(A_0, A_0 - A_1, self._rubbing.rows)
+        if factor * unit.max() > MEANINGLESS:
+            factor = np.inf
         critical = dict(zip(self._names, (factor * unit).tolist(), strict=True))
         return ContactMargin(float(reserve.item()), critical, state, time)
 
