@@ -81,7 +81,8 @@ def wire_scenario(
         sensor = force.sensor(model.dae.num_constraints)
     damping = scenario.constraint_damping
     keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
-    with at(" or ".join([*keys, *(["constraint_damping"] if damping else [])])):
+    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
+    with at(" or ".join(keys)):
         gains = scenario.gains.design()
         law = TrackingLaw(
             model.dae,
@@ -90,6 +91,7 @@ def wire_scenario(
             measured_force=force.is_measured,
             force_gain=force.gain,
             constraint_damping=None if damping is None else damping.design(),
+            integral=scenario.integral,
         )
     references = _references(scenario.references, law)
     exogenous = exogenous_references(scenario, law)

@@ -114,6 +114,8 @@ class Scenario:
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
             for example.
         gains: The gains of the tracking law (28).
+        integral: Names of outputs whose errors are integrated as well, which take a pole more:
+            positions, and forces where `force` is measured.
         constraint_damping: What the law's model demands of constraints that give way, written as
             gains are, for r_i - 1 poles per constraint; none where left out.
         references: The references, in the order of the outputs, the forces last.
@@ -134,6 +136,7 @@ class Scenario:
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     gains: Gains = field(default_factory=parts.Poles)
+    integral: list[str] = field(default_factory=list)
     constraint_damping: Gains | None = None
     references: list[Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)

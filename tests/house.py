@@ -54,6 +54,7 @@ PAPER = (
     "constraint_damping",
     "references",
     "measured_force",
+    "integral",
     "tracking",
     "linearization",
     "zero_dynamics",
