@@ -40,8 +40,9 @@ class RobotModel:
         M(q) v' + H(q, v) = J(q)^T lambda + B tau,    q' = N(q) v,
         0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
 
-    with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T; one
-    that restricts velocities alone has its rate in place of phi, and r = 1. With rigid joints
+    with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T;
+    viscous friction is a part of H; one that restricts velocities alone has its rate in place of
+    phi, and r = 1. With rigid joints
     tau = u; stages of actuation put their own dynamics between u and tau: E s' = drift(q, v, s) +
     drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the
     constraint input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many
@@ -111,7 +112,8 @@ class RobotModel:
         compiled: Compiled = "auto",
     ) -> None:
         self.links = links
-        self.constraints = (*constraints, *plant_constraints(links))
+        every = (*constraints, *plant_constraints(links))
+        self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
         self.positions = tuple(positions)
         self.name = name
         self.loads = tuple(loads)
@@ -311,6 +313,7 @@ class RobotModel:
         B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
         torque = ca.mtimes(B, driven.joint_force) + self._known_force() + self.loop_joints.force
+        torque += bound.drag(links)
         motors = self.loop_joints.motors
         rotors = self._moved_rotors(driven)
 
@@ -363,6 +366,7 @@ class RobotModel:
             implicit=implicit,
             control_metric=ca.diag(choice[0].symbol) if choice else None,
             free_control=choice[1].symbol if choice else None,
+            contacts=bound.contacts,
         )
 
     def _known_force(self) -> ca.SX:
