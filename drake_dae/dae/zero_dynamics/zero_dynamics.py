@@ -293,7 +293,9 @@ class ZeroDynamics:
             return lambda time: parameters
         structure, system = self.structure, self.system
         residual, v = structure.manifold.residual_expression, structure.elimination.alpha
-        matrices = (structure.control_matrix, structure.elimination.constraint_matrix)
+        matrices = [structure.control_matrix, structure.elimination.constraint_matrix]
+        if system.control_metric is not None:
+            matrices += [system.control_metric, system.free_control]
         degrees = system.exogenous.degrees(residual, structure.chain, structure.drift, v, *matrices)
         given = sum(reference.size for reference in exogenous)
         if given != len(degrees):
