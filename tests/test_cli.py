@@ -417,6 +417,7 @@ def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, 
 # The rest of the command line.
 
 
+@pytest.mark.slow
 def test_cache(tmp_path, monkeypatch, capsys):
     """A run with a flag that fills it; no other flag does."""
     monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "code"))

@@ -15,6 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.export.samples import Call, samples, tests
@@ -116,13 +117,7 @@ def _vectors(
 ) -> dict[str, _Vector]:
     """All vectors of the C code, by their names there."""
     system = structure.system
-    moving = system.exogenous.moving
-    parameters = [signal for p in system.parameters for signal in p.signals] + [
-        signal.derivative(order)
-        for p in moving
-        for order in range(1, len(p.derivatives) + 1)
-        for signal in p.signals
-    ]
+    moves = "; what moves comes here, too, with its derivatives" if system.exogenous else ""
     gains = [
         Signal(f"K of {system.output_signals[i].name} for {chain.name}")
         for j, chain in enumerate(law.layout.chain_signals(system.output_signals))
@@ -137,14 +132,27 @@ def _vectors(
         "constraint_force": _Vector("v, the constraint inputs", system.constraint_input_signals),
         "constraint_residual": _Vector("zero on N*", structure.manifold.residual_signals),
         "controlled_output": _Vector("z, the controlled outputs", system.output_signals),
-        "parameters": _Vector("of the plant", parameters, plant_parameters),
+        "parameters": _Vector(f"of the plant{moves}", _parameters(system), plant_parameters),
         "law_parameters": _Vector(
-            "of the law's model, and then the gains", [*parameters, *gains], law_parameters
+            "of the law's model, and then the gains",
+            [*_parameters(law.system), *gains],
+            law_parameters,
         ),
     }
     if not law.measured_force:
         del vectors["measured_force"]
     return vectors
+
+
+def _parameters(system: DaeSystem) -> list[Signal]:
+    """Names and units of all parameters, and of the derivatives of those that move."""
+    rates = [
+        signal.derivative(order)
+        for p in system.exogenous.moving
+        for order in range(1, len(p.derivatives) + 1)
+        for signal in p.signals
+    ]
+    return [signal for p in system.parameters for signal in p.signals] + rates
 
 
 def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:

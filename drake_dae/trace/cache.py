@@ -131,6 +131,7 @@ def workplace() -> Iterator[Path]:
 def store(key: str, file: Path) -> Path:
     """Moves a file from the `workplace` to where `find` finds it by a key."""
     path = file.parents[1] / _name(key, file.read_bytes())
+    file.chmod(0o700)
     os.replace(file, path)
     return path
 

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+import weakref
 
 import casadi as ca
 import numpy as np
@@ -128,6 +129,21 @@ def test_what_is_compiled_has_derivatives(cache):
     code(X, P)
     one, two = (f.derivative(0, (0, 1))(X, P)[0] for f in (code, interpreted))
     np.testing.assert_array_equal(one, two)
+
+
+@needs_compiler
+@pytest.mark.parametrize("compiled", [True, "auto", False])
+def test_a_function_is_freed_with_its_last_name(compiled, cache):
+    """It is in no circle, so that it does not wait for Python's search of those."""
+    function = made(compiled)
+    function(X, P)
+    left = weakref.ref(function)
+    gc.disable()
+    try:
+        del function
+        assert left() is None
+    finally:
+        gc.enable()
 
 
 # When.
@@ -312,6 +328,7 @@ def test_what_is_kept(cache, monkeypatch):
     made(True)(X, P)
     assert cache.stat().st_mode & 0o777 == 0o700
     (first,) = contents()
+    assert first.stat().st_mode & 0o777 == 0o700
     written = first.stat().st_mtime_ns
     made(True)(X, P)
     assert [path.stat().st_mtime_ns for path in contents()] == [written]
