@@ -101,3 +101,8 @@ class NonFiniteError(SimulationError):
 
 class NonMinimumPhaseWarning(UserWarning):
     """A law for a system with unstable zero dynamics: outputs follow, but states run off."""
+
+
+def describe_os_error(error: OSError) -> str:
+    """What a message says of a file that could not be read or written."""
+    return f"{error.filename or 'output'}: {error.strerror or error}"

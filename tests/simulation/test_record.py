@@ -11,7 +11,7 @@ from runs import run_scenario, scenario
 
 from drake_dae import Record, build_scenario, load_scenario, simulate
 from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.simulation.record import Recorded
 
