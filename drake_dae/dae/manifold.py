@@ -1,6 +1,7 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from math import isfinite
 
 import casadi as ca
@@ -11,7 +12,9 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
+    PRECISION,
     ROUNDING,
     Linearization,
     are_dependent,
@@ -24,6 +27,10 @@ from drake_dae.trace.round_off import positive
 CONSISTENT = 1e-8
 """A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
 size; or, where gradients depend on each other, if its residual is at most this."""
+
+STEPS = 6
+"""So many Newton steps are one function: one or two to N* from where a step of a simulation ends,
+the others polish; one projection in a thousand takes more."""
 
 FLOOR = 1e-12
 """A distance from N* that is round-off of states that are zero."""
@@ -39,6 +46,7 @@ class Manifold:
     Attributes:
         residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
         residual_signals: Its names and units.
+        residual_function: The same as a function of state and parameters.
     """
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
@@ -49,15 +57,34 @@ class Manifold:
         self.residual_signals = layout.chain_signals(system.constraint_output_signals)
         gradient = ca.jacobian(residual, system.state)
         self._levels = _levels(layout, gradient)
-        self._residual = system.trace("manifold", {"residual": residual})
+        self.residual_function = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
-        # The Newton step of least norm from a state, by the gradients at another one: from
-        # C' = Q R, dx = -Q R^-T r.
-        other, step = ca.SX.sym("other", system.num_states), ca.SX(system.num_states, 1)
-        if residual.numel():
-            q, r = ca.qr(ca.substitute(gradient, system.state, other).T)
-            step = -ca.mtimes(q, ca.solve(r.T, residual))
-        self._newton = system.trace("step to the manifold", {"step": step}, {"other": other})
+        self._projection = self._trace_projection(gradient)
+
+    def _trace_projection(self, gradient: ca.SX) -> TracedFunction:
+        """The first Newton steps from a state, all by the gradients there, as one function.
+
+        Before them stand the sizes of the first two, relative to the state as in `newton`.
+        """
+        state, p = self.system.state, self.system.parameter_symbol
+        residual = ca.Function("residual", [state, p], [self.residual_expression])
+        step_for, steps = _shortest_step(gradient), {}
+        for number in range(STEPS):
+            steps[f"step {number}"] = step = step_for(residual(state, p))
+            state += step
+        unit = ca.fmax(1.0, ca.fabs(self.system.state))
+        sizes = [ca.norm_2(steps[f"step {number}"] / unit) for number in (0, 1)]
+        outputs = {"sizes": ca.vertcat(*sizes), **steps}
+        return self.system.trace("projection onto the manifold", outputs)
+
+    @cached_property
+    def _newton(self) -> TracedFunction:
+        """The Newton step from a state, by the gradients at another one."""
+        other, state = ca.SX.sym("other", self.system.num_states), self.system.state
+        gradient = ca.substitute(ca.jacobian(self.residual_expression, state), state, other)
+        step = _shortest_step(gradient)(self.residual_expression)
+        inputs = {"other": other}
+        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
     @property
     def dimension(self) -> int:
@@ -71,7 +98,7 @@ class Manifold:
             state: x, shape (n,).
             parameters: Values of all parameters; the defaults if None.
         """
-        return self._residual(state, self.system.parameter_vector(parameters))[0]
+        return self.residual_function(state, self.system.parameter_vector(parameters))[0]
 
     def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """C = d(residual)/dx, shape (sum r_i, n); the arguments are those of `residual`."""
@@ -84,7 +111,7 @@ class Manifold:
         The arguments are those of `residual`.
         """
         x, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = norm(self._newton.evaluate(x, x, p)[0])
+        reach = norm(self._projection.evaluate(x, p)[1])
         if isfinite(reach) and reach > 0.0:
             return reach <= CONSISTENT * norm(x) + FLOOR
         # Gradients that depend on each other; or nothing is left, or what no state changes.
@@ -104,21 +131,41 @@ class Manifold:
             InconsistentStateError: Newton's method does not reach N* from there.
             ModelError: The state has a wrong shape.
         """
-        start, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = norm(self._newton.evaluate(start, start, p)[0])
-        if 0.0 < reach <= ROUNDING or (reach == 0.0 and self._residual_size(start, p) == 0.0):
-            return start  # As in most steps of a simulation.
+        return self.projected(self._state(state), self.system.parameter_vector(parameters))
+
+    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """`project` without checks of its arguments, for a simulation.
+
+        Args:
+            start: The state, shape (n,).
+            p: Values of all parameters, shape (k,).
+
+        Returns:
+            The consistent state, which is `start` itself if that is one.
+        """
+        sizes, *steps = self._projection.evaluate(start, p)
+        if self._projection.is_finite:
+            reach = norm(steps[0])
+            if 0.0 < reach <= ROUNDING or (reach == 0.0 and self._residual_size(start, p) == 0.0):
+                return start  # As in most steps of a simulation.
+            nearby = _followed(start, steps, *sizes.tolist())
+            if nearby is not None and nearby is not start:
+                return nearby
+        return self._searched(start, p)
+
+    def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """The consistent state next to one, where the first few steps do not lead to it."""
         found, converged = newton(start, lambda x: self._linearize(x, p))
         if not converged:
             # Gradients that depend on each other, or steps that mislead: least squares, downhill.
             found, converged = newton(start, lambda x: self._downhill(x, p))
         if converged and found is not start:
             return found
-        residual = self._residual.evaluate(found, p)[0].copy()
+        residual = self.residual_function.evaluate(found, p)[0].copy()
         # Else it is round-off, in units in which that is much, or no state changes what is left.
         if np.linalg.norm(residual) <= CONSISTENT:
             return found
-        if converged and self._newton.evaluate(found, found, p)[0].any():
+        if converged and self._projection.evaluate(found, p)[1].any():
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
 
@@ -150,7 +197,7 @@ class Manifold:
         def linearize(values: FloatArray) -> Linearization | None:
             gradients = self.gradients(filled(values), parameters)[np.ix_(rows, columns)]
             return shortest_steps(
-                gradients, lambda x: self._residual(filled(x), parameters)[0][rows]
+                gradients, lambda x: self.residual_function(filled(x), parameters)[0][rows]
             )
 
         state[columns], converged = newton(state[columns], linearize)
@@ -166,7 +213,7 @@ class Manifold:
         return x
 
     def _residual_size(self, state: FloatArray, parameters: FloatArray) -> float:
-        return norm(self._residual.evaluate(state, parameters)[0])
+        return norm(self.residual_function.evaluate(state, parameters)[0])
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
         """Newton steps of least norm by the gradients at a state."""
@@ -180,7 +227,7 @@ class Manifold:
         length = positive(np.linalg.norm(gradients, axis=1))
 
         def residual(x: FloatArray) -> FloatArray:
-            return self._residual(x, parameters)[0]
+            return self.residual_function(x, parameters)[0]
 
         def measure(x: FloatArray) -> float:
             return float(np.linalg.norm(residual(x) / length))
@@ -210,6 +257,43 @@ class Manifold:
                 "contradict each other, or start away from this state"
             )
         return left + "Start nearer to the constraint, away from its singular states"
+
+
+def _shortest_step(gradient: ca.SX) -> Callable[[ca.SX], ca.SX]:
+    """residual -> the shortest dx with C dx = -residual: from C' = Q R, dx = -Q R^-T residual."""
+    if not gradient.shape[0]:
+        return lambda residual: ca.SX(gradient.shape[1], 1)
+    q, r = ca.qr(gradient.T)
+    return lambda residual: -ca.mtimes(q, ca.solve(r.T, residual))
+
+
+def _followed(
+    start: FloatArray, steps: Sequence[FloatArray], size: float, left: float
+) -> FloatArray | None:
+    """What `newton` finds from a start by these first steps; None where it takes others.
+
+    Args:
+        start: The state, shape (n,).
+        steps: The Newton steps that follow each other from there.
+        size, left: The sizes of the first two, relative to the state.
+    """
+    if size <= ROUNDING:
+        state, number = start, 0
+    elif left * left <= PRECISION * size:
+        state, number = start + steps[0], 1
+    else:
+        return None
+    length = norm(steps[number])
+    while length > 0.0:
+        state = state + steps[number]
+        number += 1
+        if number == len(steps):
+            return None
+        following = norm(steps[number])
+        if not following < 0.5 * length:
+            break
+        length = following
+    return state
 
 
 def _levels(layout: Layout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
