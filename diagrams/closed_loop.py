@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
-from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerType
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
@@ -15,17 +14,21 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.diagrams.wiring import (
+    add_block,
+    add_exogenous,
+    add_force_feedback,
+    check_sizes,
+)
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import add_live_view
-from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sensors import ForceSensor
-
-Block = TypeVar("Block", DaePlant, ForceSensor)
 
 
 @checked(WiringError)
@@ -38,11 +41,14 @@ class ClosedLoop:
             `constraint_residual`, `controlled_output`, `control`, `reference` and
             `tracking_error`; `link_state` for a robot, and `loop_state` if joints close its loops.
         plant, controller, reference: The systems in it.
-        loggers: Port name -> (sink, names and units), one sample per step.
+        loggers: Port name -> (sink, names and units), one sample per step: of what has memory of
+            its own. `record` computes everything else from that, when it is asked for.
+        signals: Names and units of each signal of a record.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
+        plant_exogenous: That for the plant, or None.
     """
 
     diagram: Diagram
@@ -50,13 +56,15 @@ class ClosedLoop:
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
+    signals: Mapping[str, Sequence[Signal]]
     scene_graph: SceneGraph | None
     sensor: ForceSensor | None
     noise: RandomSource | None
     exogenous: ReferenceGenerator | None = None
+    plant_exogenous: ReferenceGenerator | None = None
 
     def __repr__(self) -> str:
-        return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.loggers)})"
+        return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.signals)})"
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Chooses the noise of the sensor; without a call it is the same in every run.
@@ -70,20 +78,74 @@ class ClosedLoop:
             self.noise.SetRandomContext(own, RandomGenerator(seed))
 
     def record(self, context: Context, after: float | None = None) -> Record:
-        """What was logged up to now, with `desired_output` r and `tracking_error` z - r (29).
+        """What was logged up to now, and what follows from it.
+
+        With `desired_output` r and `tracking_error` z - r (29). Parameters and gains are those that
+        the blocks had at each moment.
 
         Args:
             context: The diagram's context.
             after: Only what was logged later than this time, in s; None for all.
+
+        Raises:
+            WiringError: An input port of the controller has a fixed value in this context, of which
+                nobody knows since when.
         """
-        record = Record.from_logs(self.loggers, context, after)
-        desired = record["reference"][:, self.controller.law.layout.lowest]
-        outputs = record.signals["controlled_output"]
-        derived = {
-            "desired_output": Recorded(desired, outputs.signals),
-            "tracking_error": Recorded(outputs.values - desired, outputs.signals),
-        }
-        return Record(record.time, {**record.signals, **derived})
+        self._refuse_fixed_ports(context)
+        logged = Record.from_logs(self.loggers, context, after)
+        times, values = logged.time, {name: logged[name] for name in logged.signals}
+        known = {**values, "parameters": self._parameters_along(self.plant, context, times)}
+        functions = dict(self.plant.functions)
+        measured = self.controller.law.measured_force
+        if measured and "measured_force" not in known:
+            # Without a sensor that has memory; a law that does but integrate it reads none here.
+            known["measured_force"] = (
+                function_along(functions["constraint_force"], known)
+                if self.controller.law.control_takes_force
+                else np.zeros((times.size, self.plant.dae.num_constraints))
+            )
+        if self.plant_exogenous is not None:
+            values["exogenous"] = self.plant_exogenous.along(times)
+        values["reference"] = self.reference.along(times)
+        gains = self._parameters_along(self.controller, context, times)
+        given = {**known, "reference": values["reference"], "parameters": gains}
+        values["control"] = known["control"] = function_along(self.controller.law.function, given)
+        values |= {name: function_along(own, known) for name, own in functions.items()}
+
+        desired = values["reference"][:, self.controller.law.layout.lowest]
+        values["desired_output"] = desired
+        values["tracking_error"] = values["controlled_output"] - desired
+        outputs = self.signals["controlled_output"]
+        signals = {**self.signals, "desired_output": outputs, "tracking_error": outputs}
+        recorded = {name: Recorded(values[name], tuple(signals[name])) for name in signals}
+        return Record(times, recorded).while_finite()
+
+    def _refuse_fixed_ports(self, context: Context) -> None:
+        taker, own = self.controller, self.controller.GetMyContextFromRoot(context)
+        for giver, source, name in (
+            (self.plant, "state", "estimated_state"),
+            (self.reference, "reference", "reference"),
+        ):
+            try:
+                given = giver.GetOutputPort(source).Eval(giver.GetMyContextFromRoot(context))
+            except DrakeDaeError:
+                continue  # Where a run failed.
+            if not np.array_equal(given, taker.GetInputPort(name).Eval(own), equal_nan=True):
+                raise WiringError(
+                    f"the port '{name}' of {taker.get_name()} has a fixed value in this context, "
+                    "so that its control does not follow from the state; wire plant and controller "
+                    "in a diagram of your own, with a LogVectorOutput"
+                )
+
+    def _parameters_along(
+        self, block: DaePlant | TrackingController, context: Context, times: FloatArray
+    ) -> FloatArray:
+        """The parameters of a block at each time, those that move as they did."""
+        values = block.parameters_along(block.GetMyContextFromRoot(context), times)
+        moving = self.plant_exogenous if block is self.plant else self.exogenous
+        if moving is not None:
+            values[:, block.exogenous_places] = moving.along(times)
+        return values
 
     def predicted_error(self, record: Record) -> FloatArray:
         """The error (30), (31) that theory predicts for a record's start, shape (k, p)."""
@@ -136,11 +198,11 @@ def make_closed_loop(
         WiringError: The law or the sensor has other sizes than the plant; measured force would
             close an algebraic loop, or a sampled loop that diverges; or no law uses the sensor.
     """
-    _check_sizes(system, law, sensor)
+    check_sizes(system, law, sensor)
     builder = DiagramBuilder()
 
     # The plant, its reference and its controller.
-    plant = _add(builder, system)
+    plant = add_block(builder, system)
     reference = builder.AddSystem(ReferenceGenerator(references, law.degrees))
     try:
         outputs = law.layout.values(reference.reference(start_time))
@@ -151,40 +213,42 @@ def make_closed_loop(
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
 
-    moving = [_add_exogenous(builder, block, exogenous) for block in (plant, controller)]
+    moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
 
     noise = None
     if law.measured_force:
-        noise = _add_force_feedback(builder, plant, controller, sensor)
+        noise = add_force_feedback(builder, plant, controller, sensor)
     elif sensor is not None:
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
-    # Every signal under its own name: exported, and logged once per step.
+    # Every signal under its own name: exported, and logged once per step if nothing else tells it.
     dae = plant.dae
-    loggers = {}
-    named = {
+    named: dict[str, tuple[OutputPort, Sequence[Signal]]] = {}
+    if moving[0] is not None:
+        signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
+        named["exogenous"] = (moving[0].get_output_port(), signals)
+    for name, (owner, signals) in {
         "state": (plant, dae.state_signals),
         "constraint_force": (plant, dae.force_signals),
         "constraint_residual": (plant, plant.structure.manifold.residual_signals),
         "controlled_output": (plant, dae.output_signals),
         "control": (controller, dae.control_signals),
         "reference": (reference, law.reference_signals),
-    }
+    }.items():
+        named[name] = (owner.GetOutputPort(name), signals)
     if law.integral.outputs:
-        named["integral"] = (controller, law.integral.signals)
+        named["integral"] = (controller.GetOutputPort("integral"), law.integral.signals)
     if law.measured_force and sensor is not None:
-        named["measured_force"] = (sensor, dae.constraint_input_signals)
+        port = sensor.GetOutputPort("measured_force")
+        named["measured_force"] = (port, dae.constraint_input_signals)
     if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
-        named["loop_state"] = (plant, plant.model.loop_joints.signals)
-    if moving[0] is not None:
-        signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
-        builder.ExportOutput(moving[0].get_output_port(), "exogenous")
-        sink = LogVectorOutput(moving[0].get_output_port(), builder, {TriggerType.kPerStep})
-        loggers["exogenous"] = (sink, signals)
-    for name, (owner, signals) in named.items():
-        port = owner.GetOutputPort(name)
+        named["loop_state"] = (plant.GetOutputPort("loop_state"), plant.model.loop_joints.signals)
+    told = {*plant.functions, "control", "reference", "exogenous"}
+    loggers = {}
+    for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
-        loggers[name] = (LogVectorOutput(port, builder, {TriggerType.kPerStep}), signals)
+        if name not in told:
+            loggers[name] = (LogVectorOutput(port, builder, {TriggerType.kPerStep}), signals)
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
@@ -197,106 +261,15 @@ def make_closed_loop(
     diagram = builder.Build()
     diagram.set_name("closed_loop")
     return ClosedLoop(
-        diagram, plant, controller, reference, loggers, scene_graph, sensor, noise, moving[1]
+        diagram,
+        plant,
+        controller,
+        reference,
+        loggers,
+        {name: tuple(signals) for name, (_, signals) in named.items()},
+        scene_graph,
+        sensor,
+        noise,
+        moving[1],
+        moving[0],
     )
-
-
-def _add(builder: DiagramBuilder, block: Block) -> Block:
-    """Adds what the caller made."""
-    try:
-        return builder.AddSystem(block)
-    except RuntimeError:
-        raise WiringError(
-            f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
-        ) from None
-
-
-def _add_exogenous(
-    builder: DiagramBuilder, block: ParameterizedSystem, exogenous: Sequence[Reference]
-) -> ReferenceGenerator | None:
-    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
-
-    Raises:
-        WiringError: The references are not as many as the signals.
-    """
-    names = [signal.name for signal in block.dae.exogenous.signals]
-    size = sum(reference.size for reference in exogenous)
-    if exogenous and size != len(names):
-        raise WiringError(
-            f"the references of exogenous signals cover {size}, '{block.dae.name}' has "
-            f"{len(names)}: {', '.join(names) or 'none'}"
-        )
-    if not exogenous:
-        return None
-    generator = builder.AddSystem(ReferenceGenerator(exogenous, block.exogenous_layout.degrees))
-    generator.set_name(f"{block.get_name()}_exogenous")
-    builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
-    return generator
-
-
-def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
-    """Refuses wrong sizes: Drake would name the ports, but not what is wrong with them."""
-    own, other = plant.dae, law.system
-    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
-    if sizes[0] != sizes[1]:
-        has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
-        raise WiringError(
-            f"the law is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. Make "
-            "the law for the plant's system, TrackingLaw(plant.dae, ...), or for a model of the "
-            "same structure"
-        )
-    if sensor is not None:
-        size = sensor.GetInputPort("force").size()
-        if size != own.num_constraints:
-            names = ", ".join(signal.name for signal in own.constraint_input_signals) or "none"
-            raise WiringError(
-                f"the sensor measures {size} forces, the plant '{own.name}' has "
-                f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
-                "...)"
-            )
-
-
-def _add_force_feedback(
-    builder: DiagramBuilder,
-    plant: DaePlant,
-    controller: TrackingController,
-    sensor: ForceSensor | None,
-) -> RandomSource | None:
-    """Connects the constraint force to the controller, through the sensor if there is one.
-
-    Returns:
-        The source of the sensor's noise, if it has one.
-    """
-    force, noise = plant.GetOutputPort("constraint_force"), None
-    if sensor is None:
-        control = plant.GetInputPort("control").get_index()
-        reads = controller.GetInputPort("measured_force").get_index()
-        acts = controller.GetOutputPort("control").get_index()
-        takes = controller.HasDirectFeedthrough(reads, acts)
-        if takes and plant.HasDirectFeedthrough(control, force.get_index()):
-            raise WiringError(
-                "the constraint force depends on the control in the same instant, so a law that "
-                "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
-                "time_constant or a sample_period"
-            )
-    else:
-        measured = controller.law.measured_force
-        gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
-        if gain >= sensor.largest_stable_gain():
-            raise WiringError(
-                f"the sampled force loop diverges: ||Gbar|| = {gain:.3g}, but each sample "
-                "multiplies the force error by -Gbar; it must stay below "
-                f"{sensor.largest_stable_gain():.3g}. Lower force_gain, or give the sensor a "
-                "time_constant well above its sample_period"
-            )
-        _add(builder, sensor)
-        builder.Connect(force, sensor.GetInputPort("force"))
-        force = sensor.GetOutputPort("measured_force")
-        if sensor.HasInputPort("noise"):
-            size = sensor.GetInputPort("noise").size()
-            period = sensor.sample_period or sensor.time_constant
-            source = RandomSource(RandomDistribution.kGaussian, size, period)
-            noise = builder.AddSystem(source)
-            builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    builder.Connect(force, controller.GetInputPort("measured_force"))
-    return noise

@@ -15,7 +15,6 @@ from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import unknown_name
 from drake_dae.dae import references
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
@@ -25,9 +24,6 @@ from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
 from drake_dae.trace.compiled import Compiled
-
-FOLDER = Path(__file__).resolve().parent
-DEFAULT_SCENARIO = "seven_joint_wall"
 
 T = TypeVar("T")
 
@@ -173,29 +169,6 @@ def _reader() -> Reader[Scenario]:
 def scenario_schema() -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
     return _reader().schema
-
-
-def shipped_scenarios() -> dict[str, Path]:
-    """Name -> file of the scenarios that come with drake_dae."""
-    return {path.stem: path for path in sorted((FOLDER / "scenarios").glob("*.yaml"))}
-
-
-def find_scenario(name: str) -> Path:
-    """The file of a shipped scenario, or a path as it is.
-
-    Raises:
-        ScenarioError: There is neither such a scenario nor such a file.
-    """
-    shipped = shipped_scenarios()
-    if name in shipped:
-        return shipped[name]
-    path = Path(name)
-    try:
-        if path.is_file():
-            return path
-    except (OSError, ValueError):
-        pass  # Such as a null byte.
-    raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
 
 
 @checked(lambda text: ScenarioError(("", text)))

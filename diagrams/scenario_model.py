@@ -17,8 +17,9 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.resources import check_resources, package_folder
-from drake_dae.diagrams.scenario import FOLDER, Scenario
+from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
+from drake_dae.diagrams.shipped import FOLDER
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
 from drake_dae.robots.actuation.chain import chain

@@ -6,50 +6,20 @@ import logging
 import os
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from datetime import datetime
+from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TextIO
-
-from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.diagrams.build import build_scenario
-from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.export.export import export_code
-from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario import (
-    DEFAULT_SCENARIO,
-    Scenario,
-    find_scenario,
-    load_scenario,
-    save_scenario,
-    shipped_scenarios,
-)
+from drake_dae.diagrams.shipped import DEFAULT_SCENARIO, description, shipped_scenarios
 from drake_dae.errors import (
     DrakeDaeError,
-    MachineCodeError,
-    ModelError,
     NonMinimumPhaseWarning,
     ScenarioError,
+    describe_os_error,
 )
-from drake_dae.simulation.animation import make_animation
-from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
-from drake_dae.simulation.plots import PLOTS, save_plots
-from drake_dae.simulation.record import Record
-from drake_dae.simulation.record_writer import RecordWriter
-from drake_dae.simulation.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
-from drake_dae.simulation.simulate import RunStatistics, simulate
-from drake_dae.simulation.summary import Limits, summary
-from drake_dae.simulation.view import start_meshcat
-from drake_dae.systems.robot_plant import RobotPlant
-from drake_dae.trace.cache import cache_folder, clear, contents
-from drake_dae.trace.compiled import find_compiler
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -121,18 +91,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, TextIOWrapper):
         # Names may have letters that the terminal does not.
         sys.stdout.reconfigure(errors="backslashreplace")
-    # Drake tells where each Meshcat listens, also the one that only records.
-    logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         if options.command == "list":
             return _list()
+        # What a command needs is loaded with it: Drake alone takes a second.
+        ignored: list[type[Warning]] = []
         if options.command == "cache":
-            return _cache(options)
-        if options.command == "analyze":
-            with _warnings(NonMinimumPhaseWarning):  # The report tells it.
-                return _analyze(options)
-        with _warnings():
-            return _export(options) if options.command == "export" else _simulate(options)
+            from drake_dae.commands.cache import run_command
+        elif options.command == "analyze":
+            from drake_dae.commands.analyze import run_command
+
+            ignored.append(NonMinimumPhaseWarning)  # The report tells it.
+        elif options.command == "export":
+            from drake_dae.commands.export import run_command
+        else:
+            from drake_dae.commands.simulate import run_command
+        if options.command != "cache" and options.compiled is not None:
+            options.settings.append(f"compiled={options.compiled}")
+        # Drake tells where each Meshcat listens, also the one that only records.
+        logging.getLogger("drake").setLevel(logging.WARNING)
+        with _warnings(*ignored):
+            return run_command(options)
     except DrakeDaeError as error:
         # A scenario has a line for each problem; other texts, as of Drake, are made one.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
@@ -145,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        print(f"error: {_of(error)}", file=sys.stderr)
+        print(f"error: {describe_os_error(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
@@ -156,30 +135,8 @@ def _list() -> int:
     paths = shipped_scenarios()
     width = max(map(len, paths), default=0)
     for name, path in paths.items():
-        print(f"{name.ljust(width)}  {load_scenario(path).description}")
+        print(f"{name.ljust(width)}  {description(path)}")
     return 0
-
-
-def _cache(options: argparse.Namespace) -> int:
-    files = contents()
-    size = sum(path.stat().st_size for path in files if path.is_file())
-    what = f"{len(files)} files, {size / 1e6:.1f} MB"
-    if options.clear:
-        clear()
-        print(f"removed from {cache_folder()}: {what}")
-        return 0
-    print(f"cache     {cache_folder()}: {what}")
-    try:
-        print(f"compiler  {' '.join(find_compiler().command)}")
-    except MachineCodeError as error:
-        print(f"compiler  none: {error}")
-    return 0
-
-
-def _settings(options: argparse.Namespace) -> list[str]:
-    """The changes of the scenario, those by options of their own the last."""
-    own = [] if options.compiled is None else [f"compiled={options.compiled}"]
-    return [*options.settings, *own]
 
 
 @contextmanager
@@ -190,165 +147,3 @@ def _warnings(*ignored: type[Warning]) -> Iterator[None]:
             warnings.simplefilter("ignore", category)
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         yield
-
-
-def _analyze(options: argparse.Namespace) -> int:
-    path = find_scenario(options.scenario)
-    found = find_feasibility(load_scenario(path, _settings(options)))
-    if options.json:
-        print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
-    else:
-        print(f"{path.stem}\n\n{found}")
-    return 2 if found.problems else 0
-
-
-def _export(options: argparse.Namespace) -> int:
-    path = find_scenario(options.scenario)
-    loop, context = build_scenario(load_scenario(path, _settings(options)))
-    folder = options.out or Path(f"{path.stem}_c99")
-    files = export_code(loop, context, path.stem, folder)
-    print(f"written to {folder}/: {', '.join(file.name for file in files)}")
-    return 0
-
-
-def _simulate(options: argparse.Namespace) -> int:
-    path = find_scenario(options.scenario)
-    scenario = load_scenario(path, _settings(options))
-    if options.meshcat:
-        scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
-    meshcat = start_meshcat() if options.meshcat else None
-    began = time.perf_counter()
-    loop, context = build_scenario(scenario, meshcat)
-    print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
-    folder = options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
-    with ending_signals(end_at_once), run_folder(folder):
-        save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
-        if meshcat is not None:
-            print(f"watch at {meshcat.web_url()}", flush=True)
-        return _run(loop, context, scenario, folder)
-
-
-def _unused(name: str) -> Path:
-    """A folder below runs/ that was not there before."""
-    runs, number = Path("runs"), 1
-    runs.mkdir(exist_ok=True)
-    while True:
-        folder = runs / (name if number == 1 else f"{name}-{number}")
-        try:
-            folder.mkdir()
-            return folder
-        except FileExistsError:
-            number += 1
-
-
-@dataclass
-class _Run:
-    """A run: what it is of, where it is written, and how it ended."""
-
-    loop: ClosedLoop
-    context: Context
-    scenario: Scenario
-    folder: Path
-    writer: RecordWriter
-    statistics: RunStatistics | None = None
-    failure: str = ""
-    pictures: bool = True
-
-
-def _run(loop: ClosedLoop, context: Context, scenario: Scenario, folder: Path) -> int:
-    """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
-    with RecordWriter(folder / PART, loop.record) as writer:
-        run = _Run(loop, context, scenario, folder, writer)
-        try:
-            run.statistics = simulate(
-                loop.diagram,
-                context,
-                scenario.duration,
-                scenario.integrator,
-                progress=True,
-                after_step=writer.update if scenario.write.record else None,
-            )
-        except DrakeDaeError as error:
-            run.failure = str(error)
-            raise
-        except KeyboardInterrupt:
-            run.failure, run.pictures = "interrupted in the middle of a step", False
-            raise
-        finally:
-            complete = _write(run)
-    if run.statistics.interrupted:
-        return 128 + run.statistics.interrupted
-    return 0 if complete else 1
-
-
-def _write(run: _Run) -> bool:
-    """Writes the files, prints the summary, and says whether all files are complete."""
-    loop, folder, write = run.loop, run.folder, run.scenario.write
-    problems: list[str] = []
-    # A signal that comes now does not stop before the record is written, but before the pictures.
-    with ending_signals(ending := Ending()):
-        record = loop.record(run.context)
-        if record.time.size == 0:
-            return True
-        predicted = loop.predicted_error(record)
-        limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
-        text = summary(record, predicted, limits, run.statistics, run.failure)
-        if write.record:
-            with _collected(problems):
-                _write_record(record, run)
-        with _collected(problems), stage(folder, "summary.txt") as place:
-            (place / "summary.txt").write_text(text + "\n", encoding="utf-8")
-    try:
-        if ending.signal is not None:
-            end_at_once(ending.signal)
-        if write.plots and run.pictures:
-            with _collected(problems), stage(folder, *PLOTS) as place:
-                save_plots(record, predicted, limits.control, place)
-        if write.animation and run.pictures:
-            with _collected(problems), stage(folder, "animation.html") as place:
-                page = make_animation(loop, record, run.context)
-                (place / "animation.html").write_text(page, encoding="utf-8")
-    finally:
-        files = [name for name in (*FILES, PART) if (folder / name).exists()]
-        with _collected(problems):
-            _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
-        with suppress(OSError):
-            _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
-    return not problems
-
-
-def _write_record(record: Record, run: _Run) -> None:
-    writer = run.writer
-    try:
-        with stage(run.folder, "record.npz") as place:
-            record.save(place / "record.npz")
-    except OSError as error:
-        with suppress(OSError):
-            writer.finish(run.context)  # Rows that fit are kept.
-        with suppress(OSError, ModelError, IndexError):
-            kept = Record.load(writer.path).time[-1]
-            error.strerror = f"{error.strerror or error}; {PART} has the record up to {kept:.6g} s"
-        raise
-    writer.path.unlink(missing_ok=True)
-
-
-def _print(text: str, file: TextIO) -> None:
-    """Prints now; what is closed, as a terminal after SIGHUP, gets no second try on exit."""
-    try:
-        print(text, end="\n" if text and text[-1] != "\n" else "", file=file, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
-        raise
-
-
-@contextmanager
-def _collected(problems: list[str]) -> Iterator[None]:
-    """Keeps what is wrong with a file for later: the other files are written, and the summary."""
-    try:
-        yield
-    except OSError as error:
-        problems.append(_of(error))
-
-
-def _of(error: OSError) -> str:
-    return f"{error.filename or 'output'}: {error.strerror or error}"

@@ -128,3 +128,8 @@ class NonMinimumPhaseWarning(UserWarning):
 
 class MachineCodeWarning(UserWarning):
     """Functions that run interpreted where machine code was asked for, or would have paid."""
+
+
+def describe_os_error(error: OSError) -> str:
+    """What a message says of a file that could not be read or written."""
+    return f"{error.filename or 'output'}: {error.strerror or error}"

@@ -37,7 +37,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.diagrams.shipped import FOLDER
 
 LOW, HIGH = 0.0, 0.6
 """Heights of the tip, m."""

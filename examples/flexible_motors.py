@@ -21,7 +21,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.diagrams.shipped import FOLDER
 
 SPRINGS = dd.FlexibleJoints(stiffness=[2e4, 2e4, 1e4, 1e4, 5e3, 2e3, 2e3])
 MOTORS = dd.DcMotors(torque_constant=0.1, inductance=2e-3, resistance=0.5)

@@ -20,7 +20,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.diagrams.shipped import FOLDER
 
 SERVOS = dd.ElectrohydraulicServos(
     stiffness=1e6, leakage=1e-6, geometry=lambda q: ca.diag(0.05 + 0.02 * ca.sin(q))

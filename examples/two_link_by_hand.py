@@ -30,7 +30,7 @@ from drake_dae import (
     TrackingLaw,
     poles,
 )
-from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.diagrams.shipped import FOLDER
 
 
 def main(folder: Path) -> tuple[float, float]:

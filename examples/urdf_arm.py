@@ -17,7 +17,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.diagrams.shipped import FOLDER
 
 
 def main(folder: Path) -> tuple[float, float]:

@@ -26,7 +26,7 @@ from drake_dae import (
 )
 from drake_dae.dae.gains import GainDesign
 from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.diagrams.scenario import FOLDER, find_scenario
+from drake_dae.diagrams.shipped import FOLDER, find_scenario
 from drake_dae.robots.actuation.stage import Stage
 
 

@@ -16,6 +16,7 @@ from matplotlib.path import Path as Curve
 LOOKS = {
     "__main__": ("python -m drake_dae", "#5c6b7a"),
     "cli": ("the command drake-dae", "#5c6b7a"),
+    "commands": ("what each command does", "#5c6b7a"),
     "drake_dae": ("the public names", "#8a7f6d"),
     "diagrams": ("wirings, scenario files, models", "#b5527a"),
     "simulation": ("runs, records, plots, Meshcat", "#8e5bb0"),

@@ -28,6 +28,7 @@ FLOORS = (
     ("simulation",),
     ("diagrams",),
     ("drake_dae",),
+    ("commands",),
     ("cli",),
     ("__main__",),
 )

@@ -4,7 +4,8 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
-from drake_dae.diagrams.scenario import Scenario, find_scenario
+from drake_dae.diagrams.scenario import Scenario
+from drake_dae.diagrams.shipped import find_scenario
 
 
 def scenario(name: str, *settings: str) -> Scenario:

@@ -38,7 +38,8 @@ from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.diagrams.scenario import Scenario, find_scenario
+from drake_dae.diagrams.scenario import Scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint

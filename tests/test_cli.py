@@ -17,12 +17,14 @@ from matplotlib.figure import Figure
 from recordings import animation
 
 import drake_dae
-from drake_dae import Record, cli, load_scenario
-from drake_dae.cli import FILES, main
-from drake_dae.diagrams.scenario import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
+from drake_dae import Record, load_scenario
+from drake_dae.cli import main
+from drake_dae.commands import analyze, simulate
+from drake_dae.diagrams.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation import view
 from drake_dae.simulation.plots import PLOTS
+from drake_dae.simulation.run_folder import FILES
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
 BARE = [*QUICK, "--set", "write.record=false"]
@@ -286,7 +288,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     monkeypatch.setattr(os, "pwrite", write)
     monkeypatch.setattr(np, "savez_compressed", fill)
     monkeypatch.setattr(Figure, "savefig", fill)
-    monkeypatch.setattr(cli, "make_animation", fill)
+    monkeypatch.setattr(simulate, "make_animation", fill)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
     assert main(arguments) == 1
     out, err = capsys.readouterr()
@@ -349,7 +351,7 @@ def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monke
         return result
 
     seen = [listening()]
-    monkeypatch.setattr(cli, "simulate", watched)
+    monkeypatch.setattr(simulate, "simulate", watched)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
     assert main([*arguments, "--set", "write.plots=false"]) == 0
     assert (tmp_path / "animation.html").exists()
@@ -407,7 +409,7 @@ def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, 
         raise KeyboardInterrupt
 
     scenario = find_scenario("two_link_wall")
-    monkeypatch.setattr(cli, "simulate", stop)
+    monkeypatch.setattr(simulate, "simulate", stop)
     assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *QUICK]) == 130
     assert capsys.readouterr().err == "interrupted\n"
     assert Record.load(tmp_path / "record.npz").time[-1] == 0.1
@@ -464,6 +466,8 @@ def test_list(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(shipped_scenarios())
     assert {"seven_joint_wall", "seven_joint_dome", "two_link_wall"} <= set(shipped_scenarios())
+    told = [line.split(maxsplit=1)[1] for line in lines]
+    assert told == [load_scenario(path).description for path in shipped_scenarios().values()]
     starts = {len(line) - len(line.split(maxsplit=1)[1]) for line in lines}
     assert len(starts) == 1
 
@@ -538,7 +542,8 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
         warnings.warn("two tanks: non-minimum phase", NonMinimumPhaseWarning, stacklevel=1)
         raise ScenarioError(("", "empty"))
 
-    monkeypatch.setattr(cli, "find_scenario", warn)
+    for command_of in (simulate, analyze):
+        monkeypatch.setattr(command_of, "find_scenario", warn)
     assert main(["simulate", "two_tanks"]) == 1
     assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty\n"
     assert main(["analyze", "two_tanks"]) == 1

@@ -13,7 +13,7 @@ from drake_dae.cli import main
 from drake_dae.diagrams import feasibility as module
 from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.diagrams.feasibility_report import Feasibility
-from drake_dae.diagrams.scenario import shipped_scenarios
+from drake_dae.diagrams.shipped import shipped_scenarios
 from drake_dae.simulation.summary import Limits
 
 

@@ -131,6 +131,28 @@ def test_the_mathematics_loads_no_drake() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("words", [["list"], ["--version"], ["--help"], ["simulate", "--help"]])
+def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
+    code = (
+        "import sys\nfrom drake_dae.cli import main\n"
+        f"try:\n    main({words})\nexcept SystemExit:\n    pass\n"
+        "print(*sys.modules)"
+    )
+    command = [sys.executable, "-W", "error", "-c", code]
+    printed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    tops = {name.split(".")[0] for name in printed.splitlines()[-1].split()}
+    assert "drake_dae" in tops
+    assert tops.isdisjoint({"pydrake", "casadi", "scipy", "matplotlib", "pydantic", "tqdm"})
+
+
+@pytest.mark.slow
+def test_what_most_runs_do_not_need_loads_when_it_is_used() -> None:
+    loaded = loaded_with(["commands"])
+    assert "pydrake" in loaded
+    assert loaded.isdisjoint({"matplotlib", "scipy.integrate", "scipy.optimize"})
+
+
+@pytest.mark.slow
 def test_traced_functions_load_no_system() -> None:
     loaded = {room(name) for name in loaded_with(["trace"]) if name.startswith("drake_dae.")}
     assert loaded == {"errors", "arrays", "trace"}

@@ -16,7 +16,7 @@ from drake_dae import (
     SinusoidReference,
     WeldedFrames,
 )
-from drake_dae.diagrams.scenario import FOLDER
+from drake_dae.diagrams.shipped import FOLDER
 from drake_dae.robots.actuation.stage import Stage
 
 APART = 1.8

@@ -1,6 +1,7 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from math import isfinite
 
 import casadi as ca
@@ -13,6 +14,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
+    PRECISION,
     ROUNDING,
     Linearization,
     are_dependent,
@@ -25,6 +27,10 @@ from drake_dae.trace.round_off import positive
 CONSISTENT = 1e-8
 """A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
 size; or, where gradients depend on each other, if its residual is at most this."""
+
+STEPS = 6
+"""So many Newton steps are one function: one or two to N* from where a step of a simulation ends,
+the others polish; one projection in a thousand takes more."""
 
 FLOOR = 1e-12
 """A distance from N* that is round-off of states that are zero."""
@@ -40,6 +46,7 @@ class Manifold:
     Attributes:
         residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
         residual_signals: Its names and units.
+        residual_function: The same as a function of state and parameters.
     """
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
@@ -50,17 +57,37 @@ class Manifold:
         self.residual_signals = layout.chain_signals(system.constraint_output_signals)
         gradient = ca.jacobian(residual, system.state)
         self._levels = _levels(layout, gradient)
-        self._residual = system.trace("manifold", {"residual": residual})
+        self.residual_function = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
-        # The Newton step dx = S dz of least norm |dz| from a state, S its scale, by the gradients C
-        # at another one: from (C S)' = Q R, dz = -Q R^-T r.
         self._scale = system.scale
-        other, step = ca.SX.sym("other", system.num_states), ca.SX(system.num_states, 1)
-        if residual.numel():
-            scaled = ca.mtimes(gradient, ca.diag(ca.SX(self._scale)))
-            q, r = ca.qr(ca.substitute(scaled, system.state, other).T)
-            step = -ca.mtimes(q, ca.solve(r.T, residual))
-        self._newton = system.trace("step to the manifold", {"step": step}, {"other": other})
+        self._projection = self._trace_projection(gradient)
+
+    def _trace_projection(self, gradient: ca.SX) -> TracedFunction:
+        """The first Newton steps from a state, all by the gradients there, as one function.
+
+        Before them stand their lengths, in states over their scale, and the sizes of the first two,
+        relative to the state as in `newton`.
+        """
+        state, p, scale = self.system.state, self.system.parameter_symbol, ca.SX(self._scale)
+        residual = ca.Function("residual", [state, p], [self.residual_expression])
+        step_for, steps = _shortest_step(gradient, scale), {}
+        for number in range(STEPS):
+            steps[f"step {number}"] = step = scale * step_for(residual(state, p))
+            state += step
+        unit = ca.fmax(scale, ca.fabs(self.system.state))
+        lengths = [ca.norm_2(step / scale) for step in steps.values()]
+        sizes = [ca.norm_2(steps[f"step {number}"] / unit) for number in (0, 1)]
+        outputs = {"sizes": ca.vertcat(*lengths, *sizes), **steps}
+        return self.system.trace("projection onto the manifold", outputs)
+
+    @cached_property
+    def _newton(self) -> TracedFunction:
+        """The Newton step from a state over its scale, by the gradients at another one."""
+        other, state = ca.SX.sym("other", self.system.num_states), self.system.state
+        gradient = ca.substitute(ca.jacobian(self.residual_expression, state), state, other)
+        step = _shortest_step(gradient, ca.SX(self._scale))(self.residual_expression)
+        inputs = {"other": other}
+        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
     @property
     def dimension(self) -> int:
@@ -74,7 +101,7 @@ class Manifold:
             state: x, shape (n,).
             parameters: Values of all parameters; the defaults if None.
         """
-        return self._residual(state, self.system.parameter_vector(parameters))[0]
+        return self.residual_function(state, self.system.parameter_vector(parameters))[0]
 
     def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """C = d(residual)/dx, shape (sum r_i, n); the arguments are those of `residual`."""
@@ -95,7 +122,7 @@ class Manifold:
         The arguments are those of `residual`.
         """
         x, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = norm(self._newton.evaluate(x, x, p)[0])
+        reach = float(self._projection.evaluate(x, p)[0][0])
         if isfinite(reach) and reach > 0.0:
             return reach <= CONSISTENT * norm(x / self._scale) + FLOOR
         # Gradients that depend on each other; or nothing is left, or what no state changes.
@@ -115,12 +142,32 @@ class Manifold:
             InconsistentStateError: Newton's method does not reach N* from there.
             ModelError: The state has a wrong shape.
         """
-        start, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = norm(self._newton.evaluate(start, start, p)[0])
-        if 0.0 < reach <= ROUNDING or (
-            reach == 0.0 and not self._residual.evaluate(start, p)[0].any()
-        ):
-            return start  # As in most steps of a simulation.
+        return self.projected(self._state(state), self.system.parameter_vector(parameters))
+
+    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """`project` without checks of its arguments, for a simulation.
+
+        Args:
+            start: The state, shape (n,).
+            p: Values of all parameters, shape (k,).
+
+        Returns:
+            The consistent state, which is `start` itself if that is one.
+        """
+        sizes, *steps = self._projection.evaluate(start, p)
+        if self._projection.is_finite:
+            *lengths, size, left = sizes.tolist()
+            if 0.0 < lengths[0] <= ROUNDING or (
+                lengths[0] == 0.0 and not self.residual_function.evaluate(start, p)[0].any()
+            ):
+                return start  # As in most steps of a simulation.
+            nearby = _followed(start, steps, lengths, size, left)
+            if nearby is not None and nearby is not start:
+                return nearby
+        return self._searched(start, p)
+
+    def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """The consistent state next to one, where the first few steps do not lead to it."""
         scale = self._scale
         z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
         if not converged:
@@ -132,8 +179,8 @@ class Manifold:
         # Else it is round-off, in units in which that is much, or no state changes what is left.
         if self._residual_size(found, p) <= CONSISTENT:
             return found
-        residual = self._residual.evaluate(found, p)[0].copy()
-        if converged and self._newton.evaluate(found, found, p)[0].any():
+        residual = self.residual_function.evaluate(found, p)[0].copy()
+        if converged and self._projection.evaluate(found, p)[1].any():
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
 
@@ -166,7 +213,7 @@ class Manifold:
         def linearize(z: FloatArray) -> Linearization | None:
             gradients = self.gradients(filled(z), parameters)[np.ix_(rows, columns)]
             return shortest_steps(
-                gradients * scale, lambda z: self._residual(filled(z), parameters)[0][rows]
+                gradients * scale, lambda z: self.residual_function(filled(z), parameters)[0][rows]
             )
 
         z, converged = newton(state[columns] / scale, linearize)
@@ -186,7 +233,7 @@ class Manifold:
     def _residual_size(self, state: FloatArray, parameters: FloatArray) -> float:
         """The residual relative to how it changes over the scale of the states, if it does."""
         length = np.linalg.norm(self.gradients(state, parameters) * self._scale, axis=1)
-        return norm(self._residual.evaluate(state, parameters)[0] / positive(length))
+        return norm(self.residual_function.evaluate(state, parameters)[0] / positive(length))
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""
@@ -202,7 +249,7 @@ class Manifold:
         length = positive(np.linalg.norm(gradients, axis=1))
 
         def residual(z: FloatArray) -> FloatArray:
-            return self._residual(scale * z, parameters)[0]
+            return self.residual_function(scale * z, parameters)[0]
 
         def measure(z: FloatArray) -> float:
             return float(np.linalg.norm(residual(z) / length))
@@ -232,6 +279,51 @@ class Manifold:
                 "contradict each other, or start away from this state"
             )
         return left + "Start nearer to the constraint, away from its singular states"
+
+
+def _shortest_step(gradient: ca.SX, scale: ca.SX) -> Callable[[ca.SX], ca.SX]:
+    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
+
+    From (C S)' = Q R it is -Q R^-T residual.
+    """
+    if not gradient.shape[0]:
+        return lambda residual: ca.SX(gradient.shape[1], 1)
+    q, r = ca.qr(ca.mtimes(gradient, ca.diag(scale)).T)
+    return lambda residual: -ca.mtimes(q, ca.solve(r.T, residual))
+
+
+def _followed(
+    start: FloatArray,
+    steps: Sequence[FloatArray],
+    lengths: Sequence[float],
+    size: float,
+    left: float,
+) -> FloatArray | None:
+    """What `newton` finds from a start by these first steps; None where it takes others.
+
+    Args:
+        start: The state, shape (n,).
+        steps: The Newton steps that follow each other from there.
+        lengths: Their lengths, in states over their scale.
+        size, left: The sizes of the first two, relative to the state.
+    """
+    if size <= ROUNDING:
+        state, number = start, 0
+    elif left * left <= PRECISION * size:
+        state, number = start + steps[0], 1
+    else:
+        return None
+    length = lengths[number]
+    while length > 0.0:
+        state = state + steps[number]
+        number += 1
+        if number == len(steps):
+            return None
+        following = lengths[number]
+        if not following < 0.5 * length:
+            break
+        length = following
+    return state
 
 
 def _levels(layout: Layout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:

@@ -1,18 +1,29 @@
 """Pictures of a run."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.simulation.record import Record
 
+if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 PLOTS = ("outputs.png", "errors.png", "residual.png", "controls.png")
 """The files that `save_plots` writes."""
+
+# Of a figure, in inches: the axes' height, what is left and right of them for the numbers of their
+# scale, between rows, below the last and above the first; of a legend, a line, what stands before
+# a label, and a letter of it.
+_AXES, _LEFT, _RIGHT, _GAP, _BOTTOM, _TITLE = 1.4, 0.75, 0.2, 0.5, 0.55, 0.25
+_LINE, _HANDLE, _LETTER = 0.2, 0.65, 0.075
 
 
 def save_plots(
@@ -43,7 +54,7 @@ def plot_outputs(record: Record) -> Figure:
     values = record["controlled_output"]
     desired = record["desired_output"]
     signals = record.signals["controlled_output"].signals
-    figure, axes = _grid([_label(signal) for signal in signals])
+    figure, axes = _grid([_label(signal) for signal in signals], ("actual", "reference"))
     for i, axis in enumerate(axes):
         axis.plot(record.time, values[:, i], color="C0", label="actual")
         axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
@@ -60,7 +71,8 @@ def plot_errors(record: Record, predicted: FloatArray) -> Figure:
     values = record["controlled_output"]
     errors = values - record["desired_output"]
     signals = record.signals["controlled_output"].signals
-    figure, axes = _grid([_label(Signal(f"|error of {s.name}|", s.unit)) for s in signals])
+    titles = [_label(Signal(f"|error of {s.name}|", s.unit)) for s in signals]
+    figure, axes = _grid(titles, ("predicted", "actual", "round-off"))
     for i, axis in enumerate(axes):
         floor = _round_off(values[:, i])
         for data, style in (
@@ -77,10 +89,12 @@ def plot_errors(record: Record, predicted: FloatArray) -> Figure:
 def plot_residual(record: Record) -> Figure:
     """Constraint outputs and their derivatives, as the steps leave them before projection."""
     values = np.abs(record["constraint_residual"])
-    figure, (axis,) = _grid(["|constraint residual|, before each step's projection"])
+    labels = [_label(signal) for signal in record.signals["constraint_residual"].signals]
+    title = "|constraint residual|, before each step's projection"
+    figure, (axis,) = _grid([title], (*labels, "round-off"))
     floor = _round_off(np.ones(1))
-    for i, signal in enumerate(record.signals["constraint_residual"].signals):
-        axis.semilogy(record.time, np.maximum(values[:, i], floor), label=_label(signal))
+    for i, label in enumerate(labels):
+        axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
     axis.set_ylim(floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor))
@@ -111,19 +125,43 @@ def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
     return figure
 
 
-def _grid(titles: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    """Axes over time in two columns; a last one alone in its row fills it."""
+def _grid(titles: Sequence[str], labels: Sequence[str] = ()) -> tuple[Figure, list[Axes]]:
+    """Axes over time in two columns; a last one alone in its row fills it.
+
+    Their places are known beforehand: a layout that measures what it draws takes longer than the
+    drawing itself. Those below each other share their numbers, too.
+
+    Args:
+        titles: What stands above each of them.
+        labels: The entries of a legend above all axes, for which room is left.
+    """
+    from matplotlib.figure import Figure
+
     count = len(titles)
     columns = 1 if count <= 2 else 2
     rows = -(-count // columns)
-    figure = Figure(figsize=(6.0 * columns, 1.2 + 1.9 * rows), layout="constrained")
-    cells = figure.add_gridspec(rows, columns)
+    width = 6.0 * columns
+    top = _TITLE + (_LINE * _legend_shape(labels, width)[0] + 0.15 if labels else 0.1)
+    height = _BOTTOM + rows * _AXES + (rows - 1) * _GAP + top
+    figure = Figure(figsize=(width, height))
+    cells = figure.add_gridspec(
+        rows,
+        columns,
+        left=_LEFT / width,
+        right=1.0 - _RIGHT / width,
+        bottom=_BOTTOM / height,
+        top=1.0 - top / height,
+        wspace=(_LEFT + _RIGHT) / (width / columns - _LEFT - _RIGHT),
+        hspace=_GAP / _AXES,
+    )
+    numbered = count - count % columns  # Above a wide one stands another scale.
     axes: list[Axes] = []
     for i, title in enumerate(titles):
         row, column = divmod(i, columns)
         place = cells[row, :] if i == count - 1 and column == 0 else cells[row, column]
         axis = figure.add_subplot(place, sharex=axes[0] if axes else None)
-        axis.set_title(title, fontsize=10)
+        axis.set_title(title, y=1.0, fontsize=10)  # With y there is no search for room.
+        axis.tick_params(axis="x", labelbottom=row == rows - 1 or i + columns >= numbered)
         axis.grid(True, alpha=0.3)
         axes.append(axis)
     figure.supxlabel("time [s]", fontsize=10)
@@ -138,7 +176,24 @@ def _label(signal: Signal) -> str:
 def _legend(figure: Figure, axis: Axes) -> None:
     """One legend above all axes, where it hides nothing."""
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=9)
+    columns = _legend_shape(labels, figure.get_figwidth())[1]
+    place = (0.5, 1.0 - 0.05 / figure.get_figheight())
+    figure.legend(
+        handles,
+        labels,
+        loc="upper center",
+        bbox_to_anchor=place,
+        borderaxespad=0.0,
+        ncols=columns,
+        fontsize=9,
+    )
+
+
+def _legend_shape(labels: Sequence[str], width: float) -> tuple[int, int]:
+    """Rows and columns of a legend that is no wider than a figure."""
+    entry = _HANDLE + _LETTER * max(map(len, labels))
+    columns = max(1, min(len(labels), int((width - 0.2) / entry)))
+    return -(-len(labels) // columns), columns
 
 
 def _flatten(axis: Axes, values: FloatArray, noise: float, margin: float) -> None:

@@ -74,6 +74,19 @@ class Record:
             raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
         return self.signals[name].values
 
+    def while_finite(self) -> Self:
+        """The record up to the first moment at which some signal is not finite."""
+        finite = [np.isfinite(recorded.values).all(axis=1) for recorded in self.signals.values()]
+        broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
+        if not broken.any():
+            return self
+        count = int(np.argmax(broken))
+        signals = {
+            name: Recorded(recorded.values[:count], recorded.signals)
+            for name, recorded in self.signals.items()
+        }
+        return type(self)(self.time[:count], signals)
+
     @classmethod
     def from_logs(
         cls,

@@ -74,11 +74,13 @@ class RecordWriter:
         Warns:
             UserWarning: The file cannot be written to; once.
         """
-        began = time.perf_counter()
-        if began < self._next:
+        if time.perf_counter() < self._next:
             return
+        record = self._made(context)
+        # What making it takes grows with the steps, and does not have to wait for a slow disk.
+        began = time.perf_counter()
         try:
-            self._append(context, keep_last=True)
+            self._append(record, keep_last=True)
         except OSError as error:
             if not self._warned:
                 reason = error.strerror or error
@@ -97,12 +99,16 @@ class RecordWriter:
             ModelError: What makes the record fails.
             OSError: The file cannot be written to; it keeps what fits.
         """
-        self._append(context, keep_last=False)
+        self._append(self._made(context), keep_last=False)
 
-    def _append(self, context: Context, keep_last: bool) -> None:
+    def _made(self, context: Context) -> Record:
+        """What was recorded since the last time."""
         record = result_of("record", self._record, context, self._time)
         if not isinstance(record, Record):
             raise ModelError(f"record must return a Record, got {brief(record)}")
+        return record
+
+    def _append(self, record: Record, keep_last: bool) -> None:
         stop = record.time.size - keep_last
         if stop < 1:
             return

@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, numbers, vector
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
@@ -152,13 +152,14 @@ class ParameterizedSystem(DifferentiableSystem):
             NonFiniteError: A value is not finite, likewise.
         """
         if self._exogenous is None:  # Without a call more, in each evaluation.
-            parameters = context.get_numeric_parameter(0).CopyToVector()
+            parameters = context.get_numeric_parameter(0).value()
         else:
             parameters = self._values(context)
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
-        error = simulation_error(function.failure(), context.get_time(), state, self._signals)
+        time, state = context.get_time(), state.copy()
+        error = simulation_error(function.failure(), time, state, self._signals)
         self._steps.tolerate(context, self._explained(error, parameters, *inputs))
         return function.nowhere()
 
@@ -178,6 +179,21 @@ class ParameterizedSystem(DifferentiableSystem):
         """All parameters as `parameters`, those that move as they are at the context's time."""
         self.check_context(context)
         return np.array(self._values(context)[: self.dae.parameter_values.size])
+
+    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
+        """What the block's functions take as parameters, as it was at the accepted times of a run.
+
+        Parameters that move stand still at their values; see `exogenous_places`.
+
+        Args:
+            context: The context of the run.
+            times: The times, in s, shape (k,), increasing.
+
+        Returns:
+            One row for each time.
+        """
+        self.check_context(context)
+        return self._steps.parameters_along(context, vector("times", times, None))
 
     def get_parameter(self, context: Context, name: str) -> FloatArray:
         """A parameter by name, shape (k,).

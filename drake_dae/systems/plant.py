@@ -75,6 +75,10 @@ class DaePlant(ParameterizedSystem):
             `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
 
+    Attributes:
+        functions: Name of an output port -> its function of state, parameters and, for some, the
+            control.
+
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
         ModelError: This is no system, or the structure is that of another one.
@@ -110,6 +114,11 @@ class DaePlant(ParameterizedSystem):
         self.dynamics = structure.trace("dynamics", rate, self._is_controlled)
         self._force = structure.trace("constraint force", force, self._force_needs_control)
         self._output = structure.trace("controlled output", output, self._output_needs_control)
+        self.functions = {
+            "constraint_force": self._force,
+            "constraint_residual": structure.manifold.residual_function,
+            "controlled_output": self._output,
+        }
 
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
@@ -171,14 +180,12 @@ class DaePlant(ParameterizedSystem):
         return state
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        derivatives.get_mutable_vector().SetFromVector(
-            self._evaluate(self.dynamics, context, self._is_controlled)
-        )
+        derivatives.SetFromVector(self._evaluate(self.dynamics, context, self._is_controlled))
 
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool
     ) -> FloatArray:
-        x = context.get_continuous_state_vector().CopyToVector()
+        x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
         if needs_control:
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
@@ -291,7 +298,7 @@ class DaePlant(ParameterizedSystem):
     def _project(self, context: Context, state: State) -> EventStatus:
         x = context.get_continuous_state_vector().CopyToVector()
         try:
-            x = self.structure.manifold.project(x, self._values(context))
+            x = self.structure.manifold.projected(x, self._values(context))
         except InconsistentStateError as error:
             time = context.get_time()
             raise SimulationError(

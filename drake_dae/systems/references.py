@@ -5,14 +5,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.systems.along import signal_along
 from drake_dae.systems.block import DifferentiableSystem
 from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
@@ -138,6 +140,11 @@ class ReferenceGenerator(DifferentiableSystem):
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s, shape (sum (mu_i + 1),)."""
         return self._evaluate(time).copy()
+
+    def along(self, times: ArrayLike) -> FloatArray:
+        """R(t) at many times in s, one row for each; nan where it has no value."""
+        moments = vector("times", times, None, ReferenceSignalError)
+        return signal_along(self._evaluate, self.get_output_port().size(), moments)
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(context.get_time()))

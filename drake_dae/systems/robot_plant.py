@@ -77,6 +77,7 @@ class RobotPlant(DaePlant):
         loops = model.loop_joints
         if loops.signals:
             self._loops = model.dae.trace("loop state", {"value": loops.state})
+            self.functions["loop_state"] = self._loops
             size, calc = len(loops.signals), weakly(self._calc_loop_state)
             self.DeclareVectorOutputPort("loop_state", size, calc, self._by_state)
         if model.joint_force is not None:

@@ -50,6 +50,9 @@ def state_tickets(system: LeafSystem) -> set[DependencyTicket]:
     return {system.xc_ticket(), system.time_ticket()}
 
 
+_DONE = EventStatus.DidNothing()
+
+
 @dataclass
 class Progress:
     """What a block knows of a simulation, in one context.
@@ -64,6 +67,7 @@ class Progress:
         start: When the simulation began, in s.
         steps: How many steps were accepted.
         mark: The time after the last thousand steps, in s.
+        parameters: After which time, in s, the block had which numeric parameters.
     """
 
     time: float = inf
@@ -74,6 +78,7 @@ class Progress:
     start: float = 0.0
     steps: int = 0
     mark: float = 0.0
+    parameters: list[tuple[float, FloatArray]] = field(default_factory=list)
 
 
 class StepWatch:
@@ -85,11 +90,12 @@ class StepWatch:
 
     def __init__(self, system: LeafSystem) -> None:
         self._system = proxy(system)
-        # It depends on nothing, so nothing but the two events changes it.
+        # It is out of date where parameters have changed, and then they are noted; all else in it
+        # is changed by the two events alone.
         self._index = system.DeclareCacheEntry(
             "progress",
-            ValueProducer(_no_simulation, lambda *_: None),
-            {system.nothing_ticket()},
+            ValueProducer(_no_simulation, _note_parameters),
+            {system.all_parameters_ticket()},
         ).cache_index()
         system.DeclareInitializationPublishEvent(weakly(self._begin))
         system.DeclarePerStepPublishEvent(weakly(self._accept))
@@ -120,15 +126,27 @@ class StepWatch:
             progress.state if progress.state.size else error.state,
         ) from None
 
+    def parameters_along(self, context: Context, times: FloatArray) -> FloatArray:
+        """The numeric parameters that the block had at accepted times, in s, one row for each."""
+        seen = self._progress(context).parameters
+        if not seen:
+            return np.tile(_parameters(context), (times.size, 1))
+        last = np.searchsorted([time for time, _ in seen], times) - 1
+        return np.array([values for _, values in seen])[np.maximum(last, 0)]
+
     def _progress(self, context: Context) -> Progress:
-        # It never gets out of date, so this calculates nothing; the object is ours to change.
+        # The object stays the same, and is ours to change.
         found: Progress = self._system.get_cache_entry(self._index).Eval(context)
         return found
 
     def _begin(self, context: Context) -> EventStatus:
         time = context.get_time()
         progress = self._progress(context)
-        vars(progress).update(vars(Progress(time=time, start=time, mark=time)))
+        before = float(np.nextafter(time, -inf))
+        seen = [entry for entry in progress.parameters if entry[0] < before]
+        if context.num_numeric_parameter_groups():
+            seen.append((before, _parameters(context)))
+        vars(progress).update(vars(Progress(time=time, start=time, mark=time, parameters=seen)))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
         return EventStatus.DidNothing()
@@ -137,7 +155,7 @@ class StepWatch:
         progress = self._progress(context)
         time = context.get_time()
         if progress.state.size:
-            state = context.get_continuous_state_vector().CopyToVector()
+            state = context.get_continuous_state_vector().value().copy()
             # The sum takes a fifth of the time, and may overflow.
             if not (isfinite(sum(state.tolist())) or np.isfinite(state).all()):
                 raise self._spoilt(progress, time)
@@ -148,7 +166,7 @@ class StepWatch:
         progress.time = time
         if progress.failures:
             progress.failures, progress.reason, progress.reason_time = 0, "", inf
-        return EventStatus.DidNothing()
+        return _DONE
 
     def _spoilt(self, progress: Progress, time: float) -> NonFiniteError:
         """The error where an integrator without error control accepted a trial that failed."""
@@ -176,6 +194,17 @@ class StepWatch:
 
 def _no_simulation() -> AbstractValue:
     return AbstractValue.Make(Progress())
+
+
+def _note_parameters(context: Context, value: AbstractValue) -> None:
+    """Notes that the parameters of a context are others since the last accepted state."""
+    progress: Progress = value.get_value()
+    if progress.parameters:
+        progress.parameters.append((progress.time, _parameters(context)))
+
+
+def _parameters(context: Context) -> FloatArray:
+    return np.array(context.get_numeric_parameter(0).value())
 
 
 def _at(state: FloatArray) -> str:

@@ -1,19 +1,24 @@
 """Speed of the shipped scenarios, reported and never judged: `make benchmark`.
 
 A derivative is that of the whole closed loop; the ratio is to an empty plant and controller in
-Python, in the same run. Traced is parsed, traced and built. Runs are at an accuracy of 1e-6.
+Python, in the same run. So is a step, of runge_kutta3 at 1 ms: with its projection and its log. A
+record is what is computed of each step afterwards. Traced is parsed, traced and built. Runs are at
+an accuracy of 1e-6. The command that lists scenarios has NumPy alone beside it.
 """
 
+import subprocess
+import sys
 import time
 import timeit
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_dae import build_scenario, load_scenario, simulate
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 
 SCENARIOS = ["two_link_wall", "seven_joint_wall"]
 TARGETS = {"two_link_wall": 20.0, "seven_joint_wall": 60.0}
@@ -94,6 +99,55 @@ def test_derivative_evaluation(name, report):
             "ratio": f"{ours / drake:.1f}",
         },
     )
+
+
+def stepping(diagram, context):
+    """A function that runs 20 steps of 1 ms, and returns what one of them takes, in us."""
+    config = SimulatorConfig(
+        integration_scheme="runge_kutta3", use_error_control=False, max_step_size=1e-3
+    )
+    simulator = Simulator(diagram, context)
+    ApplySimulatorConfig(config, simulator)
+    simulator.Initialize()
+
+    def run():
+        began = time.perf_counter()
+        simulator.AdvanceTo(context.get_time() + 0.02)
+        return 1e6 * (time.perf_counter() - began) / 20
+
+    return run
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_step(name, report):
+    loop, context = build_scenario(load_scenario(find_scenario(name)))
+    law = loop.controller.law
+    empty = empty_loop(law.system.num_states, len(law.reference_signals), law.system.num_controls)
+    runs = stepping(loop.diagram, context), stepping(*empty)
+    # Turn by turn, so that both meet the same moods of the machine.
+    ours, drake = (min(times) for times in zip(*((a(), b()) for a, b in [runs] * 30), strict=True))
+    began = time.perf_counter()
+    record = loop.record(context)
+    recorded = 1e6 * (time.perf_counter() - began) / record.time.size
+    report(
+        name,
+        {
+            "1 ms step [us]": f"{ours:.0f}",
+            "to that of empty blocks": f"{ours / drake:.1f}",
+            "record [us a step]": f"{recorded:.0f}",
+        },
+    )
+
+
+def test_starting(report):
+    def seconds(*words):
+        began = time.perf_counter()
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
+        return time.perf_counter() - began
+
+    pairs = [(seconds("-m", "drake_dae", "list"), seconds("-c", "import numpy")) for _ in range(5)]
+    ours, numpy = map(min, zip(*pairs, strict=True))
+    report("drake-dae list", {"[s]": f"{ours:.2f} (<0.3)", "to NumPy alone": f"{ours / numpy:.1f}"})
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

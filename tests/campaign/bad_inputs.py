@@ -13,7 +13,8 @@ import yaml
 from campaign.outcomes import Outcome, checked
 
 from drake_dae import build_scenario, load_scenario, simulate
-from drake_dae.diagrams.scenario import FOLDER, Scenario, shipped_scenarios
+from drake_dae.diagrams.scenario import Scenario
+from drake_dae.diagrams.shipped import FOLDER, shipped_scenarios
 from drake_dae.diagrams.typed_yaml import dump_yaml, load_yaml
 
 URDFS = {"two_link_arm": "two_link_wall", "five_bar": "five_bar"}

@@ -27,7 +27,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae.references import stack_references
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import GainError, ModelError, ScenarioError
 
 STIFFNESS, MASS = 1e4, 2.0

@@ -9,7 +9,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import are_dependent
+from drake_dae.trace.newton import are_dependent, newton, shortest_steps
 
 CONSTRAINED = [name for name, make in PROBLEMS.items() if make().constraint_degrees]
 
@@ -56,6 +56,26 @@ def test_residual_and_dimension_are_those_found_by_hand(problem):
         )
         consistent = problem.consistent(random)
         np.testing.assert_allclose(manifold.residual(consistent), 0.0, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_steps_taken_at_once_are_those_of_newtons_method(problem):
+    """What a simulation calls, against Newton's method with the factors of LAPACK."""
+    random = np.random.default_rng(4)
+    manifold = find_structure(problem.system).manifold
+    parameters = problem.system.parameter_values
+    for size in (1e-14, 1e-11, 1e-8, 1e-5, 1e-2):
+        start = problem.consistent(random)
+        start = start + size * random.standard_normal(start.size)
+        found, converged = newton(
+            start, lambda x: shortest_steps(manifold.gradients(x), manifold.residual)
+        )
+        assert converged
+        # Two factorizations, each to round-off of numbers of order 1.
+        state = manifold.projected(start.copy(), parameters)
+        np.testing.assert_allclose(state, found, rtol=1e-14, atol=1e-14)
+        again = manifold.projected(state, parameters)
+        np.testing.assert_allclose(again, state, rtol=0, atol=1e-15 * np.linalg.norm(state))
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ from drake_dae import (
     simulate,
     start_meshcat,
 )
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact import surfaces
 from drake_dae.simulation.animation import frame_times

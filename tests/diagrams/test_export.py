@@ -11,7 +11,7 @@ from runs import scenario
 
 from drake_dae import ClosedLoop, build_scenario, export_code
 from drake_dae.cli import main
-from drake_dae.diagrams.scenario import shipped_scenarios
+from drake_dae.diagrams.shipped import shipped_scenarios
 from drake_dae.errors import ModelError
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")

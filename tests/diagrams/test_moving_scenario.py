@@ -8,7 +8,7 @@ from recordings import animation
 
 from drake_dae import build_scenario, load_scenario, make_animation, simulate
 from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
 
 NAME = "seven_joint_moving_plate"

@@ -39,13 +39,8 @@ from drake_dae import (
     load_scenario,
 )
 from drake_dae.diagrams import scenario_parts as forms
-from drake_dae.diagrams.scenario import (
-    Scenario,
-    find_scenario,
-    save_scenario,
-    scenario_schema,
-    shipped_scenarios,
-)
+from drake_dae.diagrams.scenario import Scenario, save_scenario, scenario_schema
+from drake_dae.diagrams.shipped import find_scenario, shipped_scenarios
 from drake_dae.diagrams.typed_yaml import load_yaml
 from drake_dae.errors import ScenarioError
 from drake_dae.trace.functions import TracedFunction

@@ -8,8 +8,9 @@ from runs import run_scenario
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario import find_scenario, scenario_schema
+from drake_dae.diagrams.scenario import scenario_schema
 from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.diagrams.typed_yaml import load_yaml
 from drake_dae.errors import ScenarioError
 

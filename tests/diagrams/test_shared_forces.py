@@ -6,7 +6,7 @@ from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
 
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"

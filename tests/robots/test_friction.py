@@ -20,7 +20,7 @@ from drake_dae import (
     load_scenario,
     simulate,
 )
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
 
 GRAVITY = 9.81

@@ -37,8 +37,8 @@ from drake_dae import (
 from drake_dae.dae.contacts import MOST, Contact, Contacts, Jam, critical_factor, jam
 from drake_dae.dae.references import stack_references
 from drake_dae.dae.signals import Parameter, Signal
-from drake_dae.diagrams.scenario import find_scenario
 from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import JammedContactError, ModelError
 from drake_dae.trace.functions import TracedFunction
 

@@ -21,7 +21,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.diagrams.build import build_scenario
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError, ScenarioError
 
 

@@ -121,6 +121,18 @@ def test_residual():
     assert figure.get_supxlabel() == "time [s]"
 
 
+@pytest.mark.slow
+def test_a_legend_of_many_residuals_is_all_in_the_picture():
+    figure = plot_residual(record(contacts=7)[0])
+    figure.draw_without_rendering()
+    box, axes = figure.legends[0].get_tightbbox(), figure.axes[0].get_tightbbox()
+    assert len(legend(figure)) == 15
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+    assert axes.y1 <= box.y0
+    assert box.y1 <= figure.bbox.y1
+
+
 def test_residual_without_constraints():
     assert legend(plot_residual(record(contacts=0)[0])) == ["round-off"]
 

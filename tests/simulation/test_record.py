@@ -9,10 +9,10 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, T
 from pydrake.systems.primitives import LogVectorOutput
 from runs import run_scenario, scenario
 
-from drake_dae import Record, build_scenario, load_scenario, simulate
+from drake_dae import Record, build_scenario, load_scenario, poles, simulate
 from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.scenario import find_scenario
-from drake_dae.errors import ModelError
+from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.errors import ModelError, WiringError
 from drake_dae.simulation.record import Recorded
 
 
@@ -78,7 +78,7 @@ def test_signals_belong_together(run):
     for row in (0, record.time.size // 2, -1):
         replay.SetTime(record.time[row])
         loop.plant.set_state(loop.plant.GetMyContextFromRoot(replay), record["state"][row])
-        for name in loop.loggers:
+        for name in loop.signals:
             value = loop.diagram.GetOutputPort(name).Eval(replay)
             np.testing.assert_array_equal(record[name][row], value, err_msg=name)
         error = loop.diagram.GetOutputPort("tracking_error").Eval(replay)
@@ -86,6 +86,48 @@ def test_signals_belong_together(run):
         np.testing.assert_allclose(record["tracking_error"][row], error, atol=1e-12)
     difference = record["controlled_output"] - record["desired_output"]
     np.testing.assert_array_equal(record["tracking_error"], difference)
+
+
+def test_rows_before_a_change_of_parameters_keep_the_old_ones():
+    """Only the state is logged: gains and masses are those that the blocks had at each moment."""
+    loop, context = build_scenario(scenario("two_link_wall"))
+    config = scenario("two_link_wall").integrator
+    own, law = (
+        block.GetMyMutableContextFromRoot(context) for block in (loop.plant, loop.controller)
+    )
+    simulate(loop.diagram, context, 0.2, config)
+    replays = [context.Clone()]
+    name = loop.plant.dae.parameters[0].name
+    loop.plant.set_parameter(own, name, 1.01 * loop.plant.get_parameter(own, name))
+    loop.controller.set_gains(law, poles(-6.0))
+    config.start_time = context.get_time()
+    simulate(loop.diagram, context, 0.1, config)
+    replays.append(context.Clone())
+    record = loop.record(context)
+    assert np.sum(record.time > 0.2) > 3
+    for row, time in enumerate(record.time):
+        # The run goes on at 0.2 s, and logs what it begins with.
+        replay = replays[int(time >= 0.2)]
+        replay.SetTime(time)
+        loop.plant.set_state(loop.plant.GetMyContextFromRoot(replay), record["state"][row])
+        for signal in ("control", "constraint_force"):
+            value = loop.diagram.GetOutputPort(signal).Eval(replay)
+            np.testing.assert_array_equal(record[signal][row], value)
+    # What is asked for later is the same, whatever was changed since.
+    loop.controller.set_gains(law, poles(-2.0))
+    same(loop.record(context), record)
+    later = loop.record(context, 0.2)
+    np.testing.assert_array_equal(later.time, record.time[record.time > 0.2])
+    np.testing.assert_array_equal(later["control"], record["control"][record.time > 0.2])
+
+
+def test_a_fixed_port_of_the_controller_leaves_no_record():
+    """The state alone does not tell the control then."""
+    loop, context = build_scenario(scenario("two_link_wall"))
+    port = loop.controller.GetInputPort("reference")
+    port.FixValue(loop.controller.GetMyMutableContextFromRoot(context), np.zeros(port.size()))
+    with pytest.raises(WiringError, match="the port 'reference' of tracking_controller has a fix"):
+        loop.record(context)
 
 
 def test_the_last_row_is_after_the_projection(run):

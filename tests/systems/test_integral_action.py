@@ -26,7 +26,7 @@ from drake_dae import (
     poles,
     simulate,
 )
-from drake_dae.diagrams.scenario import find_scenario
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import GainError, ModelError, WiringError
 
 WANTED = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from drake_dae import DaeSystem, build_scenario
-from drake_dae.diagrams.scenario import find_scenario, load_scenario, shipped_scenarios
+from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.diagrams.shipped import find_scenario, shipped_scenarios
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiled import LIMIT, LOOK, attempts, find_compiler

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.integrate
+import scipy  # Which loads its heavy parts when they are used.
 import scipy.linalg
 
 from drake_dae.arguments import result_of

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import scipy.integrate
+import scipy  # Which loads its heavy parts when they are used.
 
 from drake_dae.arguments import result_of
 from drake_dae.arrays import FloatArray, numbers, show
@@ -181,7 +181,7 @@ class _Pursuit:
                     integrator = self._integrator(end, step)
             yield self._last
 
-    def _integrator(self, end: float, step: float | None = None) -> scipy.integrate.Radau:
+    def _integrator(self, end: float, step: float | None = None) -> "scipy.integrate.Radau":
         """An integrator of x' = f* + h* u from the last point."""
 
         def rate(time: float, state: FloatArray) -> FloatArray:

@@ -1,0 +1,19 @@
+"""`drake-dae analyze`: examines a scenario without running it."""
+
+import argparse
+import json
+
+from drake_dae.diagrams.feasibility import find_feasibility
+from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.diagrams.shipped import find_scenario
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """Prints what is found about the scenario that the options name; returns the exit code."""
+    path = find_scenario(options.scenario)
+    found = find_feasibility(load_scenario(path, options.settings))
+    if options.json:
+        print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
+    else:
+        print(f"{path.stem}\n\n{found}")
+    return 2 if found.problems else 0
