@@ -27,8 +27,8 @@ SHARE = 0.5
 """States are taken to be in use up to this part of where the terms of the equations are alike."""
 
 FAINT = 1e-3
-"""The weight of nominal values and of constant terms, which hang on where the nominal state is:
-they decide where other terms do not."""
+"""The weight of constant terms, which hang on where the nominal state is: they decide where other
+terms do not. The weight of nominal values is its square: they decide where nothing else does."""
 
 NEGLIGIBLE = log(1e-10)
 """The logarithm of a term, relative to the largest of its equation, that may be round-off."""
@@ -137,7 +137,7 @@ def natural_scale(
             comparisons.append(_Comparison(unknowns, log(size), equation, weight, is_plain))
     for i in np.flatnonzero(nominal).tolist():
         unknowns = -np.eye(1, end, i)[0]
-        comparisons.append(_Comparison(unknowns, log(abs(nominal[i])), i, FAINT, True))
+        comparisons.append(_Comparison(unknowns, log(abs(nominal[i])), i, FAINT**2, True))
     return np.asarray(SHARE * np.exp(np.clip(_alike(comparisons)[:n], -300.0, 300.0)))
 
 

@@ -8,7 +8,7 @@ ZERO = 1e-9
 """A sum of products below this, relative to the sizes of its terms, is zero."""
 
 
-ROUND_OFF = 1e-12
+ROUND_OFF = 1e-11
 """A factor below this, relative to the other factors in its row or column, is zero."""
 
 

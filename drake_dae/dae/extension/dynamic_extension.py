@@ -137,7 +137,8 @@ class _Chain:
         """
         random = np.random.default_rng(0)
         step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
-        return replace(self.system, nominal_state=self.system.nominal_state + step)
+        beside = self.system.nominal_state + step
+        return replace(self.system, nominal_state=beside, state_scale=self.system.scale)
 
     def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
         """Puts one integrator before each of some controls.
