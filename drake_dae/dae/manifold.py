@@ -1,6 +1,6 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 
 import casadi as ca
@@ -11,7 +11,9 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.factorization import smallest_sine
 from drake_dae.trace.newton import (
+    ROUND_OFF,
     ROUNDING,
     Linearization,
     are_dependent,
@@ -19,7 +21,7 @@ from drake_dae.trace.newton import (
     norm,
     shortest_steps,
 )
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.round_off import equilibration, positive
 
 CONSISTENT = 1e-8
 """A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
@@ -27,6 +29,22 @@ size; or, where gradients depend on each other, if its residual is at most this.
 
 FLOOR = 1e-12
 """A distance from N* that is round-off of states that are zero."""
+
+
+NEARLY = 3e-3
+"""Gradients of constraints that are this near to dependent, as the sine of an angle, are left out
+of a projection from a state that is all but on N*."""
+
+DOUBT = 0.03
+"""Where a gradient, less its part along those before it, is this much shorter than usual it is
+worth while to look whether they are nearly dependent."""
+
+SMALL = 1e-3
+"""A state is all but on N* if its residual, in lengths of gradients, is at most this, relative to
+its size."""
+
+ITERATIONS = 10
+"""After so many steps such a projection is given up; quadratic convergence takes three."""
 
 
 class Manifold:
@@ -51,13 +69,36 @@ class Manifold:
         self._levels = _levels(layout, gradient)
         self._residual = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
+        lengths, self._rows, self._columns = self._usual_sizes()
         # The Newton step of least norm from a state, by the gradients at another one: from
         # C' = Q R, dx = -Q R^-T r.
         other, step = ca.SX.sym("other", system.num_states), ca.SX(system.num_states, 1)
+        doubt = None
         if residual.numel():
             q, r = ca.qr(ca.substitute(gradient, system.state, other).T)
             step = -ca.mtimes(q, ca.solve(r.T, residual))
-        self._newton = system.trace("step to the manifold", {"step": step}, {"other": other})
+            heads = layout.heads.tolist()
+            # For next to nothing, like the sines, which are looked at where this fails.
+            doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(r[i, i]) / lengths[i] for i in heads])) - DOUBT
+            units = ca.diag(ca.SX(ca.DM(self._columns)))
+            first = ca.mtimes(ca.jacobian(residual[heads], system.state), units)
+            sines = {"sine": smallest_sine(first, self._rows[heads])}
+            self._sine = system.trace("independence", sines, often=False)
+        outputs, inputs = {"step": step}, {"other": other}
+        self._newton = system.trace("step to the manifold", outputs, inputs, doubt=doubt)
+
+    def _usual_sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How long gradients are at the nominal state: as they are, and in units of the states.
+
+        The units, which are the third, even out what states do to them. In some configurations
+        gradients vanish; what has no length at the nominal state has 1, and 0 in these units.
+        """
+        gradients = self.gradients(self.system.nominal_state)
+        if not np.all(np.isfinite(gradients)):
+            gradients = np.zeros_like(gradients)
+        columns = 1.0 / equilibration(gradients)[1]
+        rows = np.linalg.norm(gradients * columns, axis=1)
+        return positive(np.linalg.norm(gradients, axis=1)), rows, columns
 
     @property
     def dimension(self) -> int:
@@ -90,12 +131,19 @@ class Manifold:
         # Gradients that depend on each other; or nothing is left, or what no state changes.
         return self._residual_size(x, p) <= CONSISTENT
 
-    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+    def project(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
         """The consistent state next to a given one, to round-off, by Newton's method.
 
         Args:
             state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
+            crosses: Whether a system crosses a singular configuration at a state next to one: what
+                it loses there is then left out of the projection; None if it crosses none.
 
         Returns:
             The consistent state, shape (n,).
@@ -108,6 +156,10 @@ class Manifold:
         reach = norm(self._newton.evaluate(start, start, p)[0])
         if 0.0 < reach <= ROUNDING or (reach == 0.0 and self._residual_size(start, p) == 0.0):
             return start  # As in most steps of a simulation.
+        if crosses is not None and not self._newton.is_valid and self._is_near(start, p, crosses):
+            found = self._nearly(start, p)
+            if found is not None:
+                return found
         found, converged = newton(start, lambda x: self._linearize(x, p))
         if not converged:
             # Gradients that depend on each other, or steps that mislead: least squares, downhill.
@@ -173,6 +225,35 @@ class Manifold:
         return Linearization(
             lambda x: self._newton.evaluate(x, state, parameters)[0].copy(), is_regular=True
         )
+
+    def _is_near(
+        self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
+    ) -> bool:
+        """Whether a system crosses a singular configuration next to a state."""
+        return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
+
+    def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
+        """The state next to one that is all but on N*, where gradients nearly depend on each other.
+
+        Across a singular configuration a regular step would magnify round-off. What gradients that
+        are left out there say of N* is left, which is little so near to it; None if it is more.
+        """
+        x = start / self._columns
+        size = max(norm(x), norm(self.system.nominal_state / self._columns))
+        for _ in range(ITERATIONS):
+            state = x * self._columns
+            gradients = self.gradients(state, parameters) * self._columns
+            left = self._residual(state, parameters)[0]
+            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(left))):
+                return None
+            length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._rows))
+            if norm(left / length) > SMALL * size:
+                return None
+            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (left / length)
+            x = x - step
+            if norm(step) <= ROUND_OFF * size:
+                return x * self._columns
+        return None
 
     def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
         """Steps of least squares that make the residual smaller, its rows scaled to length one."""

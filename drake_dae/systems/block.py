@@ -158,9 +158,22 @@ class ParameterizedSystem(DifferentiableSystem):
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
+        known = self._otherwise(function, state, inputs, parameters)
+        if known is not None:
+            return known
         failure, time = function.failure(), context.get_time()
         self._steps.tolerate(context, simulation_error(failure, time, state, self._signals))
         return function.nowhere()
+
+    def _otherwise(
+        self,
+        function: TracedFunction,
+        state: FloatArray,
+        inputs: Sequence[FloatArray],
+        parameters: FloatArray,
+    ) -> tuple[FloatArray, ...] | None:
+        """The values of a function by another way, where its own are not valid; None if none."""
+        return None
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
