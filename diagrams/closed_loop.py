@@ -95,12 +95,11 @@ class ClosedLoop:
         logged = Record.from_logs(self.loggers, context, after)
         times, values = logged.time, {name: logged[name] for name in logged.signals}
         known = {**values, "parameters": self._parameters_along(self.plant, context, times)}
-        functions = dict(self.plant.functions)
         measured = self.controller.law.measured_force
         if measured and "measured_force" not in known:
             # Without a sensor that has memory; a law that does but integrate it reads none here.
             known["measured_force"] = (
-                function_along(functions["constraint_force"], known)
+                self.plant.along("constraint_force", known)
                 if self.controller.law.control_takes_force
                 else np.zeros((times.size, self.plant.dae.num_constraints))
             )
@@ -110,7 +109,7 @@ class ClosedLoop:
         gains = self._parameters_along(self.controller, context, times)
         given = {**known, "reference": values["reference"], "parameters": gains}
         values["control"] = known["control"] = function_along(self.controller.law.function, given)
-        values |= {name: function_along(own, known) for name, own in functions.items()}
+        values |= {port: self.plant.along(port, known) for port in self.plant.functions}
 
         desired = values["reference"][:, self.controller.law.layout.lowest]
         values["desired_output"] = desired

@@ -24,7 +24,7 @@ from .dae.signals import Signal as Signal
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
 from .dae.structure.constrained import find_constraint_structure as find_constraint_structure
 from .dae.structure.redundancy import drop_constraints as drop_constraints
-from .dae.structure.redundancy import share_forces as share_forces
+from .dae.structure.shared_forces import share_forces as share_forces
 from .dae.structure.structure import Structure as Structure
 from .dae.structure.structure import find_structure as find_structure
 from .dae.system import DaeSystem as DaeSystem

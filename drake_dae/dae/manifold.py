@@ -12,9 +12,11 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.factorization import smallest_sine
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     PRECISION,
+    ROUND_OFF,
     ROUNDING,
     Linearization,
     are_dependent,
@@ -34,6 +36,22 @@ the others polish; one projection in a thousand takes more."""
 
 FLOOR = 1e-12
 """A distance from N* that is round-off of states that are zero."""
+
+
+NEARLY = 3e-3
+"""Gradients of constraints that are this near to dependent, as the sine of an angle, are left out
+of a projection from a state that is all but on N*."""
+
+DOUBT = 0.03
+"""Where a gradient, less its part along those before it, is this much shorter than usual it is
+worth while to look whether they are nearly dependent."""
+
+SMALL = 1e-3
+"""A state is all but on N* if its residual, in lengths of gradients, is at most this, relative to
+its size."""
+
+ITERATIONS = 10
+"""After so many steps such a projection is given up; quadratic convergence takes three."""
 
 
 class Manifold:
@@ -60,32 +78,56 @@ class Manifold:
         self.residual_function = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
         self._scale = system.scale
-        self._projection = self._trace_projection(gradient)
+        lengths, self._rows = self._usual_sizes()
+        heads = layout.heads.tolist()
+        self._projection = self._trace_projection(gradient, heads, lengths)
+        if heads:
+            first = ca.mtimes(gradient[heads, :], ca.diag(ca.SX(self._scale)))
+            sines = {"sine": smallest_sine(first, self._rows[heads])}
+            self._sine = system.trace("independence", sines, often=False)
 
-    def _trace_projection(self, gradient: ca.SX) -> TracedFunction:
+    def _usual_sizes(self) -> tuple[FloatArray, FloatArray]:
+        """How long gradients are at the nominal state, over the scale of the states.
+
+        In some configurations gradients vanish; what has no length at the nominal state has 1, and
+        0 in the second array.
+        """
+        gradients = self.gradients(self.system.nominal_state) * self._scale
+        if not np.all(np.isfinite(gradients)):
+            gradients = np.zeros_like(gradients)
+        rows = np.linalg.norm(gradients, axis=1)
+        return positive(rows), rows
+
+    def _trace_projection(
+        self, gradient: ca.SX, heads: Sequence[int], lengths: FloatArray
+    ) -> TracedFunction:
         """The first Newton steps from a state, all by the gradients there, as one function.
 
         Before them stand their lengths, in states over their scale, and the sizes of the first two,
-        relative to the state as in `newton`.
+        relative to the state as in `newton`. They are doubted where gradients nearly depend on each
+        other.
         """
         state, p, scale = self.system.state, self.system.parameter_symbol, ca.SX(self._scale)
         residual = ca.Function("residual", [state, p], [self.residual_expression])
-        step_for, steps = _shortest_step(gradient, scale), {}
+        (step_for, pivots), steps = _shortest_step(gradient, scale), {}
         for number in range(STEPS):
             steps[f"step {number}"] = step = scale * step_for(residual(state, p))
             state += step
         unit = ca.fmax(scale, ca.fabs(self.system.state))
-        lengths = [ca.norm_2(step / scale) for step in steps.values()]
+        reaches = [ca.norm_2(step / scale) for step in steps.values()]
         sizes = [ca.norm_2(steps[f"step {number}"] / unit) for number in (0, 1)]
-        outputs = {"sizes": ca.vertcat(*lengths, *sizes), **steps}
-        return self.system.trace("projection onto the manifold", outputs)
+        outputs = {"sizes": ca.vertcat(*reaches, *sizes), **steps}
+        # For next to nothing, like the sines, which are looked at where this fails.
+        doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / lengths[i] for i in heads])) - DOUBT
+        return self.system.trace("projection onto the manifold", outputs, doubt=doubt)
 
     @cached_property
     def _newton(self) -> TracedFunction:
-        """The Newton step from a state over its scale, by the gradients at another one."""
+        """The Newton step from a state, by the gradients at another one."""
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(ca.jacobian(self.residual_expression, state), state, other)
-        step = _shortest_step(gradient, ca.SX(self._scale))(self.residual_expression)
+        scale = ca.SX(self._scale)
+        step = scale * _shortest_step(gradient, scale)[0](self.residual_expression)
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
@@ -128,12 +170,19 @@ class Manifold:
         # Gradients that depend on each other; or nothing is left, or what no state changes.
         return self._residual_size(x, p) <= CONSISTENT
 
-    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+    def project(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
         """The consistent state next to a given one, to round-off, by Newton's method.
 
         Args:
             state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
+            crosses: Whether a system crosses a singular configuration at a state next to one: what
+                it loses there is then left out of the projection; None if it crosses none.
 
         Returns:
             The consistent state, shape (n,).
@@ -142,29 +191,39 @@ class Manifold:
             InconsistentStateError: Newton's method does not reach N* from there.
             ModelError: The state has a wrong shape.
         """
-        return self.projected(self._state(state), self.system.parameter_vector(parameters))
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        return self.projected(start, p, crosses)
 
-    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
+    def projected(
+        self,
+        start: FloatArray,
+        p: FloatArray,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
         """`project` without checks of its arguments, for a simulation.
 
         Args:
             start: The state, shape (n,).
             p: Values of all parameters, shape (k,).
+            crosses: As for `project`.
 
         Returns:
             The consistent state, which is `start` itself if that is one.
         """
         sizes, *steps = self._projection.evaluate(start, p)
-        if self._projection.is_finite:
-            *lengths, size, left = sizes.tolist()
-            if 0.0 < lengths[0] <= ROUNDING or (
-                lengths[0] == 0.0 and not self.residual_function.evaluate(start, p)[0].any()
-            ):
-                return start  # As in most steps of a simulation.
-            nearby = _followed(start, steps, lengths, size, left)
-            if nearby is not None and nearby is not start:
-                return nearby
-        return self._searched(start, p)
+        is_finite, is_valid = self._projection.is_finite, self._projection.is_valid
+        *lengths, size, left = sizes.tolist()
+        if is_finite and (
+            0.0 < lengths[0] <= ROUNDING
+            or (lengths[0] == 0.0 and not self.residual_function.evaluate(start, p)[0].any())
+        ):
+            return start  # As in most steps of a simulation.
+        found = None
+        if crosses is not None and not is_valid and self._is_near(start, p, crosses):
+            found = self._nearly(start, p)
+        elif is_finite:
+            found = _followed(start, steps, lengths, size, left)
+        return self._searched(start, p) if found is None or found is start else found
 
     def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """The consistent state next to one, where the first few steps do not lead to it."""
@@ -239,8 +298,38 @@ class Manifold:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""
         scale = self._scale
         return Linearization(
-            lambda z: self._newton.evaluate(scale * z, state, parameters)[0].copy(), is_regular=True
+            lambda z: self._newton.evaluate(scale * z, state, parameters)[0] / scale,
+            is_regular=True,
         )
+
+    def _is_near(
+        self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
+    ) -> bool:
+        """Whether a system crosses a singular configuration next to a state."""
+        return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
+
+    def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
+        """The state next to one that is all but on N*, where gradients nearly depend on each other.
+
+        Across a singular configuration a regular step would magnify round-off. What gradients that
+        are left out there say of N* is left, which is little so near to it; None if it is more.
+        """
+        x = start / self._scale
+        size = max(norm(x), norm(self.system.nominal_state / self._scale))
+        for _ in range(ITERATIONS):
+            state = x * self._scale
+            gradients = self.gradients(state, parameters) * self._scale
+            left = self.residual_function(state, parameters)[0]
+            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(left))):
+                return None
+            length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._rows))
+            if norm(left / length) > SMALL * size:
+                return None
+            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (left / length)
+            x = x - step
+            if norm(step) <= ROUND_OFF * size:
+                return x * self._scale
+        return None
 
     def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
         """Steps of least squares that make the residual smaller, its rows scaled to length one."""
@@ -281,15 +370,18 @@ class Manifold:
         return left + "Start nearer to the constraint, away from its singular states"
 
 
-def _shortest_step(gradient: ca.SX, scale: ca.SX) -> Callable[[ca.SX], ca.SX]:
+def _shortest_step(
+    gradient: ca.SX, scale: ca.SX
+) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
     """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
 
-    From (C S)' = Q R it is -Q R^-T residual.
+    From (C S)' = Q R it is -Q R^-T residual; the diagonal of R comes with it.
     """
     if not gradient.shape[0]:
-        return lambda residual: ca.SX(gradient.shape[1], 1)
+        return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
     q, r = ca.qr(ca.mtimes(gradient, ca.diag(scale)).T)
-    return lambda residual: -ca.mtimes(q, ca.solve(r.T, residual))
+    pivots = [r[i, i] for i in range(r.shape[0])]
+    return (lambda residual: -ca.mtimes(q, ca.solve(r.T, residual))), pivots
 
 
 def _followed(

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.signals import Parameter, Signal
-from drake_dae.dae.structure.redundancy import share_forces
+from drake_dae.dae.structure.shared_forces import share_forces
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import ActuationChain, chain

@@ -10,13 +10,18 @@ from drake_dae.errors import DrakeDaeError
 from drake_dae.trace.functions import TracedFunction
 
 
-def function_along(function: TracedFunction, given: Mapping[str, FloatArray]) -> FloatArray:
+def function_along(
+    function: TracedFunction,
+    given: Mapping[str, FloatArray],
+    otherwise: Callable[[tuple[FloatArray, ...]], tuple[FloatArray, ...] | None] | None = None,
+) -> FloatArray:
     """The first value of a function at each moment; nan where it has none.
 
     Args:
         function: The function.
         given: Name of an input -> its values, one row for each moment; more than the function
             takes do no harm.
+        otherwise: What may know the values, of such inputs, where the function has none.
 
     Returns:
         One row for each moment.
@@ -25,8 +30,10 @@ def function_along(function: TracedFunction, given: Mapping[str, FloatArray]) ->
     rows = np.full((len(arguments[0]), function.nowhere()[0].size), np.nan)
     evaluate = function.evaluate
     for row, moment in zip(rows, zip(*arguments, strict=True), strict=True):
-        values = evaluate(*moment)
-        if function.is_valid:
+        values: tuple[FloatArray, ...] | None = evaluate(*moment)
+        if not function.is_valid:
+            values = otherwise(moment) if otherwise else None
+        if values is not None:
             row[:] = values[0]
     return rows
 

@@ -158,10 +158,23 @@ class ParameterizedSystem(DifferentiableSystem):
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
+        known = self._otherwise(function, state, inputs, parameters)
+        if known is not None:
+            return known
         time, state = context.get_time(), state.copy()
         error = simulation_error(function.failure(), time, state, self._signals)
         self._steps.tolerate(context, self._explained(error, parameters, *inputs))
         return function.nowhere()
+
+    def _otherwise(
+        self,
+        function: TracedFunction,
+        state: FloatArray,
+        inputs: Sequence[FloatArray],
+        parameters: FloatArray,
+    ) -> tuple[FloatArray, ...] | None:
+        """The values of a function by another way, where its own are not valid; None if none."""
+        return None
 
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray

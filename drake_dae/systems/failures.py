@@ -50,8 +50,9 @@ def simulation_error(
         case Fault.SINGULAR:
             return SingularityError(
                 f"{failure.singular} is singular {where}, so {failure.function} is not determined "
-                "there: a singular configuration, through which smaller steps do not lead. Keep "
-                "away from this state, or choose other constraints or outputs",
+                "there: a singular configuration, through which smaller steps do not lead. A plant "
+                "passes one only where its velocity leads across, along one branch. Keep away from "
+                "this state, or choose other constraints or outputs",
                 time,
                 state,
             )

@@ -68,7 +68,7 @@ class TracedFormula:
         self, function: TracedFunction, time: float, arguments: tuple[FloatArray, ...]
     ) -> tuple[FloatArray, ...]:
         values = function.evaluate(*arguments)
-        if not function.is_valid:
+        if not function.is_regular:
             state = arguments[self._state]
             raise simulation_error(function.failure(), time, state, self._signals)
         return values

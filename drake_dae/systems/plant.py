@@ -1,5 +1,7 @@
 """Any DaeSystem as a LeafSystem."""
 
+from collections.abc import Mapping, Sequence
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +17,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.contacts import jam
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.structure.redundancy import manifold_of_left_out
+from drake_dae.dae.structure.passage import Passage
+from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import (
     InconsistentStateError,
@@ -24,6 +27,7 @@ from drake_dae.errors import (
     SimulationError,
     SingularityError,
 )
+from drake_dae.systems.along import function_along
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
@@ -59,6 +63,13 @@ class DaePlant(ParameterizedSystem):
             (sum r_i,); zero on N*.
         controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
             zero.
+
+    Through a singular configuration, where gradients of constraints depend on each other at one
+    state alone, it goes along the branch of N* that its velocity leads along, whether or not a step
+    ends there; see `Passage`. Within 1e-3 of it, as the sine of an angle between gradients,
+    `constraint_force` and `controlled_output` are without the part that grows there without bound.
+    Where nothing leads through, as at rest, and always with friction, exogenous signals or shared
+    forces, A(x) is singular.
 
     At a state that an integrator only tries, what has no value is nan, and error control takes a
     shorter step; at a state that was reached, and where no step leads on, it raises.
@@ -111,15 +122,24 @@ class DaePlant(ParameterizedSystem):
         self._output_needs_control = elimination.n_star.nnz() > 0
         self._is_controlled = system.num_controls > 0
         rate = derivatives.expand(derivatives.rate)
-        self.dynamics = structure.trace("dynamics", rate, self._is_controlled)
-        self._force = structure.trace("constraint force", force, self._force_needs_control)
-        self._output = structure.trace("controlled output", output, self._output_needs_control)
+        self._passage = Passage(structure)
+        doubt = self._passage.doubt
+        self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
+        self._force = structure.trace("constraint force", force, self._force_needs_control, doubt)
+        self._output = structure.trace(
+            "controlled output", output, self._output_needs_control, doubt
+        )
         self.functions = {
             "constraint_force": self._force,
             "constraint_residual": structure.manifold.residual_function,
             "controlled_output": self._output,
         }
 
+        v = {"v": derivatives.constraint_input}
+        shown = {"force": system.forces(v["v"]), "output": system.l + ca.mtimes(system.m, v["v"])}
+        self._force_of, self._output_of = (
+            system.trace(name, {"value": value}, v, often=False) for name, value in shown.items()
+        )
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
         residual = structure.manifold.residual_expression
@@ -189,6 +209,43 @@ class DaePlant(ParameterizedSystem):
         if needs_control:
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
+
+    def _otherwise(
+        self,
+        function: TracedFunction,
+        state: FloatArray,
+        inputs: Sequence[FloatArray],
+        parameters: FloatArray,
+    ) -> tuple[FloatArray, ...] | None:
+        own = tuple(value.copy() for value in function.evaluate(state, *inputs, parameters))
+        if not all(np.isfinite(given).all() for given in (state, *inputs)):
+            return None
+        is_regular = function.is_regular
+        control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
+        found = self._passage.motion(state, control, parameters)
+        if found is None:
+            return own if is_regular else None
+        if function is self.dynamics:
+            return found[:1]
+        given = {self._force: self._force_of, self._output: self._output_of}.get(function)
+        return None if given is None else (given(state, found[1], parameters)[0],)
+
+    def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
+        """What a port of `functions` showed at moments, one row for each; nan where nothing.
+
+        Args:
+            port: The port's name.
+            given: "state", "parameters" and "control" at each moment, one row for each.
+        """
+        function = self.functions[port]
+        return function_along(
+            function, given, lambda at: self._otherwise(function, at[0], at[1:-1], at[-1])
+        )
+
+    def _crosses(self, state: FloatArray, context: Context) -> bool:
+        """Whether the system crosses a singular configuration at a state next to one."""
+        control = self._control_port.Eval(context) if self._is_controlled else np.zeros(0)
+        return self._passage.motion(state, control, self._values(context)) is not None
 
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
@@ -298,7 +355,9 @@ class DaePlant(ParameterizedSystem):
     def _project(self, context: Context, state: State) -> EventStatus:
         x = context.get_continuous_state_vector().CopyToVector()
         try:
-            x = self.structure.manifold.projected(x, self._values(context))
+            x = self.structure.manifold.projected(
+                x, self._values(context), lambda near: self._crosses(near, context)
+            )
         except InconsistentStateError as error:
             time = context.get_time()
             raise SimulationError(

@@ -1,5 +1,7 @@
 """Matrices of expressions, factored once for many right sides."""
 
+from collections.abc import Sequence
+
 import casadi as ca
 
 
@@ -137,3 +139,24 @@ def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
         if right[:, j].nnz():
             result[:, j] = ca.solve(triangle, right[:, j])
     return ca.sparsify(result)
+
+
+def smallest_sine(rows: ca.SX, usual: Sequence[float]) -> ca.SX:
+    """The smallest sine of the angle between a row of a matrix and the span of those before it.
+
+    Args:
+        rows: The matrix, shape (k, n).
+        usual: How long rows usually are; one that is shorter counts as if it made that much
+            smaller an angle.
+    """
+    smallest = ca.SX(1)
+    basis: list[ca.SX] = []
+    for i, length in enumerate(usual):
+        row = rest = ca.densify(rows[i, :])
+        for direction in basis:
+            rest -= ca.dot(direction, rest) * direction
+        left = ca.norm_2(rest)
+        basis.append(rest / left)
+        whole = ca.fmax(ca.norm_2(row), length)
+        smallest = ca.fmin(smallest, ca.if_else(whole > 0, left / whole, 0))
+    return smallest

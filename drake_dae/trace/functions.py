@@ -68,6 +68,8 @@ class TracedFunction:
             for machine code.
         compiled: Whether a function that is called often becomes machine code; see
             `trace.compiled`.
+        doubt: A scalar that is negative where the values are not valid though the pivot is large
+            enough, for a caller that may know better ones; see `is_regular`.
 
     Attributes:
         num_operations: How many scalar operations one call takes.
@@ -83,19 +85,22 @@ class TracedFunction:
         regular: str = "a matrix",
         often: bool = True,
         compiled: Compiled = False,
+        doubt: ca.SX | None = None,
     ) -> None:
         self.name = name
         self._regular = regular
         self.input_names = tuple(inputs)
         self.output_names = tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
-        # Two numbers tell at once whether the values are of use: one is finite exactly if all
-        # outputs are, the other if the pivot is large enough as well.
+        # Two numbers tell at once whether the values are of use: the first is finite exactly if all
+        # outputs are, the last if the pivot is large enough as well, and there is no doubt.
         finite = sum((ca.sum1(ca.vec(e)) for e in dense if e.numel()), ca.SX(0))
         checks, regularity = [finite], ca.SX(1)
         if pivot is not None:
             regularity = pivot
             checks.append(finite + ca.if_else(pivot >= SINGULAR_PIVOT, 0, np.nan))
+        if doubt is not None:
+            checks.append(checks[-1] + ca.if_else(doubt >= 0, 0, np.nan))
         expressions = [*dense, regularity, *checks]
         self._function = ca.Function(
             _identifier(name),
@@ -187,6 +192,11 @@ class TracedFunction:
     def is_finite(self) -> bool:
         """Whether every output of the last call was finite."""
         return isfinite(self._finite[0])
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether the last values are of use where nobody knows better ones."""
+        return self.is_finite and bool(self._pivot[0] >= SINGULAR_PIVOT)
 
     @property
     def pivot(self) -> float:

@@ -37,9 +37,11 @@ class Cause(Enum):
     )
     SINGULAR_CONFIGURATION = (
         "This is a singular configuration: the constraints are redundant there, and not around it, "
-        "so that forces are not determined, and motions on N* may branch. Smaller steps do not "
-        "help a motion through it. Keep away from this state, or write other constraints that stay "
-        "independent there; a spring or a clearance in one of them makes the forces determined"
+        "so that forces are not determined, and motions on N* may branch. A plant that starts "
+        "elsewhere passes it where its velocity leads across, no law does, and smaller steps do "
+        "not help. Choose a nominal state away from it, and for a law motions that keep away; or "
+        "write other constraints that stay independent there; a spring or a clearance in one of "
+        "them makes the forces determined"
     )
     HIDDEN_DEGREE = (
         "No constraint is redundant, but the system is not in the class as it is written: such a "

@@ -75,13 +75,16 @@ class ConstraintStructure:
         x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
         return function(x, p)[0].reshape(matrix.shape)
 
-    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
+    def trace(
+        self, name: str, value: ca.SX, needs_control: bool, doubt: ca.SX | None = None
+    ) -> TracedFunction:
         """An expression on N* as a function of state, control and parameters.
 
         Args:
             name: What it is, for messages.
             value: An expression of the state and of the control `derivatives.control`.
             needs_control: Whether the function takes the control; without one it is put to 0.
+            doubt: Negative where its values are not valid though A(x) is regular.
 
         Returns:
             A function with the output "value", and with A(x) as the matrix that must be regular.
@@ -91,7 +94,8 @@ class ConstraintStructure:
         if not needs_control:
             value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(control.numel()))
         pivot = self.elimination.pivot
-        return self.system.trace(name, {"value": value}, inputs, pivot, "A(x) of Assumption (2)")
+        outputs, regular = {"value": value}, "A(x) of Assumption (2)"
+        return self.system.trace(name, outputs, inputs, pivot, regular, doubt=doubt)
 
 
 @checked(ModelError)

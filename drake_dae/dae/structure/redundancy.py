@@ -1,6 +1,6 @@
-"""A system without its redundant constraints, and how their forces are shared."""
+"""Which constraints are redundant, and a system without them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -10,14 +10,12 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.sharing import Sharing
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.dependence import Combination, redundant_constraints
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF
-from drake_dae.trace.round_off import equilibration, positive, without_round_off
+from drake_dae.trace.round_off import equilibration, positive
 
 SEARCH = 200
 """After so many steps the search for a state at which all constraints hold ends; a dozen do."""
@@ -46,10 +44,10 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
         ModelError: No constraint has that name; or one that goes does not follow from those that
             stay, its input acts in a direction of its own, or an output is its force.
     """
-    samples = _samples(system)
+    samples = consistent_samples(system)
     if names is None:
         names = [combination.name for combination in redundant_constraints(samples)]
-    kept = _kept(system, names)
+    kept = constraints_kept(system, names)
     if len(kept) == system.num_constraints:
         return system
     gone = ", ".join(f"'{name}'" for name in names)
@@ -58,113 +56,19 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
             f"{system.name}: an output is the force of {gone}, which is not determined where "
             "constraints are redundant; choose other outputs, or leave out other constraints"
         )
-    _check_same_motion(samples, kept, gone)
-    return _with(system, kept)
-
-
-@checked(ModelError)
-def share_forces(
-    system: DaeSystem,
-    names: Sequence[str] | None = None,
-    *,
-    compliances: Mapping[str, float] | None = None,
-) -> DaeSystem:
-    """The same motion with fewer constraints, and the forces of all by least squares.
-
-    On N* the input of a constraint that is left out acts as a combination of those that stay,
-    E^-1 g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all
-    v_all = (v_stay, v_out) with one v move the system in the same way: the split among redundant
-    constraints is not determined by (1)-(3). Shown is the one with the least sum of c_i v_i^2,
-
-        v_all = T v,   T = C^-1 G^T (G C^-1 G^T)^-1,   G = [1, D],   C = diag(c_1, ..., c_M),
-
-    whichever constraints stay. It is more than a convention where the c_i are the compliances of
-    what the constraints are made of, in m/N or rad/(N m): then it is how stiff springs in place of
-    the constraints share a load that changes slowly (Menabrea 1858), and only ratios matter. With
-    all c_i = 1, the default, it is that of equal stiffness in SI units, which means little where
-    forces and moments are redundant together.
-
-    The system has the constraints that stay, and its `sharing` shows the forces of all on the port
-    `constraint_force` of a plant. Those that stay must stay independent wherever the system moves:
-    else A(x) becomes singular there, and others may do better.
-
-    Args:
-        system: The system (1)-(3).
-        names: The constraints to leave out; if None as many as are redundant at all consistent
-            states drawn around the nominal one, so that those that stay are well independent.
-        compliances: Name of a constraint input -> c_i, for those where it is not 1.
-
-    Returns:
-        The system; the same one if nothing is redundant.
-
-    Raises:
-        InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: There is no such constraint or constraint input, or a compliance is not
-            positive; one that goes does not follow from those that stay, or its input acts in a
-            direction of its own; or an output is no function of the sum G v_all, and therefore not
-            determined.
-    """
-    weights = _weights(system, compliances or {})
-    samples = _samples(system)
-    kept = _independent(samples) if names is None else _kept(system, names)
-    if len(kept) == system.num_constraints:
-        return system
-    others = [i for i in range(system.num_constraints) if i not in kept]
-    signals = system.constraint_output_signals
-    _check_same_motion(samples, kept, ", ".join(f"'{signals[i].name}'" for i in others))
-    inertia = PositiveDefiniteFactorization(system.mass_matrix)
-    half = inertia.forward(system.g)
-    product = ca.sparsify(ca.mtimes(inertia.scaled(half).T, half))
-    gather = ca.SX(len(kept), system.num_constraints)
-    gather[:, kept] = ca.SX.eye(len(kept))
-    gather[:, others] = PositiveDefiniteFactorization(product[kept, kept]).solve(
-        product[kept, others]
-    )
-    weighted = ca.mtimes(ca.diag(ca.SX(1.0 / weights)), gather.T)
-    sum_of = PositiveDefiniteFactorization(ca.sparsify(ca.mtimes(gather, weighted)))
-    split = sum_of.solve(ca.densify(weighted.T)).T
-    sharing = Sharing(
-        split=split,
-        gather=gather,
-        signals=system.constraint_input_signals,
-        undetermined=_undetermined(samples, gather, split),
-        left_out=system.k[others],
-        left_out_signals=tuple(signals[i] for i in others),
-    )
-    return replace(_with(system, kept), sharing=sharing)
+    check_same_motion(samples, kept, gone)
+    return with_constraints(system, kept)
 
 
 def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
     """The constraints that follow from those before them at all states around the nominal one."""
     try:
-        return redundant_constraints(_samples(system))
+        return redundant_constraints(consistent_samples(system))
     except InconsistentStateError:
         return ()
 
 
-def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
-    """Where the constraints hold that were left out as redundant; None if none were.
-
-    N* is a part of it, and so may states be that are assembled in another way.
-    """
-    sharing = system.sharing
-    if sharing is None:
-        return None
-    count = len(sharing.left_out_signals)
-    alone = replace(
-        system,
-        k=sharing.left_out,
-        g=ca.SX(system.num_states, count),
-        m=ca.SX(system.num_outputs, count),
-        constraint_input_signals=(),
-        constraint_output_signals=sharing.left_out_signals,
-        implicit=None,
-        sharing=None,
-    )
-    return Manifold(alone, [[row] for row in ca.vertsplit(sharing.left_out)])
-
-
-def _samples(system: DaeSystem) -> Samples:
+def consistent_samples(system: DaeSystem) -> Samples:
     """Consistent states around the nominal one, as far as the constraints k_i tell."""
     return Samples(_Redundant(system), draw(system, None, 12, 0))
 
@@ -181,7 +85,12 @@ class _Redundant(Manifold):
     def __init__(self, system: DaeSystem) -> None:
         super().__init__(system, [[row] for row in ca.vertsplit(system.k)])
 
-    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+    def project(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
         x = self.system.state_vector(state)
         gradients = self.gradients(x, parameters)
         length = positive(np.linalg.norm(gradients, axis=1))
@@ -205,7 +114,7 @@ class _Redundant(Manifold):
         )
 
 
-def _kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
+def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
     """The constraints that stay where those with given names go.
 
     Raises:
@@ -218,7 +127,7 @@ def _kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
     return [i for i, name in enumerate(signals) if name not in names]
 
 
-def _independent(samples: Samples) -> list[int]:
+def independent_constraints(samples: Samples) -> list[int]:
     """The constraints that can stay, chosen so that they are well independent at all samples."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
     rest = []
@@ -238,55 +147,7 @@ def _independent(samples: Samples) -> list[int]:
     return sorted(kept)
 
 
-def _weights(system: DaeSystem, compliances: Mapping[str, float]) -> FloatArray:
-    """The compliances of all constraint inputs, shape (M,)."""
-    names = [signal.name for signal in system.constraint_input_signals]
-    weights = np.ones(len(names))
-    for name, value in compliances.items():
-        if name not in names:
-            raise ModelError(f"{system.name}: {unknown_name('constraint force', name, names)}")
-        if not value > 0.0:
-            raise ModelError(
-                f"{system.name}: the compliance of '{name}' must be positive, got {value}"
-            )
-        weights[names.index(name)] = value
-    return weights
-
-
-def _undetermined(samples: Samples, gather: ca.SX, split: ca.SX) -> tuple[str, ...]:
-    """The constraint inputs that are not determined.
-
-    Raises:
-        ModelError: An output is not.
-    """
-    system = samples.system
-    every = np.eye(system.num_constraints)
-    free = np.zeros(system.num_constraints, dtype=bool)
-    for m, g, t in samples.values(m=system.m, gather=gather, split=split):
-        free |= _changes(every, g, t)
-        bad = [
-            signal.name
-            for signal, changes in zip(system.output_signals, _changes(m, g, t), strict=True)
-            if changes
-        ]
-        if bad:
-            raise ModelError(
-                f"{system.name}: the output {', '.join(bad)} is not determined: how redundant "
-                "constraints share their forces does not change the motion, and no control steers "
-                "it. Choose other outputs; what the redundant forces sum up to is determined"
-            )
-    signals = system.constraint_input_signals
-    return tuple(signal.name for signal, is_free in zip(signals, free, strict=True) if is_free)
-
-
-def _changes(rows: FloatArray, gather: FloatArray, split: FloatArray) -> np.ndarray:
-    """Which rows S of S v_all change with v_all while G v_all stays: S is not S T G."""
-    sized = np.abs(rows) + np.abs(rows) @ np.abs(split) @ np.abs(gather)
-    changed, _ = without_round_off(rows - rows @ split @ gather, sized)
-    return np.asarray(changed.any(axis=1))
-
-
-def _with(system: DaeSystem, kept: list[int]) -> DaeSystem:
+def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
     """A system with some of its constraints and their inputs alone."""
     return replace(
         system,
@@ -299,7 +160,7 @@ def _with(system: DaeSystem, kept: list[int]) -> DaeSystem:
     )
 
 
-def _check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
+def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
     """Refuses to leave out what the remaining constraints do not replace."""
     system = samples.system
     moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
