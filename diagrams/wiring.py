@@ -89,7 +89,10 @@ def add_force_feedback(
     force, noise = plant.GetOutputPort("constraint_force"), None
     if sensor is None:
         control = plant.GetInputPort("control").get_index()
-        if plant.HasDirectFeedthrough(control, force.get_index()):
+        reads = controller.GetInputPort("measured_force").get_index()
+        acts = controller.GetOutputPort("control").get_index()
+        takes = controller.HasDirectFeedthrough(reads, acts)
+        if takes and plant.HasDirectFeedthrough(control, force.get_index()):
             raise WiringError(
                 "the constraint force depends on the control in the same instant, so a law that "
                 "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
