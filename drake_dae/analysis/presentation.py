@@ -6,10 +6,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from drake_dae.analysis.contact_text import contact_margin_as_dict, contact_margin_in_words
 from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.states.margins import SINGULAR, Margin
 from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.system import DaeSystem
@@ -82,8 +82,8 @@ def as_dict(findings: Findings) -> dict[str, Any]:
             "exponents": along.exponents.tolist(),
             "reason": along.reason,
         },
-        "contact_margin": _contact(findings.contact_margin),
-        "contact_margin_along": _contact(findings.contact_margin_along),
+        "contact_margin": contact_margin_as_dict(findings.contact_margin),
+        "contact_margin_along": contact_margin_as_dict(findings.contact_margin_along),
         "reference": None if motion is None else _motion(motion),
         "problems": list(findings.problems),
     }
@@ -198,7 +198,7 @@ def _places(findings: Findings) -> list[Part]:
         if a.margin is not None and a.finding is Finding.SATISFIED and a.number in matrices
     ]
     lines += [
-        _friction(findings, where, margin)
+        contact_margin_in_words(findings, where, margin)
         for where, margin in (
             ("at the examined states", findings.contact_margin),
             ("along the reference", findings.contact_margin_along),
@@ -232,24 +232,6 @@ def _places(findings: Findings) -> list[Part]:
         if along.verdict != Verdict.UNSTABLE or along is not findings.decisive:
             lines.append(f"Zero dynamics along the reference {along.verdict}: {along.reason}.")
     return [lines] if lines else []
-
-
-def _friction(findings: Findings, where: str, margin: ContactMargin) -> str:
-    """How much of A(x) friction leaves, and how much friction there may be."""
-    critical = ", ".join(f"{name} {value:.4g}" for name, value in margin.critical_friction.items())
-    if not np.all(np.isfinite([*margin.critical_friction.values()])):
-        return f"Friction: {where} no amount of it jams a contact."
-    when = "" if margin.time is None else f"t = {margin.time:.4g} s, "
-    constrained, system = findings.constraint_structure, findings.system
-    used = None
-    if constrained is not None:
-        matrix = ca.vec(constrained.elimination.constraint_matrix)
-        used = ca.which_depends(matrix, system.state, 1, False)
-    place = named_values(system.state_signals, margin.state, used)
-    return (
-        f"Friction: {where} at least {margin.reserve:.3g} of A(x) is left, and a contact would jam "
-        f"at {critical}, nearest at {when}{place}."
-    )
 
 
 def _nearest(findings: Findings, number: int, matrix: ca.SX, margin: Margin) -> str:
@@ -332,20 +314,6 @@ def _margin(margin: Margin | None) -> dict[str, Any] | None:
         "singular_value": float(margin.singular_value),
         "relative": float(margin.relative),
         "state": margin.state.tolist(),
-    }
-
-
-def _contact(margin: ContactMargin | None) -> dict[str, Any] | None:
-    if margin is None:
-        return None
-    return {
-        "reserve": margin.reserve,
-        "critical_friction": {
-            name: value if np.isfinite(value) else None
-            for name, value in margin.critical_friction.items()
-        },
-        "state": margin.state.tolist(),
-        "time": margin.time,
     }
 
 
