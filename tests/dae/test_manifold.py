@@ -63,17 +63,20 @@ def test_steps_taken_at_once_are_those_of_newtons_method(problem):
     """What a simulation calls, against Newton's method with the factors of LAPACK."""
     random = np.random.default_rng(4)
     manifold = find_structure(problem.system).manifold
-    parameters = problem.system.parameter_values
+    parameters, scale = problem.system.parameter_values, problem.system.scale
     for size in (1e-14, 1e-11, 1e-8, 1e-5, 1e-2):
         start = problem.consistent(random)
         start = start + size * random.standard_normal(start.size)
         found, converged = newton(
-            start, lambda x: shortest_steps(manifold.gradients(x), manifold.residual)
+            start / scale,
+            lambda z: shortest_steps(
+                manifold.gradients(scale * z) * scale, lambda z: manifold.residual(scale * z)
+            ),
         )
         assert converged
         # Two factorizations, each to round-off of numbers of order 1.
         state = manifold.projected(start.copy(), parameters)
-        np.testing.assert_allclose(state, found, rtol=1e-14, atol=1e-14)
+        np.testing.assert_allclose(state, scale * found, rtol=1e-14, atol=1e-14)
         again = manifold.projected(state, parameters)
         np.testing.assert_allclose(again, state, rtol=0, atol=1e-15 * np.linalg.norm(state))
 
