@@ -79,7 +79,10 @@ def wire_scenario(
     force = scenario.force
     with at("force"):
         sensor = force.sensor(model.dae.num_constraints)
-    with at("force or gains" if force.is_measured else "gains"):
+    damping = scenario.constraint_damping
+    keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
+    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
+    with at(" or ".join(keys)):
         gains = scenario.gains.design()
         law = TrackingLaw(
             model.dae,
@@ -87,6 +90,8 @@ def wire_scenario(
             structure=structure,
             measured_force=force.is_measured,
             force_gain=force.gain,
+            constraint_damping=None if damping is None else damping.design(),
+            integral=scenario.integral,
         )
     references = _references(scenario.references, law)
     exogenous = exogenous_references(scenario, law)

@@ -92,9 +92,10 @@ class ClosedLoop:
         if self.exogenous is not None:
             moving = self.exogenous.reference(record.time[0])
             parameters[self.controller.exogenous_places] = moving
-        return law.predicted_error(
-            record.time - record.time[0], record["state"][0], record["reference"][0], parameters
-        )
+        integral = record["integral"][0] if law.integral.outputs else None
+        time = record.time - record.time[0]
+        start = record["state"][0], record["reference"][0]
+        return law.predicted_error(time, *start, parameters, integral)
 
 
 @checked(WiringError)
@@ -169,6 +170,8 @@ def make_closed_loop(
         "control": (controller, dae.control_signals),
         "reference": (reference, law.reference_signals),
     }
+    if law.integral.outputs:
+        named["integral"] = (controller, law.integral.signals)
     if law.measured_force and sensor is not None:
         named["measured_force"] = (sensor, dae.constraint_input_signals)
     if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
@@ -267,7 +270,10 @@ def _add_force_feedback(
     force, noise = plant.GetOutputPort("constraint_force"), None
     if sensor is None:
         control = plant.GetInputPort("control").get_index()
-        if plant.HasDirectFeedthrough(control, force.get_index()):
+        reads = controller.GetInputPort("measured_force").get_index()
+        acts = controller.GetOutputPort("control").get_index()
+        takes = controller.HasDirectFeedthrough(reads, acts)
+        if takes and plant.HasDirectFeedthrough(control, force.get_index()):
             raise WiringError(
                 "the constraint force depends on the control in the same instant, so a law that "
                 "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "

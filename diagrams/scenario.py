@@ -123,6 +123,10 @@ class Scenario:
             are redundant: their forces are shared by least squares. {} is all alike; left out, no
             constraint may be redundant.
         gains: The gains of the tracking law (28).
+        integral: Names of outputs whose errors are integrated as well, which take a pole more:
+            positions, and forces where `force` is measured.
+        constraint_damping: What the law's model demands of constraints that give way, written as
+            gains are, for r_i - 1 poles per constraint; none where left out.
         references: The references, in the order of the outputs, the forces last.
         start: Where the robot starts.
         duration: How long the run lasts, in s.
@@ -145,6 +149,8 @@ class Scenario:
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
     gains: Gains = field(default_factory=parts.Poles)
+    integral: list[str] = field(default_factory=list)
+    constraint_damping: Gains | None = None
     references: list[Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0

@@ -94,9 +94,28 @@ class SimulationError(DrakeDaeError):
         self.time = time
         self.state = np.array(state, dtype=float)
 
+    def retold(self, message: str, time: float, state: ArrayLike) -> "SimulationError":
+        """The same error with another text, time and state."""
+        return type(self)(message, time, state)
+
 
 class SingularityError(SimulationError):
     """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank on the way."""
+
+
+class JammedContactError(SingularityError):
+    """A contact that friction jams on the way (Painleve): A(x) is no P-matrix any more.
+
+    Attributes:
+        jam: What becomes of the contact, as a `dae.contacts.Jam`; None where that is not known.
+    """
+
+    def __init__(self, message: str, time: float, state: ArrayLike, jam: Any = None) -> None:
+        super().__init__(message, time, state)
+        self.jam = jam
+
+    def retold(self, message: str, time: float, state: ArrayLike) -> "JammedContactError":
+        return type(self)(message, time, state, self.jam)
 
 
 class NonFiniteError(SimulationError):

@@ -40,6 +40,7 @@ WITHOUT_DRAKE = ("errors", "arrays", "arguments", "trace", "dae", "analysis")
 PAPER = (
     "signals",
     "exogenous",
+    "contacts",
     "expressions",
     "scale",
     "sharing",
@@ -52,8 +53,10 @@ PAPER = (
     "structure",
     "normal_form",
     "gains",
+    "constraint_damping",
     "references",
     "measured_force",
+    "integral",
     "tracking",
     "linearization",
     "zero_dynamics",

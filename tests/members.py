@@ -19,9 +19,9 @@ from drake_dae.robots.contact.surface import Surface
 
 @dataclass(frozen=True)
 class RubbingPoint(PointOnSurface):
-    """A point on a surface with Coulomb friction, made smooth by a small speed in m/s."""
+    """A point on a surface with friction whose numbers are no parameters."""
 
-    friction: float = 0.3
+    coefficient: float = 0.3
     speed: float = 0.05
     is_ideal: ClassVar[bool] = False
 
@@ -33,13 +33,13 @@ class RubbingPoint(PointOnSurface):
         return across / ca.sqrt(ca.sumsqr(across) + self.speed**2)
 
     def reaction(self, kinematics, constraint_force):
-        rubbing = -self.friction * constraint_force * self._sliding(kinematics)
+        rubbing = -self.coefficient * constraint_force * self._sliding(kinematics)
         pushed = super().reaction(kinematics, constraint_force)
         return pushed + kinematics.push(self.frame, rubbing, self.point)
 
     def applications(self, kinematics):
         (own,) = super().applications(kinematics)
-        rubbing = -self.friction * self._sliding(kinematics)
+        rubbing = -self.coefficient * self._sliding(kinematics)
         return (Application(own.point, own.force_axes + rubbing, own.moment_axes, self.frame),)
 
 

@@ -18,6 +18,7 @@ from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.references import Reference
+from drake_dae.dae.states.contact_margin import ContactMargins
 from drake_dae.dae.states.margins import Margin, find_margin, is_regular
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Violation
@@ -69,6 +70,10 @@ def analyze(
     smallest singular values of A(x) and B(x) are also followed downhill, inside the region or the
     box that the random states span, so that a singular state between them is found as a rule.
     There is no proof that none was missed.
+
+    Where friction acts on contacts that can only push, the margin of A(x) is that without friction,
+    and `contact_margin` tells with its sign how far friction is from jamming a contact (Painleve),
+    and at which coefficient that would be; likewise along a reference.
 
     Args:
         system: The system (1)-(3).
@@ -157,9 +162,14 @@ def analyze(
     along = None
     if dynamics.dimension and motion.times.size > 1:
         along = dynamics.stability_along(reference, motion, exogenous=exogenous)
+    contact_margin_along = None
+    if system.rubbing and motion.times.size:
+        contacts = ContactMargins(system, analysis.structure.elimination.constraint_matrix)
+        contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
     return replace(
         analysis,
         motion=motion,
+        contact_margin_along=contact_margin_along,
         zero_dynamics=stability,
         equilibria=_equilibria(dynamics, stability, samples.states, outputs),
         zero_dynamics_along=along,
@@ -200,13 +210,16 @@ def _examine(
         margins[violation.assumption if violation else number] = margin
 
     if constrained.constraint_margin is not None:
-        matrix = elimination.constraint_matrix
+        matrix = system.rubbing.without_friction(elimination.constraint_matrix)
         margin = find_margin(samples, matrix, search=search)
         constrained = replace(constrained, constraint_margin=margin)
         judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
         known["constraint_structure"] = constrained
+        if system.rubbing:
+            margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
+            known["contact_margin"] = margins_of_contacts.over(samples, search)
     without_law = why_no_law(system)
     if regular and not without_law:
         try:

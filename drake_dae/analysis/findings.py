@@ -6,6 +6,7 @@ from enum import StrEnum
 from drake_dae.analysis.tables import named_values
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Layout
+from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import ConstraintStructure
@@ -77,6 +78,8 @@ class Findings:
             the examined states.
         zero_dynamics_along: Assumption 2.2 along the reference; None also without one.
         motion: The motion along the reference; None also without one.
+        contact_margin: How far friction is from jamming a contact; None without friction.
+        contact_margin_along: The same along the reference; None also without one.
         constraint_structure: What the constraints alone decide, for `DaePlant`; None where A(x) is
             singular at an examined state itself, or there are no degrees.
         structure: The structure, for laws and blocks; None where A(x) or B(x) is singular at an
@@ -95,6 +98,8 @@ class Findings:
     equilibria: tuple[Stability, ...] = ()
     zero_dynamics_along: StabilityAlong | None = None
     motion: PinnedMotion | None = None
+    contact_margin: ContactMargin | None = None
+    contact_margin_along: ContactMargin | None = None
     constraint_structure: ConstraintStructure | None = None
     structure: Structure | None = None
 
@@ -154,6 +159,18 @@ class Findings:
             found.append(
                 "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
                 f"depend on each other at {place}"
+            )
+        # Along a reference the motion decides: elsewhere no contact need be.
+        contact = self.contact_margin_along or self.contact_margin
+        if contact is not None and contact.jams:
+            when = "" if contact.time is None else f"t = {contact.time:.6g} s, "
+            critical = ", ".join(f"{k} = {v:.4g}" for k, v in contact.critical_friction.items())
+            found.append(
+                "Friction: a contact jams (Painleve's paradox) at "
+                f"{when}{named_values(self.system.state_signals, contact.state)}: a principal "
+                f"minor of A(x) is {contact.reserve:.3g} of what it is without friction, and "
+                f"{critical} is critical there. Lower the friction, slide the other way, or hold "
+                "the robot less steeply to the surface"
             )
         decisive = self.decisive
         if decisive is not None and decisive.verdict is Verdict.UNSTABLE:

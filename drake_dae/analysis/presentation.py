@@ -9,6 +9,7 @@ import numpy as np
 from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
+from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.states.margins import SINGULAR, Margin
 from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.system import DaeSystem
@@ -81,6 +82,8 @@ def as_dict(findings: Findings) -> dict[str, Any]:
             "exponents": along.exponents.tolist(),
             "reason": along.reason,
         },
+        "contact_margin": _contact(findings.contact_margin),
+        "contact_margin_along": _contact(findings.contact_margin_along),
         "reference": None if motion is None else _motion(motion),
         "problems": list(findings.problems),
     }
@@ -185,13 +188,22 @@ def _places(findings: Findings) -> list[Part]:
     """Where the margins are smallest, what the zero dynamics do, and why no more is known."""
     matrices = {}
     if findings.constraint_structure is not None:
-        matrices[2] = findings.constraint_structure.elimination.constraint_matrix
+        matrix = findings.constraint_structure.elimination.constraint_matrix
+        matrices[2] = findings.system.rubbing.without_friction(matrix)
     if findings.structure is not None:
         matrices[5] = findings.structure.control_matrix
     lines = [
         _nearest(findings, a.number, matrices[a.number], a.margin)
         for a in findings.assumptions
         if a.margin is not None and a.finding is Finding.SATISFIED and a.number in matrices
+    ]
+    lines += [
+        _friction(findings, where, margin)
+        for where, margin in (
+            ("at the examined states", findings.contact_margin),
+            ("along the reference", findings.contact_margin_along),
+        )
+        if margin is not None
     ]
     why = why_no_law(findings.system)
     if why and findings.constraint_structure is not None:
@@ -220,6 +232,24 @@ def _places(findings: Findings) -> list[Part]:
         if along.verdict != Verdict.UNSTABLE or along is not findings.decisive:
             lines.append(f"Zero dynamics along the reference {along.verdict}: {along.reason}.")
     return [lines] if lines else []
+
+
+def _friction(findings: Findings, where: str, margin: ContactMargin) -> str:
+    """How much of A(x) friction leaves, and how much friction there may be."""
+    critical = ", ".join(f"{name} {value:.4g}" for name, value in margin.critical_friction.items())
+    if not np.all(np.isfinite([*margin.critical_friction.values()])):
+        return f"Friction: {where} no amount of it jams a contact."
+    when = "" if margin.time is None else f"t = {margin.time:.4g} s, "
+    constrained, system = findings.constraint_structure, findings.system
+    used = None
+    if constrained is not None:
+        matrix = ca.vec(constrained.elimination.constraint_matrix)
+        used = ca.which_depends(matrix, system.state, 1, False)
+    place = named_values(system.state_signals, margin.state, used)
+    return (
+        f"Friction: {where} at least {margin.reserve:.3g} of A(x) is left, and a contact would jam "
+        f"at {critical}, nearest at {when}{place}."
+    )
 
 
 def _nearest(findings: Findings, number: int, matrix: ca.SX, margin: Margin) -> str:
@@ -302,6 +332,20 @@ def _margin(margin: Margin | None) -> dict[str, Any] | None:
         "singular_value": float(margin.singular_value),
         "relative": float(margin.relative),
         "state": margin.state.tolist(),
+    }
+
+
+def _contact(margin: ContactMargin | None) -> dict[str, Any] | None:
+    if margin is None:
+        return None
+    return {
+        "reserve": margin.reserve,
+        "critical_friction": {
+            name: value if np.isfinite(value) else None
+            for name, value in margin.critical_friction.items()
+        },
+        "state": margin.state.tolist(),
+        "time": margin.time,
     }
 
 

@@ -30,15 +30,18 @@ class Derivatives:
     Args:
         system: The system (1)-(3).
         constraint: The column c = (L_f^(r_1 - 1) k_1, ..., L_f^(r_m - 1) k_m), shape (m, 1).
+        damping: What c' is to be with the opposite sign, an expression of the state that vanishes
+            on N*, shape (m, 1); c' = 0 if None. Higher derivatives of c are zero nevertheless.
 
     Attributes:
         control: The symbols u, shape (p, 1).
         constraint_gradient: dc/dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        pivot: A scalar that is 0 exactly where A(x) is singular; see `trace.factorization`.
+        pivot: A scalar that is 0 exactly where A(x) is singular, see `trace.factorization`, and not
+            positive where a contact jams, see `dae.contacts`.
     """
 
-    def __init__(self, system: DaeSystem, constraint: ca.SX) -> None:
+    def __init__(self, system: DaeSystem, constraint: ca.SX, damping: ca.SX | None = None) -> None:
         self.system = system
         self.control = ca.SX.sym("u", system.num_controls)
         x = system.state
@@ -77,8 +80,10 @@ class Derivatives:
         self._unknowns, self.constraint_matrix, self.pivot = _solver(
             mass[self._rows, self._rows], g_rows, gradient
         )
+        if system.rubbing:
+            self.pivot = ca.fmin(self.pivot, system.rubbing.reserve(self.constraint_matrix))
         self._equations: list[ca.SX] = []
-        self._solve_order()
+        self._solve_order(damping)
 
     @property
     def rate(self) -> ca.SX:
@@ -219,10 +224,12 @@ class Derivatives:
         self._symbols.append(following)
         self._solve_order()
 
-    def _solve_order(self) -> None:
+    def _solve_order(self, damping: ca.SX | None = None) -> None:
         """Solves for the newest unknowns, which enter the balance and constraint rate linearly."""
-        newest = self._symbols[-1]
-        self._equations.append(ca.vertcat(self._balance, self._constraint_rate))
+        newest, rate = self._symbols[-1], self._constraint_rate
+        if damping is not None:
+            rate = rate + damping
+        self._equations.append(ca.vertcat(self._balance, rate))
         known = ca.substitute(self._equations[-1], newest, ca.SX.zeros(newest.numel()))
         count = len(self._rows)
         solution = self._unknowns(known[:count, :], known[count:, :])

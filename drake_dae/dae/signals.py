@@ -1,7 +1,7 @@
 """Names, units and numbers of the scalars that a system is made of."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -50,6 +50,7 @@ class Parameter:
         value: The default, shape (k,); a float is taken as shape (1,).
         unit: Its SI unit as text, "" for a pure number.
         positive: Whether only positive numbers make sense, as for a mass.
+        nonnegative: Whether negative numbers make no sense, as for a coefficient of friction.
         symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
             not given.
         exogenous: Whether it moves.
@@ -65,6 +66,7 @@ class Parameter:
     positive: bool = False
     symbol: ca.SX = field(default=None)
     exogenous: bool = False
+    nonnegative: bool = False
     derivatives: tuple[ca.SX, ...] = field(init=False, default=(), repr=False)
 
     def __post_init__(self) -> None:
@@ -95,21 +97,35 @@ class Parameter:
             return (Signal(self.name, self.unit),)
         return signals([f"{self.name}[{i}]" for i in range(self.value.size)], self.unit)
 
+    @property
+    def rate(self) -> ca.SX:
+        """The symbols of w', shape (k, 1); zeros without structure where it stands still."""
+        return self.derivatives[0] if self.derivatives else ca.SX(self.value.size, 1)
+
     def check(self, value: FloatArray) -> None:
         """Refuses values that make no sense for the parameter.
 
         Raises:
-            ModelError: A number is not finite, or not positive where it must be.
+            ModelError: A number is not finite, or not positive or negative where it must (not) be.
         """
         if not np.all(np.isfinite(value)):
             raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
         if self.positive and not np.all(value > 0.0):
             raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
+        if self.nonnegative and not np.all(value >= 0.0):
+            raise ModelError(f"parameter '{self.name}' must not be negative, got {value}")
 
 
 def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
     """Signals that share a unit."""
     return tuple(Signal(name, unit) for name in names)
+
+
+def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Parameter, ...]:
+    """The same parameters, of which those with some names move."""
+    return tuple(
+        replace(p, exogenous=True) if p.name in names and not p.exogenous else p for p in parameters
+    )
 
 
 def is_symbol(value: Any) -> bool:

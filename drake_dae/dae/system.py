@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
+from drake_dae.dae.contacts import Contact, Contacts
 from drake_dae.dae.exogenous import Exogenous
 from drake_dae.dae.expressions import as_functions, as_signals, call, check_unique
 from drake_dae.dae.scale import natural_scale
 from drake_dae.dae.sharing import Sharing
-from drake_dae.dae.signals import Parameter, Signal, is_symbol
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, moving
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled, check_choice
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -82,6 +83,8 @@ class DaeSystem:
         compiled: Whether functions of the system that are called often become machine code, where a
             C compiler is found: True, from the first call on; False; or "auto", what the cache has,
             and else what was called so often that compiling it pays. See `trace.compiled`.
+        contacts: Those constraint inputs that can only push, where friction acts on one of them:
+            the motion makes sense only where they are sure to push, see `dae.contacts`.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -111,6 +114,7 @@ class DaeSystem:
     control_metric: ca.SX = None
     free_control: ca.SX = None
     compiled: Compiled = "auto"
+    contacts: tuple[Contact, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -130,6 +134,9 @@ class DaeSystem:
             )
         self._put("parameters", tuple(given))
         check_unique(self.name, "parameter", [p.name for p in self.parameters])
+        for contact in self.contacts:
+            if contact.friction is not None:
+                self.parameter_slice(contact.friction)
         if self.mass_matrix is None:
             self._put("mass_matrix", ca.SX.eye(self.state.numel()))
         functions = {key: getattr(self, key) for key in ("f", "g", "h", "k", "l", "m")}
@@ -326,6 +333,11 @@ class DaeSystem:
         """The parameters that move, w, and how they enter time derivatives."""
         return Exogenous(self.name, self.parameters)
 
+    @cached_property
+    def rubbing(self) -> Contacts:
+        """The contacts that can only push, if friction acts on one of them; see `dae.contacts`."""
+        return Contacts(self.name, self.constraint_input_signals, self.parameters, self.contacts)
+
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """The same system, some of whose parameters move.
@@ -337,8 +349,7 @@ class DaeSystem:
         for name in names:
             if name not in known:
                 raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
-        changed = [replace(p, exogenous=True) if p.name in names else p for p in self.parameters]
-        return replace(self, parameters=tuple(changed))
+        return replace(self, parameters=moving(self.parameters, names))
 
     @cached_property
     def scale(self) -> FloatArray:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked, result_of
-from drake_dae.arrays import FloatArray, brief, numbers
+from drake_dae.arrays import FloatArray, brief, numbers, vector
+from drake_dae.dae.constraint_damping import damped
 from drake_dae.dae.gains import FeedbackGains, GainDesign
+from drake_dae.dae.integral import IntegralAction
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.measured_force import MeasuredForce
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
@@ -40,6 +45,11 @@ class TrackingLaw:
             with state where mu_i = 0; see `ForceSensor`.
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
+        constraint_damping: What the law's own model demands of the constraints that its plant may
+            break, as a contact that gives way does: a design such as `poles(-200.0)`, with r_i - 1
+            poles of phi'; see `dae.constraint_damping`. On N* it changes nothing. None for none.
+        integral: The names of the outputs whose errors are integrated as well, positions or
+            measured forces; see `IntegralAction`. They take a pole more.
 
     Attributes:
         layout: How references and chains are stacked.
@@ -48,6 +58,9 @@ class TrackingLaw:
             tracking_error, with `all_parameters`; without measured force there is no such input.
         measured_force: How the measurement enters; None without one.
         exogenous_degrees: How many derivatives of each entry of w the law needs.
+        integral: What is integrated; then `function` takes "integral" before the parameters, and
+            returns "integral_rate" as well.
+        control_takes_force: Whether the measured force enters the control in the same instant.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
@@ -64,19 +77,25 @@ class TrackingLaw:
         structure: Structure | None = None,
         measured_force: bool = False,
         force_gain: ArrayLike = 0.0,
+        constraint_damping: GainDesign | FeedbackGains | None = None,
+        integral: Sequence[str] = (),
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure)
+        self._model = self.structure
+        if constraint_damping is not None:
+            self._model = damped(self.structure, constraint_damping)
         self.system = system
         self.layout = Layout(self.structure.output_degrees)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
-        self.gains = self.design(gains)
         self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
+        self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
+        self.gains = self.design(gains)
         self._error_coordinates = self._trace_error_coordinates()
         self.function = self._trace()
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""
-        structure, layout, measured = self.structure, self.layout, self.measured_force
+        structure, layout, measured = self._model, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols where K is not zero: the errors of most outputs are not coupled.
         gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
@@ -87,17 +106,25 @@ class TrackingLaw:
         if measured:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
-        ubar = highest - ca.mtimes(gain, chain - reference[layout.chained.tolist(), :])
+        errors = chain - reference[layout.chained.tolist(), :]
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))
         control, pivot = structure.control_for(ubar)
         # By the model; what the control reaches at once is as wanted.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
+        outputs = {"control": control, "tracking_error": output - values}
+        if self.integral.outputs:
+            inputs["integral"] = self.integral.symbol
+            outputs["integral_rate"] = self.integral.rate(chain, values, measured)
+        self.control_takes_force = measured is not None and bool(
+            ca.depends_on(ca.vertcat(control, output), measured.symbol)
+        )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         return TracedFunction(
             f"{self.system.name} tracking law",
             {"state": self.system.state, **inputs, "parameters": numbers},
-            {"control": control, "tracking_error": output - values},
+            outputs,
             pivot,
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
             compiled=self.system.compiled,
@@ -106,9 +133,10 @@ class TrackingLaw:
     def _trace_error_coordinates(self) -> TracedFunction:
         """The error coordinates as a function of state and reference: the initial value of (30)."""
         reference = ca.SX.sym("R", self.layout.reference_size)
-        chain = self.structure.chain - reference[self.layout.chained.tolist(), :]
-        inputs = {"reference": reference}
-        return self.system.trace("error coordinates", {"coordinates": chain}, inputs, often=False)
+        chain = self._model.chain - reference[self.layout.chained.tolist(), :]
+        inputs = {"reference": reference, "integral": self.integral.symbol}
+        outputs = {"coordinates": self.integral.coordinates(chain)}
+        return self.system.trace("error coordinates", outputs, inputs, often=False)
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -122,17 +150,18 @@ class TrackingLaw:
             GainError: The gains are for other outputs or degrees, or are no gains.
         """
         names = tuple(signal.name for signal in self.system.output_signals)
+        degrees = self.integral.all_degrees
         found = gains
         if not isinstance(found, FeedbackGains):
-            found = result_of("gains", found, names, self.degrees, error=GainError)
+            found = result_of("gains", found, names, degrees, error=GainError)
         if not isinstance(found, FeedbackGains):
             raise GainError(
                 f"gains must be a design such as poles(-4.0), got one of {brief(found)}"
             )
-        if (found.names, found.degrees) != (names, self.degrees):
+        if (found.names, found.degrees) != (names, degrees):
             raise GainError(
                 f"the gains are for the outputs {', '.join(found.names)} with degrees "
-                f"{found.degrees}, the system has {', '.join(names)} with {self.degrees}"
+                f"{found.degrees}, the system has {', '.join(names)} with {degrees}"
             )
         return found
 
@@ -155,7 +184,7 @@ class TrackingLaw:
         has = self.gains.matrix != 0.0
         if np.any(chosen.matrix[~has]):
             i, j = np.argwhere((chosen.matrix != 0.0) & ~has)[0]
-            signals = self.layout.chain_signals(self.system.output_signals)
+            signals = self._coordinate_signals
             raise GainError(
                 f"the law has no gain from the error of {signals[j].name} to "
                 f"{self.system.output_signals[i].name}; make a new law with such a gain"
@@ -163,12 +192,25 @@ class TrackingLaw:
         values = self.system.parameter_vector(parameters)
         return np.concatenate([values, chosen.matrix.T[has.T]])
 
+    @property
+    def _coordinate_signals(self) -> list[Signal]:
+        """Names and units of the error coordinates."""
+        integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
+        found = []
+        for i, (signal, degree) in enumerate(
+            zip(self.system.output_signals, self.degrees, strict=True)
+        ):
+            found += [integrals[i]] if i in integrals else []
+            found += [signal.derivative(order) for order in range(degree)]
+        return found
+
     def control(
         self,
         state: ArrayLike,
         reference: ArrayLike,
         *,
         measured_force: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
         """The control u(x, R) of (28).
@@ -177,23 +219,35 @@ class TrackingLaw:
             state: x, shape (n,).
             reference: R, shape (sum (mu_i + 1),), output-major.
             measured_force: v, shape (m,); exactly where the law takes it.
+            integral: The integrals of the errors, shape (k,); zero if None.
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
             u, shape (p,).
         """
         measured = [] if measured_force is None else [measured_force]
+        if self.integral.outputs:
+            measured.append(self._integrals(integral))
         return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
 
+    def _integrals(self, given: ArrayLike | None) -> FloatArray:
+        size = len(self.integral.outputs)
+        return vector("integral", np.zeros(size) if given is None else given, size, GainError)
+
     def error_coordinates(
-        self, state: ArrayLike, reference: ArrayLike, parameters: ArrayLike | None = None
+        self,
+        state: ArrayLike,
+        reference: ArrayLike,
+        parameters: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
     ) -> FloatArray:
         """(e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
 
-        The arguments are those of `control`.
+        The integral of an error stands before it, where the law has one. The arguments are those of
+        `control`.
         """
-        values = self.system.parameter_vector(parameters)
-        return self._error_coordinates(state, reference, values)[0]
+        values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
+        return self._error_coordinates(state, reference, sigma, values)[0]
 
     def predicted_error(
         self,
@@ -201,6 +255,7 @@ class TrackingLaw:
         state: ArrayLike,
         reference: ArrayLike,
         parameters: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
     ) -> FloatArray:
         """The error that theory predicts after a start from a state, shape (k, p).
 
@@ -209,9 +264,14 @@ class TrackingLaw:
             state: The state at the start, shape (n,).
             reference: R at the start.
             parameters: Values of all parameters; the defaults if None.
+            integral: The integrals of the errors at the start, shape (k,); zero if None.
         """
-        start = self.error_coordinates(state, reference, parameters)
-        return self.gains.error_response(times, start)
+        start = self.error_coordinates(state, reference, parameters, integral)
+        errors = self.gains.error_response(times, start)
+        if self.integral.outputs:  # There the first coordinate is the integral of the error.
+            rates = self.gains.error_response(times, self.gains.error_matrix @ start)
+            errors[:, self.integral.outputs] = rates[:, self.integral.outputs]
+        return errors
 
 
 def _measured_force(

@@ -67,7 +67,7 @@ class ConstraintLoads:
         self.with_moment = [a.moment_axes.nnz() > 0 for _, _, a in acting]
         columns = {
             "points": [a.point for _, _, a in acting],
-            "forces": [ca.mtimes(a.force_axes, force[part]) for _, part, a in acting],
+            "forces": [a.force(force[part]) for _, part, a in acting],
             "moments": [ca.mtimes(a.moment_axes, force[part]) for _, part, a in acting],
         }
         self._function = TracedFunction(

@@ -21,7 +21,7 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.systems.autodiff import AutoDiffSystem
 from drake_dae.systems.failures import simulation_error
 from drake_dae.systems.formulas import Formula
@@ -158,9 +158,15 @@ class ParameterizedSystem(DifferentiableSystem):
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
-        failure, time = function.failure(), context.get_time()
-        self._steps.tolerate(context, simulation_error(failure, time, state, self._signals))
+        error = simulation_error(function.failure(), context.get_time(), state, self._signals)
+        self._steps.tolerate(context, self._explained(error, parameters, *inputs))
         return function.nowhere()
+
+    def _explained(
+        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    ) -> SimulationError:
+        """The error, or a better one for what a function of such inputs has no value."""
+        return error
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""

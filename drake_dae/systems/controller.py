@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import BasicVector, Context, ContinuousState, DependencyTicket
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.stability import Verdict
@@ -16,6 +16,8 @@ from drake_dae.errors import ModelError, NonMinimumPhaseWarning
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import state_tickets
+from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
@@ -33,13 +35,24 @@ class TrackingController(ParameterizedSystem):
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, one entry per output.
 
-    Both output ports have direct feedthrough from all input ports. The context holds the model's
+        integral: The integrals of errors, shape (k,), if the law has any; its state. They start at
+            zero, or where `set_integral` puts them. Where an entry of `hold` is not 0, or an
+            integral has come to its limit and its error would carry it on, it stays (anti-windup).
+
+    A law with integrals also has an input port `hold`, shape (k,): where it is not 0 that error is
+    not integrated, as while a drive is at its limit or a contact is lost. Without a wire it is 0.
+
+    The first two output ports have direct feedthrough from all input ports, but for `hold`, and for
+    `measured_force` where the law does but integrate it. The context holds the model's
     parameters and then the gains as one numeric parameter; see `set_parameter` and `set_gains`.
     The block converts to AutoDiffXd.
 
     Args:
         law: The law.
         outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
+        integral_limits: The largest |integral| of each error in its unit times s, a number or shape
+            (k,), positive. Converted to AutoDiffXd it has neither limits nor holds, and a force
+            that it integrates has direct feedthrough, so that it must come from a sensor.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
@@ -51,7 +64,12 @@ class TrackingController(ParameterizedSystem):
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(self, law: TrackingLaw, outputs: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        law: TrackingLaw,
+        outputs: ArrayLike | None = None,
+        integral_limits: ArrayLike = np.inf,
+    ) -> None:
         dae = law.system
         signals = {
             "state": dae.state_signals,
@@ -68,12 +86,66 @@ class TrackingController(ParameterizedSystem):
         self._evaluators = [self.DeclareVectorInputPort(*item).Eval for item in sizes.items()]
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+        if law.integral.outputs:
+            sources = self._add_integrals(integral_limits)
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
         self.DeclareVectorOutputPort(
             "tracking_error", dae.num_outputs, weakly(self._calc_tracking_error), sources
         )
+
+    def _add_integrals(self, limits: ArrayLike) -> set[DependencyTicket]:
+        """Declares the integrals, and returns what the control depends on."""
+        count = len(self.law.integral.outputs)
+        given = np.asarray(limits, dtype=float)
+        if given.shape not in ((), (count,)) or not np.all(given > 0.0):
+            raise ModelError(
+                f"integral_limits must be a positive number or shape ({count},), got {limits!r}"
+            )
+        self._limits = np.broadcast_to(given, (count,))
+        self._hold = self.DeclareVectorInputPort("hold", count)
+        self.DeclareContinuousState(count)
+        self._evaluators.append(_integrals_of)
+        self._rate_evaluators = list(self._evaluators)
+        if self.law.measured_force and not self.law.control_takes_force:
+            # Whatever it is: reading it would close an algebraic loop.
+            nothing = np.zeros(self.dae.num_constraints)
+            self._evaluators[2] = lambda context: nothing
+        self.DeclareVectorOutputPort(
+            "integral", count, weakly(self._copy_integrals), state_tickets(self)
+        )
+        read = ["estimated_state", "reference", "exogenous"]
+        read += ["measured_force"] if self.law.control_takes_force else []
+        ports = [self.GetInputPort(name) for name in read if self.HasInputPort(name)]
+        tickets = {self.input_port_ticket(port.get_index()) for port in ports}
+        return tickets | {self.all_parameters_ticket()} | state_tickets(self)
+
+    def set_integral(self, context: Context, integral: ArrayLike) -> None:
+        """Starts the integrals of the errors at values, shape (k,).
+
+        Raises:
+            ModelError: The shape is wrong, or the law has no integrals.
+        """
+        self.check_context(context)
+        size = len(self.law.integral.outputs)
+        if not size:
+            raise ModelError(f"{self.get_name()}: its law integrates nothing")
+        context.SetContinuousState(vector("integral", integral, size))
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        if not self.law.integral.outputs:
+            return
+        inputs = [evaluate(context) for evaluate in self._rate_evaluators]
+        rate = self._checked(self.law.function, context, *inputs)[2].copy()
+        sigma = _integrals_of(context)
+        rate[(np.abs(sigma) >= self._limits) & (rate * sigma > 0.0)] = 0.0
+        if self._hold.HasValue(context):
+            rate[self._hold.Eval(context) != 0.0] = 0.0
+        derivatives.get_mutable_vector().SetFromVector(rate)
+
+    def _copy_integrals(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(_integrals_of(context))
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
         """Changes the gains in a context.
@@ -106,11 +178,24 @@ class TrackingController(ParameterizedSystem):
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function
-        sources = ["estimated_state", *function.input_names[1:]]
-        return {
+        named = {"state": "estimated_state", "integral": "state"}
+        sources = [named.get(name, name) for name in function.input_names]
+        formulas: dict[str, Formula] = {
             name: TracedFormula(function, name, sources, self._signals)
             for name in ("control", "tracking_error")
         }
+        if self.law.integral.outputs:
+            formulas["derivative"] = TracedFormula(
+                function, "integral_rate", sources, self._signals
+            )
+            sigma = self.law.integral.symbol
+            own = TracedFunction("integral", {"state": sigma}, {"value": sigma})
+            formulas["integral"] = TracedFormula(own)
+        return formulas
+
+
+def _integrals_of(context: Context) -> FloatArray:
+    return context.get_continuous_state_vector().CopyToVector()
 
 
 def _warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:

@@ -13,15 +13,22 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.contacts import jam
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.redundancy import manifold_of_left_out
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.errors import (
+    InconsistentStateError,
+    JammedContactError,
+    ModelError,
+    SimulationError,
+    SingularityError,
+)
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 
 
 @checked(ModelError)
@@ -72,7 +79,8 @@ class DaePlant(ParameterizedSystem):
         AssumptionError: The system violates one of Assumptions (1)-(3).
         ModelError: This is no system, or the structure is that of another one.
         InconsistentStateError: A simulation starts from a state that is off N*.
-        SingularityError: A(x) is singular on the way; the exception has time and state.
+        SingularityError: A(x) is singular on the way; the exception has time and state. Where
+            friction jams a contact it is a JammedContactError, which tells what becomes of it.
         NonFiniteError: A value is not finite on the way, likewise.
         SimulationError: The state cannot be projected onto N* on the way, likewise.
     """
@@ -174,6 +182,47 @@ class DaePlant(ParameterizedSystem):
         if needs_control:
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
+
+    def _explained(
+        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    ) -> SimulationError:
+        """Where friction jams a contact, that, and whether any motion fits."""
+        rubbing = self.dae.rubbing
+        if not (rubbing and isinstance(error, SingularityError)):
+            return error
+        elimination = self.structure.elimination
+        matrix = elimination.constraint_matrix
+        outputs = {
+            "A": ca.densify(matrix),
+            "A_0": ca.densify(rubbing.without_friction(matrix)),
+            "gradient": elimination.constraint_gradient,
+            "reserve": rubbing.reserve(matrix),
+        }
+        values = self.dae.trace("A(x)", outputs, often=False)(error.state, parameters)
+        m, reserve = self.dae.num_constraints, values[3].item()
+        if not reserve < SINGULAR_PIVOT:
+            return error
+        A, A_0, gradient = (value.reshape(m, -1) for value in values[:3])
+        fields = dict(
+            zip(self.dae.fields.output_names, self.dae.fields(error.state, parameters), strict=True)
+        )
+        free = np.abs(fields["f"])
+        if self._is_controlled:
+            free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(inputs[0])
+        control = inputs if self._force_needs_control else ()
+        force = self._force(error.state, *control, parameters)[0]
+        found = jam(A, A_0, force, np.abs(gradient) @ free, rubbing.rows)
+        names = ", ".join(f"'{self.dae.constraint_input_signals[i].name}'" for i in rubbing.rows)
+        outcome = f". What becomes of it is {found.value}" if found else ""
+        return JammedContactError(
+            f"{self.dae.name}: friction jams the contact of {names} at t = {error.time:.6g} s, "
+            f"state {show(error.state)} (Painleve): a principal minor of A(x) has come to "
+            f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
+            "other way, or hold the robot less steeply to the surface",
+            error.time,
+            error.state,
+            found,
+        )
 
     def _formulas(self) -> dict[str, Formula]:
         dae, residual = self.dae, self.structure.manifold.residual_expression

@@ -112,7 +112,7 @@ class StepWatch:
             progress.reason, progress.reason_time = str(error), error.time
         if step > SHORTEST * abs(error.time) and progress.failures < FAILURES:
             return
-        raise type(error)(
+        raise error.retold(
             f"{self._system.get_name()}: no step leads on from t = {progress.time:.6g} s"
             f"{_at(progress.state)} since each that was tried failed, however short: "
             f"{progress.reason}",

@@ -77,7 +77,13 @@ def ball_at(place, _):
 
 def rubbing_at(place, _):
     surface = Plane(tuple(place @ POINT), (1.0, 2.0, -2.0))
-    return RubbingPoint("tip", surface, POINT, "rubbing", friction=0.4)
+    return RubbingPoint("tip", surface, POINT, "rubbing", coefficient=0.4)
+
+
+def rough_at(place, _):
+    surface = Plane(tuple(place @ POINT), (1.0, 2.0, -2.0))
+    friction = {"friction": 0.4, "stiction_tolerance": 0.05, "viscous_friction": 20.0}
+    return PointOnSurface("tip", surface, POINT, "rough", (0.0, 0.0, 0.0), **friction)
 
 
 def saddle_at(place, _):
@@ -209,6 +215,7 @@ MEMBERS = {
     "planar prismatic": (sliding_in_a_plane_at, {"tip", "base"}),
     "rod": (rod_at, {"tip", "base"}),
     "rubbing": (rubbing_at, {"tip", "world"}),
+    "rough": (rough_at, {"tip", "world"}),
     "blade": (blade_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
     "second wheel": (second_wheel_at, {"tip", "world"}),
@@ -257,6 +264,7 @@ def case(name, seed):
             "rate": kinematics.value(rate),
             "jacobian": ca.jacobian(kinematics.value(rate), links.v),
             "tau": links.generalized_force(kinematics, reaction),
+            "drag": ConstraintSet([constraint]).drag(links),
             "wrenches": wrenches,
         },
     )
@@ -311,6 +319,21 @@ def test_reaction_is_linear_and_does_the_work_of_the_rate(given):
         assert work == pytest.approx(ideal, abs=1e-9)
     else:
         assert work < ideal - 0.1
+    assert found["drag"] @ v <= 0.0
+    assert np.any(found["drag"]) == (constraint.name == "rough")
+
+
+def test_friction_grows_with_the_parameter_that_it_names(given):
+    """Rule 12."""
+    _, constraint, *_ = given
+    coefficients = {p.name: p.symbol for p in constraint.parameters}
+    force = ca.SX.sym("force", len(constraint.force_signals))
+    kinematics = robot().kinematics()
+    tau = robot().generalized_force(kinematics, constraint.reaction(kinematics, force))
+    name = constraint.friction_parameter
+    assert (name == "rough.friction") == (constraint.name == "rough")
+    if name is not None:
+        assert ca.depends_on(tau, coefficients[name])
 
 
 def test_wrenches_act_on_the_frames_that_it_connects(given):
@@ -333,7 +356,7 @@ def test_reaction_is_what_its_wrenches_do(given):
         frame.body().AddInForce(context, lever, acting, plant.world_frame(), forces)
         total += np.concatenate([wrench[:3] + np.cross(place, wrench[3:]), wrench[3:]])
     expected = plant.CalcGeneralizedForces(context, forces)
-    np.testing.assert_allclose(found["tau"], expected, **CLOSE)
+    np.testing.assert_allclose(found["tau"] + found["drag"], expected, **CLOSE)
     np.testing.assert_allclose(total, 0.0, atol=1e-10)
 
 
@@ -426,4 +449,4 @@ def test_a_push_drives_the_residual_up():
         )(links.plant.GetPositions(context), v, values)
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
-    assert found == {"plane", "ball", "saddle", "rubbing", "rolling"}
+    assert found == {"plane", "ball", "saddle", "rubbing", "rough", "rolling"}

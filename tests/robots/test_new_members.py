@@ -121,7 +121,7 @@ def test_an_arm_on_a_rod_tracks_motion_and_thrust():
 
 def rubbing(friction=0.3, speed=0.05):
     wall = Plane((1.2, 0.0, 0.0), (-1.0, 0.0, 0.0))
-    contact = RubbingPoint("tool", wall, name="wall", friction=friction, speed=speed)
+    contact = RubbingPoint("tool", wall, name="wall", coefficient=friction, speed=speed)
     outputs = [PointCoordinates("tool", "z")]
     return RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
 
@@ -129,7 +129,7 @@ def rubbing(friction=0.3, speed=0.05):
 def test_a_block_that_slides_is_braked_by_its_weight():
     """g(x) = (0, 0, -mu s, 1) / m with s = 0.3 / 0.5, and x'' = g (sin a - mu s cos a)."""
     slope, mass = 0.5, 2.0
-    floor = RubbingPoint("bob", Plane((0, 0, 0), (0, 0, 1)), friction=0.25, speed=0.4)
+    floor = RubbingPoint("bob", Plane((0, 0, 0), (0, 0, 1)), coefficient=0.25, speed=0.4)
     model = RobotModel(particle(mass, slope), [floor], [JointPositions(["q0"])], [0.0, 0.0])
     x = np.array([0.7, 0.0, 0.3, 0.0])
     explicit = model.dae.explicit

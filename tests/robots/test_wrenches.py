@@ -82,7 +82,7 @@ def wall():
 
 
 def rubbing_arm():
-    contact = RubbingPoint("tool", wall().surface, name="wall", friction=0.3, speed=0.05)
+    contact = RubbingPoint("tool", wall().surface, name="wall", coefficient=0.3, speed=0.05)
     plant = parse("two_link_arm")
     outputs = [PointCoordinates("tool", "z")]
     return RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])

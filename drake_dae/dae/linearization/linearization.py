@@ -82,6 +82,11 @@ def linearize_loop(
         ModelError: A shape is wrong, a number is not finite, or A(x) or B(x) is singular at the
             state; or the force that the law measures is not determined.
     """
+    if law.integral.outputs:
+        raise ModelError(
+            f"{law.system.name}: a law with integral action has a state of its own; convert the "
+            "closed loop's diagram to AutoDiffXd for Drake's Linearize instead"
+        )
     system, own = law.system, law.all_parameters()
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
     plant = _Plant(law.structure, state, system.parameter_vector(parameters))

@@ -61,7 +61,7 @@ def find_margin(
         crossings = (_crossing(samples, scaled, there) for there in samples.states[1:])
         candidates += [state for state in crossings if state is not None]
     if search:
-        box = ConsistentRegion(samples.manifold, _surroundings(samples))
+        box = ConsistentRegion(samples.manifold, surroundings(samples))
         starts = sorted(candidates, key=scaled.distance)[:3]
         candidates += [box.descend(scaled.slope, start) for start in starts]
     state = min(candidates, key=scaled.distance)
@@ -80,7 +80,7 @@ def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = Non
     return all(scaled.distance(state) >= SINGULAR for state in samples.states)
 
 
-def _surroundings(samples: Samples) -> Region:
+def surroundings(samples: Samples) -> Region:
     """The box that the states span, within the region that they were drawn from."""
     low, high = samples.states.min(axis=0), samples.states.max(axis=0)
     given = samples.consistent.region

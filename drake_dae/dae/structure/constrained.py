@@ -39,7 +39,8 @@ class ConstraintStructure:
         states: The consistent states at which numbers were decided, shape (samples, n).
         scale: How large each state is over them and the states near which they were sought, shape
             (n,).
-        constraint_margin: The margin of A(x), Assumption (2); None without constraints.
+        constraint_margin: The margin of A(x), Assumption (2), without friction; None without
+            constraints.
     """
 
     system: DaeSystem
@@ -59,6 +60,20 @@ class ConstraintStructure:
     def index(self) -> int:
         """max r_i + 1, the index of the DAE; 0 without constraints."""
         return max(self.constraint_degrees) + 1 if self.constraint_degrees else 0
+
+    def constraint_matrix(
+        self, state: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """A(x) at a state, shape (m, m): of a contact without friction its mobility in 1/kg.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+        """
+        matrix = self.elimination.constraint_matrix
+        function = self.system.trace("A(x)", {"value": matrix}, often=False)
+        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
+        return function(x, p)[0].reshape(matrix.shape)
 
     def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
         """An expression on N* as a function of state, control and parameters.
@@ -186,6 +201,8 @@ def examine_constraints(
     _check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
+    # Where friction turns it around the contact jams, which is decided at the states of a motion.
+    matrix = system.rubbing.without_friction(elimination.constraint_matrix)
     found = ConstraintStructure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),
@@ -194,7 +211,7 @@ def examine_constraints(
         elimination=elimination,
         states=samples.states,
         scale=samples.scale,
-        constraint_margin=(find_margin(samples, elimination.constraint_matrix) if chains else None),
+        constraint_margin=find_margin(samples, matrix) if chains else None,
     )
     return found, samples
 

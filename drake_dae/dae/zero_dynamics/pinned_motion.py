@@ -53,6 +53,7 @@ class PinnedMotion:
         states: x at these times, shape (k, n).
         controls: u at these times, shape (k, p).
         constraint_inputs: v at these times, shape (k, m).
+        parameters: The values of all parameters at these times, shape (k, P).
         constraint_margins: The smallest singular value of A(x), shape (k,); infinite if m = 0.
         control_margins: The smallest singular value of B(x), shape (k,).
         ending: Why the last time was not reached; None if it was.
@@ -62,6 +63,7 @@ class PinnedMotion:
     states: FloatArray
     controls: FloatArray
     constraint_inputs: FloatArray
+    parameters: FloatArray
     constraint_margins: FloatArray
     control_margins: FloatArray
     ending: Ending | None

@@ -70,6 +70,7 @@ def follow(
     def column(values: list[FloatArray], width: int) -> FloatArray:
         return np.array(values).reshape(count, width)
 
+    parameter_count = system.parameter_symbol.numel()
     margins = column([np.array(point.margins) for point in points], 2)
     return PinnedMotion(
         times=times[:count],
@@ -78,6 +79,7 @@ def follow(
         constraint_inputs=column(
             [point.constraint_input for point in points], system.num_constraints
         ),
+        parameters=column([parameters(time) for time in times[:count]], parameter_count),
         constraint_margins=margins[:, 0],
         control_margins=margins[:, 1],
         ending=ending,

@@ -1,9 +1,10 @@
 """What a constraint says of itself.                                             (38)"""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Container
+from copy import copy
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -11,7 +12,7 @@ from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.dae.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
@@ -24,12 +25,15 @@ class Application:
     All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
     opposite on A at the same point.
 
+    With `drag`, F has that force besides.
+
     Attributes:
         point: Where F acts, in m, shape (3, 1).
         force_axes: The force in N for a unit of each constraint force, shape (3, m).
         moment_axes: The moment in N m for a unit of each constraint force, shape (3, m).
         frame_b: Name of frame B, which feels F and M.
         frame_a: Name of frame A, which feels the opposite.
+        drag: The part of F in N that acts without constraint forces, shape (3, 1); None if none.
     """
 
     point: ca.SX
@@ -37,6 +41,12 @@ class Application:
     moment_axes: ca.SX
     frame_b: str
     frame_a: str = "world"
+    drag: ca.SX | None = None
+
+    def force(self, constraint_force: ca.SX) -> ca.SX:
+        """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
+        force = ca.mtimes(self.force_axes, constraint_force)
+        return force if self.drag is None else force + self.drag
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,20 +95,33 @@ class Constraint(ABC):
     9. Where the constraint holds and stands still, the power of its wrenches on both frames
        together is zero; it may be negative where `is_ideal` is false, as with friction.
     10. Its parameters may move (see `RobotModel`) if k = m; `rate` is then that part of the
-        derivative which velocities make.
+        derivative which velocities make. What needs to know how fast they move, as friction does,
+        takes `Parameter.rate`.
     11. `joint` tells what it has along its one coordinate, if it is a joint that closes a loop;
         `coordinate_rate` is linear in velocities, and the derivative of `coordinates` where the
         constraint holds. A force along the coordinate has the power of force times rate.
+    12. `drag` is what it does without constraint forces, as viscous friction; `applications` hold
+        it too.
+    13. Where what lambda does besides grows with one of its parameters, a coefficient of friction,
+        `friction_parameter` names that.
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
         parameters: Its numbers that change without tracing again.
-        is_ideal: Whether its forces take no power.
     """
 
     name: str
     parameters: tuple[Parameter, ...] = ()
-    is_ideal: ClassVar[bool] = True
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether its forces take no power."""
+        return True
+
+    @property
+    def friction_parameter(self) -> str | None:
+        """The name of its coefficient of friction among its parameters; None without one."""
+        return None
 
     @property
     @abstractmethod
@@ -121,6 +144,18 @@ class Constraint(ABC):
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
         """The forces that the constraint forces, shape (m, 1), make on the robot."""
         return kinematics.reaction(ca.dot(constraint_force, self.rate(kinematics)))
+
+    def drag(self, kinematics: Kinematics) -> Reaction | None:
+        """The forces that it makes without constraint forces; None if there are none."""
+        return None
+
+    def moving(self, names: Container[str]) -> Self:
+        """The same constraint, of whose parameters those with some names move."""
+        if not any(parameter.name in names for parameter in self.parameters):
+            return self
+        found = copy(self)  # Its class may be frozen.
+        object.__setattr__(found, "parameters", moving(self.parameters, names))
+        return found
 
     @property
     def can_only_push(self) -> tuple[bool, ...]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arrays import unknown_name
+from drake_dae.dae.contacts import Contact
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Constraint, Joint
@@ -118,7 +119,7 @@ class ConstraintSet:
                 f"it acts on {frames or 'no frame that is known'}"
             )
         sign = 1.0 if frame == found[0].frame_b else -1.0
-        return found[0].point, sign * ca.mtimes(found[0].force_axes, constraint_force[part])
+        return found[0].point, sign * found[0].force(constraint_force[part])
 
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX
@@ -141,10 +142,8 @@ class ConstraintSet:
         for constraint, part in self.parts():
             own: dict[str, ca.SX] = {}
             for application in constraint.applications(kinematics):
-                force, moment = (
-                    ca.mtimes(axes, constraint_force[part])
-                    for axes in (application.force_axes, application.moment_axes)
-                )
+                force = application.force(constraint_force[part])
+                moment = ca.mtimes(application.moment_axes, constraint_force[part])
                 for frame, sign in ((application.frame_b, 1.0), (application.frame_a, -1.0)):
                     lever = application.point - kinematics.position(frame)
                     wrench = ca.vertcat(moment + ca.cross(lever, force), force)
@@ -187,6 +186,28 @@ class ConstraintSet:
             total += kinematics.reaction(unit[i] * constraint.coordinate_rate(kinematics))
         columns = total.map(lambda part: ca.jacobian(part, unit))
         return links.generalized_force(kinematics, columns)
+
+    def drag(self, links: Links) -> ca.SX:
+        """What constraints do without constraint forces, a generalized force, shape (nv, 1)."""
+        total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
+        for constraint in self.constraints:
+            reaction = constraint.drag(kinematics)
+            if reaction is not None:
+                total += links.generalized_force(kinematics, reaction)
+        return total
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """The constraint forces that can only push, if friction acts on one of them."""
+        found = [
+            Contact(signal.name, constraint.friction_parameter)
+            for constraint in self.constraints
+            for signal, pushes in zip(
+                constraint.force_signals, constraint.can_only_push, strict=True
+            )
+            if pushes
+        ]
+        return tuple(found) if any(contact.friction for contact in found) else ()
 
     def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
         """M v' + H - G lambda, shape (nv, 1), and phi'' (38), shape (m, 1), by inverse dynamics.

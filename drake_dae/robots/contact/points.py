@@ -12,9 +12,10 @@ from drake_dae.arrays import FloatArray, check_axes
 from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint
+from drake_dae.robots.contact.friction import Friction, friction_parameters
 from drake_dae.robots.contact.picture import Picture
 from drake_dae.robots.contact.surface import Surface, Vector, rotation_of
-from drake_dae.robots.links.kinematics import Frames, Kinematics
+from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
 @checked(ModelError)
@@ -27,6 +28,24 @@ class PointOnSurface(Constraint):
     is where the surface stands, and "<name>.rpy" how it is turned about that place; where they are
     exogenous (see `RobotModel`), the surface moves.
 
+    With friction the surface also pulls the point back as it slides, by the velocity v_t in m/s
+    relative to the surface, which may move:
+
+        F_t = -(mu lambda s + d v_t),    s = v_t / sqrt(|v_t|^2 + v_s^2),
+
+    Coulomb's friction, made smooth by the speed v_s, and viscous friction. So at rest it does not
+    hold: below v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance"
+    and "<name>.viscous_friction" are mu, v_s and d; plant and law may have them different, where
+    both have them: 0 is a smooth surface that has. Where the friction that lambda makes turns phi''
+    around, the contact jams (Painleve): see `dae.contacts`.
+
+    Behind springs, motors and valves a law differentiates s, whose slopes are 1 / v_s. With error
+    control it follows the prediction for v_s of 0.001 m/s with all of them; but where the sliding
+    turns around it then asks for 3 to 18 times the control behind springs and valves, which a v_s
+    of 0.01 m/s does without (0.03 m/s behind valves). Fixed steps of 5 ms behind springs take 0.03
+    m/s; at 0.01 m/s they leave 0.01 to 0.4 N, and at 0.003 m/s they fail. With rigid joints v_s
+    does not matter to the law.
+
     Attributes:
         frame: Name of the frame.
         surface: A surface in the world.
@@ -35,6 +54,12 @@ class PointOnSurface(Constraint):
         rpy: Roll, pitch and yaw by which the surface is turned, rad, shape (3,): about the fixed
             axes x, y, z in this order, as in Drake. None for a surface that nobody turns, which
             has no such parameter.
+        friction: mu, not negative; None for a smooth surface, which has no such parameters.
+        stiction_tolerance: v_s in m/s, the name of it in Drake; only with friction.
+        viscous_friction: d in N s/m, not negative; None for none, without a parameter.
+
+    Raises:
+        ModelError: A coefficient is negative, or the speed not positive.
     """
 
     frame: str
@@ -42,6 +67,9 @@ class PointOnSurface(Constraint):
     point: Vector = (0.0, 0.0, 0.0)
     name: str = "surface"
     rpy: Vector | None = None
+    friction: float | None = None
+    stiction_tolerance: float = 1e-3
+    viscous_friction: float | None = None
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
     can_only_push: ClassVar[tuple[bool, ...]] = (True,)
 
@@ -50,7 +78,10 @@ class PointOnSurface(Constraint):
         turns = []
         if self.rpy is not None:
             turns.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
-        object.__setattr__(self, "parameters", (position, *turns))
+        rubbing = friction_parameters(
+            self.name, self.friction, self.stiction_tolerance, self.viscous_friction
+        )
+        object.__setattr__(self, "parameters", (position, *turns, *rubbing))
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -74,22 +105,61 @@ class PointOnSurface(Constraint):
         """How the surface is turned, shape (3, 3)."""
         return rotation_of(self.parameters[1].symbol)
 
+    def _normal(self, frames: Frames) -> ca.SX:
+        """The gradient of phi in the world, shape (3, 1)."""
+        normal = self.surface.unit_normal(self.offset(frames))
+        return normal if self.rpy is None else ca.mtimes(self._rotation(), normal)
+
+    def _friction(self, kinematics: Kinematics) -> Friction | None:
+        """How the point rubs; None where it does not."""
+        if self.is_ideal:
+            return None
+        surface = self.parameters[0].rate
+        if self.rpy is not None:
+            turn = self.parameters[1]
+            offset = ca.SX.sym("offset", 3)
+            turning = ca.jtimes(ca.mtimes(self._rotation(), offset), turn.symbol, turn.rate)
+            surface = surface + ca.substitute(turning, offset, self.offset(kinematics))
+        velocity = kinematics.velocity(self.frame, self.point) - surface
+        return Friction.of(self.name, self.parameters, velocity, self._normal(kinematics))
+
+    @property
+    def is_ideal(self) -> bool:
+        return self.friction is None and self.viscous_friction is None
+
+    @property
+    def friction_parameter(self) -> str | None:
+        return None if self.friction is None else f"{self.name}.friction"
+
     def residual(self, frames: Frames) -> ca.SX:
         return self.surface.distance(self.offset(frames))
+
+    def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
+        pushed = super().reaction(kinematics, constraint_force)
+        rubbing = self._friction(kinematics)
+        if rubbing is None or self.friction is None:
+            return pushed
+        return pushed + kinematics.push(self.frame, rubbing.pull * constraint_force, self.point)
+
+    def drag(self, kinematics: Kinematics) -> Reaction | None:
+        rubbing = self._friction(kinematics)
+        if rubbing is None or rubbing.drag is None:
+            return None
+        return kinematics.push(self.frame, rubbing.drag, self.point)
 
     def coordinates(self, frames: Frames) -> ca.SX:
         return self.surface.coordinates(self.offset(frames))
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        normal = self.surface.unit_normal(self.offset(kinematics))
-        if self.rpy is not None:
-            normal = ca.mtimes(self._rotation(), normal)
+        push, drag, rubbing = self._normal(kinematics), None, self._friction(kinematics)
+        if rubbing is not None:
+            push, drag = push + rubbing.pull, rubbing.drag
         point = kinematics.position(self.frame, self.point)
-        return (Application(point, normal, ca.SX(3, 1), self.frame),)
+        return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
 
     def placement(self, values: FloatArray) -> RigidTransform:
-        rotation = RollPitchYaw(values[3:]) if values.size > 3 else RollPitchYaw(np.zeros(3))
-        return RigidTransform(rotation, values[:3])
+        turn = np.zeros(3) if self.rpy is None else values[3:6]
+        return RigidTransform(RollPitchYaw(turn), values[:3])
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
         stands = self.placement(values)

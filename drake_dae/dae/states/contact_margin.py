@@ -1,0 +1,142 @@
+"""How far contacts are from jamming by friction: Painleve's critical coefficient."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.contacts import critical_factor
+from drake_dae.dae.states.margins import surroundings
+from drake_dae.dae.states.region import ConsistentRegion
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.system import DaeSystem
+
+MEANINGLESS = 1e6
+"""No coefficient of friction is so large: what slides but by round-off has such a critical one."""
+
+CLOSER = (0.9, 0.99)
+"""The parts of the friction found critical so far for which a state that jams is sought."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMargin:
+    """How far contacts are from jamming by friction, over some states.
+
+    Attributes:
+        reserve: The smallest principal minor of A(x) over the contacts, each divided by what it is
+            without friction: 1 without friction, 1 - mu / mu_crit for a single contact; where it is
+            not positive a contact jams.
+        critical_friction: Name of a coefficient of friction -> where it jams first, if all grow in
+            proportion; infinite where none does. Of coefficients that are all zero, equal ones.
+        state: Where that is smallest, shape (n,).
+        time: When that is, in s; None where states are not those of a motion.
+    """
+
+    reserve: float
+    critical_friction: dict[str, float]
+    state: FloatArray
+    time: float | None = None
+
+    @property
+    def jams(self) -> bool:
+        """Whether a contact jams with the friction that it has."""
+        return not self.reserve > 0.0
+
+
+class ContactMargins:
+    """The margins of a system whose contacts rub, at states that one gives.
+
+    Args:
+        system: The system.
+        matrix: A(x), shape (m, m).
+    """
+
+    def __init__(self, system: DaeSystem, matrix: ca.SX) -> None:
+        self._system, self._rubbing = system, system.rubbing
+        self._places = [
+            system.parameter_slice(p.name).start for p in self._rubbing.frictions if p is not None
+        ]
+        self._names = [p.name for p in self._rubbing.frictions if p is not None]
+        reserve = self._rubbing.reserve(matrix)
+        outputs = {"matrix": ca.densify(matrix), "reserve": reserve}
+        self._values = system.trace("contact margin", outputs, often=False)
+        slope = {"reserve": reserve, "gradient": ca.gradient(reserve, system.state)}
+        self._slope = system.trace("slope of a contact margin", slope, often=False)
+
+    def at(
+        self, state: FloatArray, parameters: FloatArray, time: float | None = None
+    ) -> ContactMargin:
+        """The margin at one state, with values of all parameters."""
+        without = self._with_friction(parameters, 0.0)
+        unit = self._direction(parameters)
+        reserve = self._values(state, parameters)[1]
+        size = len(self._system.constraint_input_signals)
+        A_0, A_1 = (
+            self._values(state, values)[0].reshape(size, size)
+            for values in (without, self._with_friction(parameters, unit))
+        )
+        factor = critical_factor(A_0, A_0 - A_1, self._rubbing.rows)
+        if factor * unit.max() > MEANINGLESS:
+            factor = np.inf
+        critical = dict(zip(self._names, (factor * unit).tolist(), strict=True))
+        return ContactMargin(float(reserve.item()), critical, state, time)
+
+    def over(self, samples: Samples, search: bool) -> ContactMargin:
+        """The smallest margin at sampled states and, downhill from the worst, between them."""
+        p = self._system.parameter_values
+        found = sorted((self.at(state, p) for state in samples.states), key=_first)
+        worst = found[0]
+        if not search:
+            return worst
+        box = ConsistentRegion(samples.manifold, surroundings(samples))
+        for start in found[:3]:
+            for better in self._downhill(box, start, p):
+                worst = min(worst, better, key=_first)
+        return worst
+
+    def along(self, times: FloatArray, states: FloatArray, parameters: FloatArray) -> ContactMargin:
+        """The smallest margin along a motion, of which there is at least one state."""
+        rows = zip(states, parameters, times.tolist(), strict=True)
+        return min((self.at(*row) for row in rows), key=_first)
+
+    def _downhill(
+        self, box: ConsistentRegion, start: ContactMargin, parameters: FloatArray
+    ) -> Iterator[ContactMargin]:
+        """States that jam with ever less friction."""
+        unit, best = self._direction(parameters), start
+        for part in CLOSER:
+            for _ in range(20):
+                factor = _first(best)
+                wanted = part * factor if np.isfinite(factor) else 1e3
+                values = self._with_friction(parameters, wanted * unit / max(unit))
+
+                def slope(
+                    state: FloatArray, values: FloatArray = values
+                ) -> tuple[float, FloatArray]:
+                    reserve, gradient = self._slope(state, values)
+                    if not self._slope.is_finite:
+                        return np.inf, np.zeros(state.size)
+                    return max(float(reserve.item()), 0.0), gradient
+
+                found = self.at(box.descend(slope, best.state), parameters)
+                if not _first(found) < factor:
+                    break
+                best = found
+                yield best
+
+    def _direction(self, parameters: FloatArray) -> FloatArray:
+        """The coefficients of friction, or ones if all are zero."""
+        own = parameters[self._places]
+        return own if np.any(own) else np.ones(len(self._places))
+
+    def _with_friction(self, parameters: FloatArray, friction: FloatArray | float) -> FloatArray:
+        values = parameters.copy()
+        values[self._places] = friction
+        return values
+
+
+def _first(margin: ContactMargin) -> float:
+    """The largest coefficient of friction at which a contact jams."""
+    return max(margin.critical_friction.values())
