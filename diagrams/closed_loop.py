@@ -5,24 +5,40 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from pydrake.common import RandomDistribution, RandomGenerator
+from numpy.typing import ArrayLike
+from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, TriggerType
-from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    OutputPort,
+    System,
+    TriggerType,
+)
+from pydrake.systems.primitives import (
+    LogVectorOutput,
+    MatrixGain,
+    RandomSource,
+    VectorLogSink,
+)
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import add_live_view
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.limits import ControlLimits
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.systems.sampling import ControlHold, Sampling
 from drake_dae.systems.sensors import ForceSensor
 
 Block = TypeVar("Block", DaePlant, ForceSensor)
@@ -106,6 +122,8 @@ def make_closed_loop(
     *,
     exogenous: Sequence[Reference] = (),
     sensor: ForceSensor | None = None,
+    sampling: Sampling | None = None,
+    control_limits: ArrayLike | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     start_time: float = 0.0,
@@ -120,6 +138,12 @@ def make_closed_loop(
             together cover all entries of w, in their order; without any nothing moves.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
             force is connected as it is, where that closes no algebraic loop.
+        sampling: When the law reads and acts: a period and a delay, and its control is held
+            between. The error is that of the theory up to one order of these times. None for a law
+            that acts continuously.
+        control_limits: The largest |u| that the drives give, shape (p,), such as
+            `model.control_limits`; the signal "excess" of the record tells what was cut off, and
+            when. Integrals stand still meanwhile. None for drives without limits.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
             its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
@@ -127,7 +151,7 @@ def make_closed_loop(
             integrator's steps. None draws nothing; `make_animation` needs none.
         start_time: When a run begins, in s: the zero dynamics are judged at the references then.
 
-    A loop that draws nothing and samples nothing converts to AutoDiffXd, for Drake's Linearize.
+    A loop that draws, samples and limits nothing converts to AutoDiffXd, for Drake's Linearize.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
@@ -149,27 +173,32 @@ def make_closed_loop(
     controller = builder.AddSystem(TrackingController(law, outputs))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
-    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    control, limits = _add_drives(builder, controller, sampling, control_limits)
+    builder.Connect(control, plant.GetInputPort("control"))
 
     moving = [_add_exogenous(builder, block, exogenous) for block in (plant, controller)]
 
     noise = None
     if law.measured_force:
-        noise = _add_force_feedback(builder, plant, controller, sensor)
+        if sensor is not None:
+            _add(builder, sensor)
+        noise = add_force_feedback(builder, plant, controller, sensor, sampling)
     elif sensor is not None:
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
     # Every signal under its own name: exported, and logged once per step.
     dae = plant.dae
     loggers = {}
-    named = {
+    named: dict[str, tuple[System, Sequence[Signal]]] = {
         "state": (plant, dae.state_signals),
         "constraint_force": (plant, dae.force_signals),
         "constraint_residual": (plant, plant.structure.manifold.residual_signals),
         "controlled_output": (plant, dae.output_signals),
-        "control": (controller, dae.control_signals),
+        "control": (control.get_system(), dae.control_signals),
         "reference": (reference, law.reference_signals),
     }
+    if limits is not None:
+        named["excess"] = (limits, dae.control_signals)
     if law.integral.outputs:
         named["integral"] = (controller, law.integral.signals)
     if law.measured_force and sensor is not None:
@@ -209,6 +238,34 @@ def _add(builder: DiagramBuilder, block: Block) -> Block:
         raise WiringError(
             f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
         ) from None
+
+
+def _add_drives(
+    builder: DiagramBuilder,
+    controller: TrackingController,
+    sampling: Sampling | None,
+    control_limits: ArrayLike | None,
+) -> tuple[OutputPort, ControlLimits | None]:
+    """Adds what stands between controller and plant, and returns the control that arrives."""
+    control, limits = controller.GetOutputPort("control"), None
+    if sampling is not None:
+        hold = builder.AddSystem(ControlHold(control.size(), sampling))
+        builder.Connect(control, hold.get_input_port())
+        control = hold.get_output_port()
+    if control_limits is not None:
+        limits = builder.AddSystem(ControlLimits(control_limits))
+        if limits.limits.size != control.size():
+            raise WiringError(
+                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
+                "controls"
+            )
+        builder.Connect(control, limits.get_input_port())
+        control = limits.GetOutputPort("control")
+        if controller.law.integral.outputs:
+            hold = builder.AddSystem(MatrixGain(np.ones((len(controller.law.integral.outputs), 1))))
+            builder.Connect(limits.GetOutputPort("is_limited"), hold.get_input_port())
+            builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
+    return control, limits
 
 
 def _add_exogenous(
@@ -254,49 +311,3 @@ def _check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) 
                 f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
                 "...)"
             )
-
-
-def _add_force_feedback(
-    builder: DiagramBuilder,
-    plant: DaePlant,
-    controller: TrackingController,
-    sensor: ForceSensor | None,
-) -> RandomSource | None:
-    """Connects the constraint force to the controller, through the sensor if there is one.
-
-    Returns:
-        The source of the sensor's noise, if it has one.
-    """
-    force, noise = plant.GetOutputPort("constraint_force"), None
-    if sensor is None:
-        control = plant.GetInputPort("control").get_index()
-        reads = controller.GetInputPort("measured_force").get_index()
-        acts = controller.GetOutputPort("control").get_index()
-        takes = controller.HasDirectFeedthrough(reads, acts)
-        if takes and plant.HasDirectFeedthrough(control, force.get_index()):
-            raise WiringError(
-                "the constraint force depends on the control in the same instant, so a law that "
-                "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
-                "time_constant or a sample_period"
-            )
-    else:
-        measured = controller.law.measured_force
-        gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
-        if gain >= sensor.largest_stable_gain():
-            raise WiringError(
-                f"the sampled force loop diverges: ||Gbar|| = {gain:.3g}, but each sample "
-                "multiplies the force error by -Gbar; it must stay below "
-                f"{sensor.largest_stable_gain():.3g}. Lower force_gain, or give the sensor a "
-                "time_constant well above its sample_period"
-            )
-        _add(builder, sensor)
-        builder.Connect(force, sensor.GetInputPort("force"))
-        force = sensor.GetOutputPort("measured_force")
-        if sensor.HasInputPort("noise"):
-            size = sensor.GetInputPort("noise").size()
-            period = sensor.sample_period or sensor.time_constant
-            source = RandomSource(RandomDistribution.kGaussian, size, period)
-            noise = builder.AddSystem(source)
-            builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    builder.Connect(force, controller.GetInputPort("measured_force"))
-    return noise
