@@ -104,6 +104,8 @@ def wire_scenario(
             references,
             exogenous=exogenous,
             sensor=sensor,
+            sampling=scenario.sampling,
+            control_limits=_limits(scenario, model),
             scene_graph=scene_graph,
             meshcat=meshcat,
             start_time=scenario.integrator.start_time,
@@ -114,6 +116,16 @@ def wire_scenario(
     context.SetTime(scenario.integrator.start_time)
     _start(scenario, model, loop, context)
     return loop, context
+
+
+@at("saturation")
+def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
+    """The largest controls, if the scenario wants drives that give no more."""
+    if not scenario.saturation:
+        return None
+    if not np.any(np.isfinite(model.control_limits)):
+        raise ModelError("the robot's file has no effort limits, or they are not on the control")
+    return model.control_limits
 
 
 def _references(references: Sequence[Reference], law: TrackingLaw) -> Sequence[Reference]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, TriggerType
@@ -14,12 +15,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.diagrams.wiring import (
-    add_block,
-    add_exogenous,
-    add_force_feedback,
-    check_sizes,
-)
+from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import add_live_view
@@ -28,6 +25,7 @@ from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
 
 
@@ -95,20 +93,21 @@ class ClosedLoop:
         logged = Record.from_logs(self.loggers, context, after)
         times, values = logged.time, {name: logged[name] for name in logged.signals}
         known = {**values, "parameters": self._parameters_along(self.plant, context, times)}
-        measured = self.controller.law.measured_force
-        if measured and "measured_force" not in known:
-            # Without a sensor that has memory; a law that does but integrate it reads none here.
-            known["measured_force"] = (
-                self.plant.along("constraint_force", known)
-                if self.controller.law.control_takes_force
-                else np.zeros((times.size, self.plant.dae.num_constraints))
-            )
         if self.plant_exogenous is not None:
             values["exogenous"] = self.plant_exogenous.along(times)
         values["reference"] = self.reference.along(times)
-        gains = self._parameters_along(self.controller, context, times)
-        given = {**known, "reference": values["reference"], "parameters": gains}
-        values["control"] = known["control"] = function_along(self.controller.law.function, given)
+        if "control" not in known:
+            gains = self._parameters_along(self.controller, context, times)
+            given = {**known, "reference": values["reference"], "parameters": gains}
+            law = self.controller.law
+            if law.measured_force and "measured_force" not in known:
+                # Without a sensor; a law that does but integrate the force reads none here.
+                given["measured_force"] = (
+                    self.plant.along("constraint_force", known)
+                    if law.control_takes_force
+                    else np.zeros((times.size, self.plant.dae.num_constraints))
+                )
+            values["control"] = known["control"] = function_along(law.function, given)
         values |= {port: self.plant.along(port, known) for port in self.plant.functions}
 
         desired = values["reference"][:, self.controller.law.layout.lowest]
@@ -167,6 +166,8 @@ def make_closed_loop(
     *,
     exogenous: Sequence[Reference] = (),
     sensor: ForceSensor | None = None,
+    sampling: Sampling | None = None,
+    control_limits: ArrayLike | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     start_time: float = 0.0,
@@ -181,6 +182,12 @@ def make_closed_loop(
             together cover all entries of w, in their order; without any nothing moves.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
             force is connected as it is, where that closes no algebraic loop.
+        sampling: When the law reads and acts: a period and a delay, and its control is held
+            between. The error is that of the theory up to one order of these times. None for a law
+            that acts continuously.
+        control_limits: The largest |u| that the drives give, shape (p,), such as
+            `model.control_limits`; the signal "excess" of the record tells what was cut off, and
+            when. Integrals stand still meanwhile. None for drives without limits.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
             its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
@@ -188,7 +195,7 @@ def make_closed_loop(
             integrator's steps. None draws nothing; `make_animation` needs none.
         start_time: When a run begins, in s: the zero dynamics are judged at the references then.
 
-    A loop that draws nothing and samples nothing converts to AutoDiffXd, for Drake's Linearize.
+    A loop that draws, samples and limits nothing converts to AutoDiffXd, for Drake's Linearize.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
@@ -210,13 +217,16 @@ def make_closed_loop(
     controller = builder.AddSystem(TrackingController(law, outputs))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
-    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    control, limits = add_drives(builder, controller, sampling, control_limits)
+    builder.Connect(control, plant.GetInputPort("control"))
 
     moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
 
     noise = None
     if law.measured_force:
-        noise = add_force_feedback(builder, plant, controller, sensor)
+        if sensor is not None:
+            add_block(builder, sensor)
+        noise = add_force_feedback(builder, plant, controller, sensor, sampling)
     elif sensor is not None:
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
@@ -231,10 +241,12 @@ def make_closed_loop(
         "constraint_force": (plant, dae.force_signals),
         "constraint_residual": (plant, plant.structure.manifold.residual_signals),
         "controlled_output": (plant, dae.output_signals),
-        "control": (controller, dae.control_signals),
         "reference": (reference, law.reference_signals),
     }.items():
         named[name] = (owner.GetOutputPort(name), signals)
+    named["control"] = (control, dae.control_signals)
+    if limits is not None:
+        named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     if law.integral.outputs:
         named["integral"] = (controller.GetOutputPort("integral"), law.integral.signals)
     if law.measured_force and sensor is not None:
@@ -242,7 +254,9 @@ def make_closed_loop(
         named["measured_force"] = (port, dae.constraint_input_signals)
     if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
         named["loop_state"] = (plant.GetOutputPort("loop_state"), plant.model.loop_joints.signals)
-    told = {*plant.functions, "control", "reference", "exogenous"}
+    told = {*plant.functions, "reference", "exogenous"}
+    if control.get_system() is controller:
+        told.add("control")
     loggers = {}
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)

@@ -23,6 +23,7 @@ from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
+from drake_dae.systems import sampling
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -76,6 +77,7 @@ Reference = Annotated[
 ]
 Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
+Sampling = Annotated[sampling.Sampling, Form()]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
@@ -123,6 +125,8 @@ class Scenario:
             positions, and forces where `force` is measured.
         constraint_damping: What the law's model demands of constraints that give way, written as
             gains are, for r_i - 1 poles per constraint; none where left out.
+        sampling: The period and the delay of the law, in s; left out, it acts continuously.
+        saturation: Whether the drives give no more than the effort limits of the robot's file.
         references: The references, in the order of the outputs, the forces last.
         start: Where the robot starts.
         duration: How long the run lasts, in s.
@@ -147,6 +151,8 @@ class Scenario:
     gains: Gains = field(default_factory=parts.Poles)
     integral: list[str] = field(default_factory=list)
     constraint_damping: Gains | None = None
+    sampling: Sampling | None = None
+    saturation: bool = False
     references: list[Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0

@@ -4,17 +4,19 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-from pydrake.common import RandomDistribution
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import RandomSource
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.primitives import MatrixGain
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import WiringError
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.limits import ControlLimits
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
+from drake_dae.systems.sampling import ControlHold, Sampling
 from drake_dae.systems.sensors import ForceSensor
 
 Block = TypeVar("Block", DaePlant, ForceSensor)
@@ -75,47 +77,29 @@ def check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -
             )
 
 
-def add_force_feedback(
+def add_drives(
     builder: DiagramBuilder,
-    plant: DaePlant,
     controller: TrackingController,
-    sensor: ForceSensor | None,
-) -> RandomSource | None:
-    """Connects the constraint force to the controller, through the sensor if there is one.
-
-    Returns:
-        The source of the sensor's noise, if it has one.
-    """
-    force, noise = plant.GetOutputPort("constraint_force"), None
-    if sensor is None:
-        control = plant.GetInputPort("control").get_index()
-        reads = controller.GetInputPort("measured_force").get_index()
-        acts = controller.GetOutputPort("control").get_index()
-        takes = controller.HasDirectFeedthrough(reads, acts)
-        if takes and plant.HasDirectFeedthrough(control, force.get_index()):
+    sampling: Sampling | None,
+    control_limits: ArrayLike | None,
+) -> tuple[OutputPort, ControlLimits | None]:
+    """Adds what stands between controller and plant, and returns the control that arrives."""
+    control, limits = controller.GetOutputPort("control"), None
+    if sampling is not None:
+        hold = builder.AddSystem(ControlHold(control.size(), sampling))
+        builder.Connect(control, hold.get_input_port())
+        control = hold.get_output_port()
+    if control_limits is not None:
+        limits = builder.AddSystem(ControlLimits(control_limits))
+        if limits.limits.size != control.size():
             raise WiringError(
-                "the constraint force depends on the control in the same instant, so a law that "
-                "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
-                "time_constant or a sample_period"
+                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
+                "controls"
             )
-    else:
-        measured = controller.law.measured_force
-        gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
-        if gain >= sensor.largest_stable_gain():
-            raise WiringError(
-                f"the sampled force loop diverges: ||Gbar|| = {gain:.3g}, but each sample "
-                "multiplies the force error by -Gbar; it must stay below "
-                f"{sensor.largest_stable_gain():.3g}. Lower force_gain, or give the sensor a "
-                "time_constant well above its sample_period"
-            )
-        add_block(builder, sensor)
-        builder.Connect(force, sensor.GetInputPort("force"))
-        force = sensor.GetOutputPort("measured_force")
-        if sensor.HasInputPort("noise"):
-            size = sensor.GetInputPort("noise").size()
-            period = sensor.sample_period or sensor.time_constant
-            source = RandomSource(RandomDistribution.kGaussian, size, period)
-            noise = builder.AddSystem(source)
-            builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    builder.Connect(force, controller.GetInputPort("measured_force"))
-    return noise
+        builder.Connect(control, limits.get_input_port())
+        control = limits.GetOutputPort("control")
+        if controller.law.integral.outputs:
+            hold = builder.AddSystem(MatrixGain(np.ones((len(controller.law.integral.outputs), 1))))
+            builder.Connect(limits.GetOutputPort("is_limited"), hold.get_input_port())
+            builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
+    return control, limits

@@ -77,11 +77,14 @@ from .simulation.simulate import simulate as simulate
 from .simulation.view import start_meshcat as start_meshcat
 from .symbolic import from_symbolic as from_symbolic
 from .systems.controller import TrackingController as TrackingController
+from .systems.limits import ControlLimits as ControlLimits
 from .systems.plant import DaePlant as DaePlant
 from .systems.realization import StateRealization as StateRealization
 from .systems.references import ReferenceGenerator as ReferenceGenerator
 from .systems.references import TrajectoryReference as TrajectoryReference
 from .systems.robot_plant import RobotPlant as RobotPlant
+from .systems.sampling import ControlHold as ControlHold
+from .systems.sampling import Sampling as Sampling
 from .systems.sensors import ForceSensor as ForceSensor
 
 __version__: str

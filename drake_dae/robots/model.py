@@ -42,20 +42,19 @@ class RobotModel:
 
     with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T;
     viscous friction is a part of H; one that restricts velocities alone has its rate in place of
-    phi, and r = 1. With rigid joints
-    tau = u; stages of actuation put their own dynamics between u and tau: E s' = drift(q, v, s) +
-    drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the
-    constraint input is lambda, and the controlled outputs are z = (z_1, z_2), so there are as many
-    position outputs as actuators less constraints. Where fewer forces can or shall be steered, as
-    those of wheels and of mimic joints, or combinations of them, as in a grasp, `forces` tells
-    which: z_2 = S(q) lambda, and there are as many position outputs as actuators less these. All of
-    lambda is on the plant's port nevertheless. Where there are fewer outputs than actuators, as in
-    a parallel robot with more motors than freedoms, `control_weights` w says which control it shall
-    be: that with the least sum w_i (u_i - u_0i)^2 of all that steer the outputs alike; see
-    `DaeSystem`. u_0 is the parameter "free_control", zero where nobody sets or moves it: it presses
-    and moves what the outputs leave free, and no output. Behind springs that is one deflection for
-    each actuator too many, which nothing damps: rather make the force that it presses with an
-    output.
+    phi, and r = 1. With rigid joints tau = u; stages of actuation put their own dynamics between u
+    and tau: E s' = drift(q, v, s) + drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The
+    state is x = (q, v, s), the constraint input is lambda, and the controlled outputs are z = (z_1,
+    z_2), so there are as many position outputs as actuators less constraints. Where fewer forces
+    can or shall be steered, as those of wheels and of mimic joints, or combinations of them, as in
+    a grasp, `forces` tells which: z_2 = S(q) lambda, and there are as many position outputs as
+    actuators less these. All of lambda is on the plant's port nevertheless. Where there are fewer
+    outputs than actuators, as in a parallel robot with more motors than freedoms, `control_weights`
+    w says which control it shall be: that with the least sum w_i (u_i - u_0i)^2 of all that steer
+    the outputs alike; see `DaeSystem`. u_0 is the parameter "free_control", zero where nobody sets
+    or moves it: it presses and moves what the outputs leave free, and no output. Behind springs
+    that is one deflection for each actuator too many, which nothing damps: rather make the force
+    that it presses with an output.
 
     Args:
         links: The links, which provide M, H and the frames.
@@ -312,8 +311,8 @@ class RobotModel:
         m, nu = bound.size, len(self._controls)
         B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
         velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(B, driven.joint_force) + self._known_force() + self.loop_joints.force
-        torque += bound.drag(links)
+        torque = ca.mtimes(B, driven.joint_force) + self._known_force() + bound.drag(links)
+        torque += self.loop_joints.force
         motors = self.loop_joints.motors
         rotors = self._moved_rotors(driven)
 

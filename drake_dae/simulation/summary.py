@@ -134,6 +134,9 @@ def _forces(record: Record, limits: Limits) -> list[str]:
 def _controls(record: Record, limits: Limits) -> list[str]:
     controls = record.signals["control"]
     largest = np.full(len(controls.signals), np.inf) if limits.control is None else limits.control
+    # A sample tells of the step that it ends.
+    excess = record["excess"] if "excess" in record.signals else np.zeros_like(controls.values)
+    cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
     return Table(
         ["control", "unit", "least", "largest", "limit", ""],
         [
@@ -143,10 +146,14 @@ def _controls(record: Record, limits: Limits) -> list[str]:
                 f"{np.min(values):.4g}",
                 f"{np.max(values):.4g}",
                 f"{limit:.4g}" if np.isfinite(limit) else "none",
-                "over its limit" if np.max(np.abs(values)) > limit else "",
+                f"cut off for {time:.3g} s"
+                if time
+                else "over its limit"
+                if np.max(np.abs(values)) > limit
+                else "",
             ]
-            for signal, values, limit in zip(
-                controls.signals, controls.values.T, largest, strict=True
+            for signal, values, limit, time in zip(
+                controls.signals, controls.values.T, largest, cut_off, strict=True
             )
         ],
         left=2,

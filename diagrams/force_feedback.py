@@ -1,0 +1,105 @@
+"""The wire from a plant's constraint force to a law that takes it."""
+
+import numpy as np
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import RandomSource
+
+from drake_dae.errors import WiringError
+from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.plant import DaePlant
+from drake_dae.systems.sampling import Sampling
+from drake_dae.systems.sensors import ForceSensor
+
+
+def add_force_feedback(
+    builder: DiagramBuilder,
+    plant: DaePlant,
+    controller: TrackingController,
+    sensor: ForceSensor | None,
+    sampling: Sampling | None,
+) -> RandomSource | None:
+    """Connects the constraint force to the controller, through the sensor if there is one.
+
+    Args:
+        builder: The builder of the diagram, with plant, controller and sensor in it.
+        plant: The plant.
+        controller: The controller, whose law takes a measured force.
+        sensor: The sensor; None for the force as it is.
+        sampling: When the control is read and acts; None where it does so at once.
+
+    Returns:
+        The source of the sensor's noise, if it has one.
+
+    Raises:
+        WiringError: It would close an algebraic loop, or a sampled loop that diverges.
+    """
+    force, noise = plant.GetOutputPort("constraint_force"), None
+    _check_loop(plant, controller, sensor, sampling)
+    if sensor is not None:
+        builder.Connect(force, sensor.GetInputPort("force"))
+        force = sensor.GetOutputPort("measured_force")
+        if sensor.HasInputPort("noise"):
+            size = sensor.GetInputPort("noise").size()
+            period = sensor.sample_period or sensor.time_constant
+            source = RandomSource(RandomDistribution.kGaussian, size, period)
+            noise = builder.AddSystem(source)
+            builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    builder.Connect(force, controller.GetInputPort("measured_force"))
+    return noise
+
+
+def _check_loop(
+    plant: DaePlant,
+    controller: TrackingController,
+    sensor: ForceSensor | None,
+    sampling: Sampling | None,
+) -> None:
+    """Refuses what Drake would not solve, or would diverge in silence."""
+    force, measured = plant.GetOutputPort("constraint_force"), controller.law.measured_force
+    control = plant.GetInputPort("control").get_index()
+    at_once = plant.HasDirectFeedthrough(control, force.get_index())
+    if sensor is None and sampling is None:
+        reads = controller.GetInputPort("measured_force").get_index()
+        acts = controller.GetOutputPort("control").get_index()
+        if controller.HasDirectFeedthrough(reads, acts) and at_once:
+            raise WiringError(
+                "the constraint force depends on the control in the same instant, so a law that "
+                "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
+                "time_constant or a sample_period, or a sampling"
+            )
+        return
+    gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
+    if sensor is not None and gain >= sensor.largest_stable_gain():
+        raise WiringError(
+            f"the sampled force loop diverges: ||Gbar|| = {gain:.3g}, but each sample "
+            "multiplies the force error by -Gbar; it must stay below "
+            f"{sensor.largest_stable_gain():.3g}. Lower force_gain, or give the sensor a "
+            "time_constant well above its sample_period"
+        )
+    if sampling is not None and at_once:
+        radius = _radius(gain, sensor, sampling)
+        if radius >= 1.0:
+            raise WiringError(
+                f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
+                f"{sampling.period:g} s multiplies the force error by {radius:.3g}. Lower "
+                "force_gain, or give the sensor a time_constant well above the sampling's period "
+                "and delay"
+            )
+
+
+def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> float:
+    """By how much a sample multiplies the force error of a rigid robot.
+
+    The force follows the control that acts, lambda = -Gbar y of an earlier sample, and the sensor
+    the force, y' = a y + (1 - a) lambda: z^(d + 1) - a z^d + (1 - a) Gbar = 0 for d late samples.
+    """
+    lag = sensor.time_constant if sensor is not None else 0.0
+    a = float(np.exp(-sampling.period / lag)) if lag else 0.0
+    # What a sensor takes at the same instant is read at the next one.
+    late = sampling.late_samples + bool(sensor is not None and sensor.sample_period)
+    polynomial = np.zeros(late + 2)
+    polynomial[0] = 1.0
+    polynomial[1] -= a
+    polynomial[-1] += (1.0 - a) * gain
+    return float(np.max(np.abs(np.roots(polynomial)), initial=0.0))

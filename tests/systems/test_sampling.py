@@ -1,0 +1,273 @@
+"""Sampled laws and drives with limits, against maps written by hand and the continuous law."""
+
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import arm, error_controlled, fixed_step, law
+from numpy.testing import assert_allclose
+from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink
+from runs import run, run_scenario, scenario
+
+from drake_dae import (
+    ConstantReference,
+    ControlHold,
+    ControlLimits,
+    DaePlant,
+    DaeSystem,
+    ForceSensor,
+    RobotPlant,
+    Sampling,
+    SinusoidReference,
+    TrackingLaw,
+    make_closed_loop,
+    poles,
+    simulate,
+)
+from drake_dae.errors import ModelError, ScenarioError, WiringError
+
+STEP = error_controlled(1e-10)
+K, T = 3.0, 0.05
+
+
+def integrator() -> DaeSystem:
+    """x' = u, z = x."""
+    x, none = ca.SX.sym("x"), ca.SX(0, 1)
+    return DaeSystem(x, 0 * x, ca.SX(1, 0), ca.SX(1), none, x, ca.SX(1, 0), nominal_state=[1.0])
+
+
+def pursue(reference, sampling, duration, **more):
+    """x' = u behind u = r' - K (x - r), from x = 1."""
+    system = integrator()
+    plant = DaePlant(system)
+    loop = make_closed_loop(
+        plant, TrackingLaw(system, poles(-K)), [reference], sampling=sampling, **more
+    )
+    context = loop.diagram.CreateDefaultContext()
+    return loop, context, run(loop, context, duration, STEP)
+
+
+def at(record, name, times):
+    """A signal of a record at times that it has; what was logged before their events."""
+    index = np.searchsorted(record.time, np.asarray(times) - 1e-9)
+    assert_allclose(record.time[index], times, atol=1e-12)
+    return record[name][index, 0]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3 * T, T, 1.3 * T, 2.0 * T])
+def test_held_control_is_that_of_the_map_by_hand(delay):
+    """x_(k+1) = x_k + rest u_(k-n-1) + (T - rest) u_(k-n), u_k = -K x_k, and u_k = u_0 before.
+
+    The control is constant between events, so the integrator leaves round-off alone.
+    """
+    whole = int(delay / T + 1e-9)
+    rest = delay - whole * T
+    x, u = [1.0], []
+    for k in range(20):
+        u.append(-K * x[k])
+        x.append(x[k] + rest * u[max(k - whole - 1, 0)] + (T - rest) * u[max(k - whole, 0)])
+    _, _, record = pursue(ConstantReference(0.0), Sampling(T, delay), 20 * T)
+    assert_allclose(at(record, "state", T * np.arange(20)), x[:20], atol=1e-12)
+
+
+def test_state_reference_and_log_belong_to_one_instant():
+    """The control of [t_k, t_(k+1)) is r'(t_k) - K (x(t_k) - r(t_k)) of what is logged for t_k."""
+    _, _, record = pursue(SinusoidReference(0.2, 0.4, 5.0), Sampling(T), 1.0)
+    times = T * np.arange(20)
+    r = 0.2 + 0.4 * np.sin(5.0 * times)
+    assert_allclose(at(record, "reference", times), r, atol=1e-14)
+    wanted = 2.0 * np.cos(5.0 * times) - K * (at(record, "state", times) - r)
+    assert_allclose(at(record, "control", times[1:]), wanted[:-1], atol=1e-12)
+
+
+def test_run_that_goes_on_keeps_what_is_held():
+    """Drake makes the events of the moment where a run ends once more when the next one begins."""
+    half, whole = Sampling(T, 0.3 * T), 20 * T
+    loop, context, _ = pursue(ConstantReference(0.0), half, 9.9 * T)
+    on = error_controlled(1e-10)
+    on.start_time = context.get_time()
+    simulate(loop.diagram, context, 10.1 * T, on)
+    _, _, record = pursue(ConstantReference(0.0), half, whole)
+    assert_allclose(loop.record(context)["state"][-1], record["state"][-1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "periods", [(8e-3, 4e-3), pytest.param((4e-3, 2e-3, 1e-3), marks=pytest.mark.slow)]
+)
+def test_error_falls_with_the_period(periods):
+    """First order, of position and force: half the period leaves half of what theory lacks.
+
+    The next order changes that by a few percent at 8 ms, and less below.
+    """
+    errors = []
+    for period in periods:
+        found = scenario("two_link_wall", f"sampling={{period: {period}}}", "duration=1.5")
+        found.start.errors.clear()
+        loop, _, record = run_scenario(found)
+        off = record["tracking_error"] - loop.predicted_error(record)
+        errors.append(np.abs(off[record.time > 0.3]).max(axis=0))
+    for coarse, fine in pairwise(errors):
+        assert_allclose(coarse / fine, 2.0, rtol=0.05)
+    assert np.all(errors[-1] < [1e-3, 0.2])
+
+
+def test_delay_is_an_error_of_its_own():
+    """At rest nothing is late: after the errors have died the force is that of the reference."""
+    found = arm("two_link")
+    loop = make_closed_loop(
+        RobotPlant(found.model, structure=found.structure),
+        law("two_link", poles(-10.0)),
+        [ConstantReference(0.3), ConstantReference(20.0)],
+        sampling=Sampling(2e-3, 3e-3),
+    )
+    context = loop.diagram.CreateDefaultContext()
+    record = run(loop, context, 3.0, fixed_step(1e-3))
+    # exp(-10 t) (1 + 10 t) is 3e-12 there.
+    assert_allclose(record["controlled_output"][-1], [0.3, 20.0], atol=1e-9)
+
+
+def test_limits_cut_and_tell_when():
+    """x' = -1 from 1 until K x = 1, then exp(-K t): cut off for 1 - 1/K seconds."""
+    _, _, record = pursue(ConstantReference(0.0), None, 2.0, control_limits=[1.0])
+    end = 1.0 - 1.0 / K
+    assert np.all(np.abs(record["control"]) <= 1.0)
+    cut = record.time[record["excess"][:, 0] != 0.0]
+    steps = np.diff(record.time).max()
+    assert cut[0] == 0.0
+    assert end - steps < cut[-1] < end + 1e-9
+    final = np.exp(-K * (2.0 - end)) / K
+    # Error control sees the kink: 1e-10 a step, and a few more for what it misses.
+    assert_allclose(record["state"][-1, 0], final, atol=1e-8)
+
+
+def test_integrals_stand_still_while_a_drive_is_at_its_limit():
+    """x' = 1 - K x cannot be held by |u| <= 0.5: without the hold the integral runs away."""
+    system = integrator()
+    tracking = TrackingLaw(system, poles(-K), integral=[system.output_signals[0].name])
+    loop = make_closed_loop(
+        DaePlant(system), tracking, [ConstantReference(5.0)], control_limits=[0.5]
+    )
+    context = loop.diagram.CreateDefaultContext()
+    record = run(loop, context, 1.0, STEP)
+    assert np.all(record["excess"] > 0.0)
+    assert_allclose(record["integral"], 0.0)
+
+
+def test_sampled_law_reads_a_force_as_it_is():
+    """lambda_k = (1 + G) r - G lambda_(k-1) with the exact model: a start off by 1 N alternates.
+
+    At rest, where the exact model holds: the force error is multiplied by -G = -0.5 a sample.
+    """
+    found = arm("two_link")
+    tracking = TrackingLaw(
+        found.model.dae,
+        poles(-4.0),
+        structure=found.structure,
+        measured_force=True,
+        force_gain=0.5,
+    )
+    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    loop = make_closed_loop(
+        RobotPlant(found.model, structure=found.structure),
+        tracking,
+        wanted,
+        sampling=Sampling(0.01),
+    )
+    context = loop.diagram.CreateDefaultContext()
+    plant = loop.plant
+    state = found.model.rest_state(found.model.configuration([0.3], [1.2, -1.6]), [20.0])
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_consistent_state(own, state)
+    hold = loop.diagram.GetSubsystemByName("control_hold")
+    held = hold.GetMyMutableContextFromRoot(context)
+    torque = _torque(found.model, state, 19.0)
+    held.SetDiscreteState(torque)
+    record = run(loop, context, 0.05, STEP)
+    errors = at(record, "constraint_force", 0.01 * np.arange(1, 5)) - 20.0
+    # The torque at the start is 1 N too little until the first sample, at once.
+    assert_allclose(errors, [0.5, -0.25, 0.125, -0.0625], rtol=0.02)
+
+
+def _torque(model, state, force):
+    """What holds the arm at rest against gravity and a force, by the plant alone."""
+    plant = model.links.plant
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, state[:2])
+    jacobian = plant.CalcJacobianTranslationalVelocity(
+        context,
+        JacobianWrtVariable.kV,
+        plant.GetFrameByName("tool"),
+        np.zeros(3),
+        plant.world_frame(),
+        plant.world_frame(),
+    )
+    normal = np.array([-1.0, 0.0, 0.0])
+    return -plant.CalcGravityGeneralizedForces(context) - jacobian.T @ normal * force
+
+
+@pytest.mark.parametrize(
+    ("gain", "sensor", "sampling"),
+    [
+        (1.1, None, Sampling(0.01)),
+        (1.1, None, Sampling(0.01, 0.02)),
+        (2.0, (0.01, 0.0), Sampling(0.01, 0.02)),
+    ],
+)
+def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
+    found = arm("two_link")
+    tracking = TrackingLaw(
+        found.model.dae,
+        poles(-4.0),
+        structure=found.structure,
+        measured_force=True,
+        force_gain=gain,
+    )
+    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    with pytest.raises(WiringError, match="diverges"):
+        make_closed_loop(
+            RobotPlant(found.model, structure=found.structure),
+            tracking,
+            wanted,
+            sensor=sensor and ForceSensor(1, *sensor),
+            sampling=sampling,
+        )
+
+
+def test_hold_of_a_source_shows_it_late():
+    """Any block may stand before it, also one of Drake."""
+    builder = DiagramBuilder()
+    source = builder.AddSystem(ConstantVectorSource([1.0, 2.0]))
+    hold = builder.AddSystem(ControlHold(2, Sampling(0.1, 0.05)))
+    log = builder.AddSystem(VectorLogSink(2))
+    builder.Connect(source.get_output_port(), hold.get_input_port())
+    builder.Connect(hold.get_output_port(), log.get_input_port())
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(0.3)
+    assert_allclose(log.FindLog(simulator.get_context()).data()[:, -1], [1.0, 2.0])
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 0.0), (-1.0, 0.0), (0.01, -1e-3)])
+def test_sampling_refuses_times_that_are_none(numbers):
+    with pytest.raises(ModelError, match="must be"):
+        Sampling(*numbers)
+
+
+def test_limits_that_are_none_are_refused():
+    with pytest.raises(ModelError, match="positive"):
+        ControlLimits([1.0, 0.0])
+    with pytest.raises(WiringError, match="2 entries, there are 1"):
+        pursue(ConstantReference(0.0), None, 1.0, control_limits=[1.0, 1.0])
+
+
+def test_scenario_samples_and_limits():
+    """The record has what was cut off; a robot without limits has nothing to cut."""
+    found = scenario(
+        "seven_joint_wall", "sampling={period: 2.0e-3, delay: 1.0e-3}", "saturation=true"
+    )
+    assert found.sampling == Sampling(2e-3, 1e-3)
+    with pytest.raises(ScenarioError, match="sampling: a sampling's period must be positive"):
+        scenario("two_link_wall", "sampling={period: 0.0}")
