@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from pydrake.systems.framework import Context
 
@@ -31,6 +31,8 @@ from drake_dae.diagrams.scenario import (
     save_scenario,
     shipped_scenarios,
 )
+from drake_dae.diagrams.sweep.sweep import sweep
+from drake_dae.diagrams.sweep.variations import parse_variations
 from drake_dae.errors import (
     DrakeDaeError,
     MachineCodeError,
@@ -106,6 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     examine.add_argument(
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
+    _add_sweep(commands, named)
     written = commands.add_parser(
         "export",
         parents=[named],
@@ -132,7 +135,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with _warnings(NonMinimumPhaseWarning):  # The report tells it.
                 return _analyze(options)
         with _warnings():
-            return _export(options) if options.command == "export" else _simulate(options)
+            run_command = {"export": _export, "sweep": _sweep, "simulate": _simulate}
+            return run_command[options.command](options)
     except DrakeDaeError as error:
         # A scenario has a line for each problem; other texts, as of Drake, are made one.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
@@ -208,6 +212,74 @@ def _export(options: argparse.Namespace) -> int:
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
     print(f"written to {folder}/: {', '.join(file.name for file in files)}")
+    return 0
+
+
+def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
+    study = commands.add_parser(
+        "sweep",
+        parents=[named],
+        help="run a scenario many times with other values",
+        description="Runs a scenario once for every combination of the values of some keys, on all "
+        "cores, and leaves a table with figures of each run, a summary and plots. Killed at any "
+        "moment and started again with the same command, it continues where it was.",
+    )
+    study.add_argument(
+        "--vary",
+        action="append",
+        required=True,
+        metavar="KEY=VALUES",
+        help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
+        '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
+        'or "force.seed=1..20:20"; may be repeated',
+    )
+    chosen = study.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--random",
+        type=int,
+        metavar="COUNT",
+        help="so many runs with random values, all in a range equally likely, instead of a grid",
+    )
+    chosen.add_argument(
+        "--together",
+        action="store_true",
+        help="the first values of all keys, then the second ones, instead of a grid",
+    )
+    study.add_argument("--seed", type=int, default=0, help="of the random values (default: 0)")
+    study.add_argument(
+        "--workers", type=int, metavar="COUNT", help="how many processes (default: one per core)"
+    )
+    study.add_argument(
+        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
+    )
+    study.add_argument(
+        "--out", type=Path, help="folder for the results (default: runs/<scenario>-sweep)"
+    )
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    path = find_scenario(options.scenario)
+    scenario = load_scenario(path, _settings(options))
+    variations = parse_variations(
+        options.vary, scenario, options.random, options.seed, options.together
+    )
+    folder = options.out or Path("runs") / f"{path.stem}-sweep"
+    file = folder / "runs.jsonl"
+    try:
+        study = sweep(
+            scenario,
+            variations,
+            file,
+            workers=options.workers,
+            cluster=options.cluster,
+            progress=True,
+        )
+    except KeyboardInterrupt:
+        print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
+        raise
+    files = study.save(folder)
+    names = ", ".join([file.name, *(written.name for written in files)])
+    _print(f"{study}\nwritten to {folder}/: {names}", sys.stdout)
     return 0
 
 
