@@ -37,8 +37,7 @@ class Cluster:
             raise ModelError(
                 f"no Dask scheduler answers at {brief(address)}: {brief(str(error))}"
             ) from None
-        known = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        self.workers = sum(worker["nthreads"] for worker in known)
+        self.workers = sum(self._client.nthreads().values())
         if not self.workers:
             self.close()
             raise ModelError(f"the Dask cluster at {address} has no workers; start some")
@@ -61,7 +60,8 @@ class Cluster:
             return future
 
         given: dict[Any, Batch] = {}
-        awaited = self._dask.as_completed([submit(batch) for batch in batches])
+        futures = [submit(batch) for batch in batches]
+        awaited = self._dask.as_completed(futures, loop=self._client.loop)
         for future in awaited:
             batch = given.pop(future.key)
             try:

@@ -21,7 +21,7 @@ from drake_dae.diagrams.sweep.runs import Batch, Outcome, Runner, RunResult
 from drake_dae.errors import ModelError
 from drake_dae.simulation.interruption import ENDING_SIGNALS
 
-BUILDS = 40
+BUILDS = 200
 """A process that has built so many loops is replaced: Drake does not free all of each."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
