@@ -1,6 +1,7 @@
 """The closed loop that a scenario describes."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
@@ -46,6 +47,15 @@ def build_scenario(
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
+    loop = build_loop(scenario, meshcat)
+    return loop, start_scenario(scenario, loop)
+
+
+def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
+    """The closed loop of a scenario, which `start_scenario` starts as often as one likes.
+
+    The arguments and errors are those of `build_scenario`.
+    """
     scene_graph = SceneGraph()
     model = scenario_model(scenario, scene_graph)
     try:
@@ -53,7 +63,27 @@ def build_scenario(
     except AssumptionError as error:
         key = "constraints" if error.assumption <= 3 else "outputs"
         raise ScenarioError((key, str(error))) from error
-    return wire_scenario(scenario, model, structure, scene_graph, meshcat)
+    return wire_loop(scenario, model, structure, scene_graph, meshcat)
+
+
+def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
+    """A new context of a closed loop at a scenario's start.
+
+    Args:
+        scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
+            uncoupled gains, and the seed of the sensor may be others than those it was built with.
+        loop: What `build_loop` made.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    context = loop.diagram.CreateDefaultContext()
+    context.SetTime(scenario.integrator.start_time)
+    with at("gains"):
+        own = loop.controller.GetMyMutableContextFromRoot(context)
+        loop.controller.set_gains(own, scenario.gains.design())
+    _start(scenario, cast(RobotPlant, loop.plant).model, loop, context)
+    return context
 
 
 def wire_scenario(
@@ -64,6 +94,21 @@ def wire_scenario(
     meshcat: Meshcat | None = None,
 ) -> tuple[ClosedLoop, Context]:
     """The closed loop of a scenario's robot, and its context at the start.
+
+    The arguments and errors are those of `wire_loop`.
+    """
+    loop = wire_loop(scenario, model, structure, scene_graph, meshcat)
+    return loop, start_scenario(scenario, loop)
+
+
+def wire_loop(
+    scenario: Scenario,
+    model: RobotModel,
+    structure: Structure,
+    scene_graph: SceneGraph | None = None,
+    meshcat: Meshcat | None = None,
+) -> ClosedLoop:
+    """The closed loop of a scenario's robot.
 
     Args:
         scenario: What `load_scenario` returns.
@@ -98,7 +143,7 @@ def wire_scenario(
 
     # The diagram.
     with at("force" if force.is_measured else "start.positions"):
-        loop = make_closed_loop(
+        return make_closed_loop(
             RobotPlant(model, structure=structure),
             law,
             references,
@@ -110,12 +155,6 @@ def wire_scenario(
             meshcat=meshcat,
             start_time=scenario.integrator.start_time,
         )
-
-    # The start: at rest, where the references begin, plus the errors.
-    context = loop.diagram.CreateDefaultContext()
-    context.SetTime(scenario.integrator.start_time)
-    _start(scenario, model, loop, context)
-    return loop, context
 
 
 @at("saturation")
@@ -179,7 +218,7 @@ def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference
 
 
 def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Context) -> None:
-    """Sets parameters, state and sensor of a context."""
+    """Sets parameters, state and sensor: at rest, where the references begin, plus the errors."""
     plant = loop.plant
     own = plant.GetMyMutableContextFromRoot(context)
     with at("plant_parameters"):

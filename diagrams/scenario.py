@@ -4,7 +4,8 @@ A scenario is YAML. What the library has as a dataclass is written with the keys
 a choice between several is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae import references
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
-from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, set_entry
+from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import surface, surfaces
@@ -112,7 +113,8 @@ class Scenario:
             "free_control" is zero where `exogenous` has it not.
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
-        plant_parameters: Parameter name -> what the plant has and the law's model does not.
+        plant_parameters: Parameter name -> what the plant has and the law's model does not; one
+            number for all entries, or a list.
         loads: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
             `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
@@ -144,7 +146,7 @@ class Scenario:
     control_weights: list[float] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
-    plant_parameters: dict[str, list[float]] = field(default_factory=dict)
+    plant_parameters: dict[str, float | list[float]] = field(default_factory=dict)
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
@@ -175,6 +177,32 @@ def _reader() -> Reader[Scenario]:
 def scenario_schema() -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
     return _reader().schema
+
+
+def scenario_data(scenario: Scenario) -> dict[str, Any]:
+    """A scenario as plain data, of which `read_scenario` makes the same."""
+    return dict(_reader().write(scenario))
+
+
+def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's plain data with other values at dotted keys.
+
+    Raises:
+        ScenarioError: There is no such place.
+    """
+    varied = deepcopy(dict(data))
+    for key, value in changes.items():
+        put_entry(varied, key, value, _reader().free_names)
+    return varied
+
+
+def read_scenario(data: Mapping[str, Any]) -> Scenario:
+    """The scenario that plain data describe, its paths as they are.
+
+    Raises:
+        ScenarioError: Keys are unknown or missing, or values cannot be used; all are told at once.
+    """
+    return _reader().read(data)
 
 
 @checked(lambda text: ScenarioError(("", text)))

@@ -150,10 +150,26 @@ def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
         ScenarioError: There is no such place, or the YAML is broken.
     """
     key, separator, text = setting.partition("=")
-    parts = key.split(".")
-    if not separator or not all(parts):
+    if not separator or not all(key.split(".")):
         raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
-    value = load_yaml(text, key)
+    put_entry(data, key, load_yaml(text, key), names)
+
+
+def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> None:
+    """Changes plain data at a dotted key, "a.b.0.c".
+
+    Args:
+        data: Lists and dictionaries; changed in place.
+        key: The key.
+        value: Plain data.
+        names: Dotted keys of dictionaries whose names may have dots themselves.
+
+    Raises:
+        ScenarioError: There is no such place.
+    """
+    parts = key.split(".")
+    if not all(parts):
+        raise ScenarioError((brief(key), "expected a dotted key, for example start.errors.tool.z"))
     path = ""
     while True:
         part = ".".join(parts) if path in names else parts[0]

@@ -36,6 +36,11 @@ from .diagrams.closed_loop import make_closed_loop as make_closed_loop
 from .diagrams.export.export import export_code as export_code
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
+from .diagrams.sweep.study import Study as Study
+from .diagrams.sweep.sweep import sweep as sweep
+from .diagrams.sweep.variations import grid_variations as grid_variations
+from .diagrams.sweep.variations import listed_variations as listed_variations
+from .diagrams.sweep.variations import random_variations as random_variations
 from .errors import DrakeDaeError as DrakeDaeError
 from .robots.actuation.dc_motors import DcMotors as DcMotors
 from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints

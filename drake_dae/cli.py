@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import drake_dae
 from drake_dae.diagrams.shipped import DEFAULT_SCENARIO, description, shipped_scenarios
@@ -76,6 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     examine.add_argument(
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
+    _add_sweep(commands, named)
     written = commands.add_parser(
         "export",
         parents=[named],
@@ -104,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ignored.append(NonMinimumPhaseWarning)  # The report tells it.
         elif options.command == "export":
             from drake_dae.commands.export import run_command
+        elif options.command == "sweep":
+            from drake_dae.commands.sweep import run_command
         else:
             from drake_dae.commands.simulate import run_command
         if options.command != "cache" and options.compiled is not None:
@@ -147,3 +151,45 @@ def _warnings(*ignored: type[Warning]) -> Iterator[None]:
             warnings.simplefilter("ignore", category)
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         yield
+
+
+def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
+    study = commands.add_parser(
+        "sweep",
+        parents=[named],
+        help="run a scenario many times with other values",
+        description="Runs a scenario once for every combination of the values of some keys, on all "
+        "cores, and leaves a table with figures of each run, a summary and plots. Killed at any "
+        "moment and started again with the same command, it continues where it was.",
+    )
+    study.add_argument(
+        "--vary",
+        action="append",
+        required=True,
+        metavar="KEY=VALUES",
+        help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
+        '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
+        'or "force.seed=1..20:20"; may be repeated',
+    )
+    chosen = study.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--random",
+        type=int,
+        metavar="COUNT",
+        help="so many runs with random values, all in a range equally likely, instead of a grid",
+    )
+    chosen.add_argument(
+        "--together",
+        action="store_true",
+        help="the first values of all keys, then the second ones, instead of a grid",
+    )
+    study.add_argument("--seed", type=int, default=0, help="of the random values (default: 0)")
+    study.add_argument(
+        "--workers", type=int, metavar="COUNT", help="how many processes (default: one per core)"
+    )
+    study.add_argument(
+        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
+    )
+    study.add_argument(
+        "--out", type=Path, help="folder for the results (default: runs/<scenario>-sweep)"
+    )

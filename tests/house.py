@@ -69,9 +69,12 @@ IMPORT_NAMES = {"drake": "pydrake", "pyyaml": "yaml"}
 
 
 def declared_modules() -> set[str]:
-    """What pyproject.toml says that the package needs, as names to import."""
+    """What pyproject.toml says that the package needs or can use, as names to import."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    names = [re.split(r"[^\w.-]", requirement)[0] for requirement in project["dependencies"]]
+    extras = project["optional-dependencies"]
+    used = [needed for extra, names in extras.items() if extra != "dev" for needed in names]
+    requirements = [*project["dependencies"], *used]
+    names = [re.split(r"[^\w.-]", requirement)[0] for requirement in requirements]
     return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
 
 

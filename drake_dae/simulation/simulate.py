@@ -213,7 +213,7 @@ class _Progress:
             total=duration,
             disable=not (enabled and self._terminal),
             file=sys.stderr,
-            **_default_size(),
+            **default_size(),
             bar_format="{desc}{percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s{postfix}",
         )
         self._began = self._shown = time.perf_counter()
@@ -254,7 +254,7 @@ class _Progress:
                 print(text, file=sys.stderr, flush=True)
 
 
-def _default_size() -> dict[str, int]:
+def default_size() -> dict[str, int]:
     """The size for tqdm where the terminal says that it has no columns, as in some containers."""
     try:
         known = os.get_terminal_size(sys.stderr.fileno()).columns > 0

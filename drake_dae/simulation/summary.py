@@ -12,7 +12,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 
-_SLACK = 1e-9
+SLACK = 1e-9
 """How far a value must be beyond a joint limit to count, in its unit: a start may be on it."""
 
 
@@ -171,5 +171,5 @@ def _beyond(record: Record, limits: Limits) -> list[str]:
         f"{signal.name} goes from {np.min(values):.4g} to {np.max(values):.4g} {signal.unit}, "
         f"its limits are {lower:.4g} and {upper:.4g}"
         for signal, values, lower, upper in rows
-        if np.min(values) < lower - _SLACK or np.max(values) > upper + _SLACK
+        if np.min(values) < lower - SLACK or np.max(values) > upper + SLACK
     ]

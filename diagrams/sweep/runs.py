@@ -1,0 +1,257 @@
+"""One run of a study after the other, in one process: what each comes to."""
+
+import json
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from functools import lru_cache
+from threading import Lock
+from typing import Any, Self, cast
+
+from drake_dae.arrays import brief
+from drake_dae.diagrams.build import build_loop, start_scenario
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.scenario import Scenario, read_scenario, varied_data
+from drake_dae.diagrams.sweep.variations import Variation
+from drake_dae.diagrams.typed_yaml import TAG
+from drake_dae.errors import (
+    AssumptionError,
+    DrakeDaeError,
+    InconsistentStateError,
+    ScenarioError,
+    SimulationError,
+)
+from drake_dae.simulation.figures import exceeded, run_figures
+from drake_dae.simulation.simulate import simulate
+from drake_dae.simulation.summary import Limits
+from drake_dae.systems.robot_plant import RobotPlant
+
+
+class Outcome(StrEnum):
+    """How a run of a study ended."""
+
+    FINISHED = "finished"
+    FAILED = "failed"
+    """On the way; the figures are those up to there."""
+    NO_START = "no start"
+    """No state on the constraints has what the start asks for."""
+    REFUSED = "refused"
+    """The scenario does not fit together, or violates an assumption."""
+    CRASHED = "crashed"
+    """The process ended, or failed in a way that it should not."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run of a study came to.
+
+    Attributes:
+        run: Its number in the study.
+        outcome: How it ended.
+        reason: Why, if not by finishing.
+        figures: Name with unit -> value, as `run_figures` has them.
+        exceeded: Names of the signals that left their limits.
+        seconds: How long it took, building included.
+    """
+
+    run: int
+    outcome: Outcome
+    reason: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    exceeded: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The result of plain data.
+
+        Raises:
+            KeyError, TypeError, ValueError: The data are those of something else.
+        """
+        values = dict(data)
+        values["outcome"] = Outcome(values["outcome"])
+        values["exceeded"] = tuple(values["exceeded"])
+        return cls(**values)
+
+
+Batch = Sequence[tuple[int, Variation]]
+"""Runs of one structure, with their numbers."""
+
+
+def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
+    """Text that is equal for scenarios which one closed loop simulates.
+
+    They differ in what a context holds: start, parameters of the plant, numbers of gains that
+    couple no outputs, the seed; or in how they are run.
+    """
+    return json.dumps(_built(data, base), sort_keys=True)
+
+
+def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's data where all that a context holds is as in the base of the study.
+
+    So what is built does not depend on which run comes first.
+    """
+    own = dict(data)
+    for key in ("description", "plant_parameters", "duration", "integrator", "write"):
+        own[key] = base[key]
+    first, positions = base["start"], own["start"].get("positions", {})
+    if positions.keys() == first["positions"].keys():
+        positions = first["positions"]
+    own["start"] = {**first, "positions": positions}
+    tag = own["gains"].get(TAG, "!Poles")
+    if tag == base["gains"][TAG] != "!Matrices":
+        own["gains"] = base["gains"]
+    if "seed" in own["force"]:
+        own["force"] = {**own["force"], "seed": 0}
+    return own
+
+
+class Runner:
+    """Simulates runs of a study, and keeps the closed loop as long as their structure is the same.
+
+    Attributes:
+        builds: How many loops it has built; Drake does not free all of each.
+
+    Args:
+        base: The plain data of the study's scenario.
+    """
+
+    def __init__(self, base: Mapping[str, Any]) -> None:
+        self._base = base
+        self._key = ""
+        self._loop: ClosedLoop | None = None
+        self.builds = 0
+
+    def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
+        """The closed loop of a scenario's data.
+
+        Raises:
+            ScenarioError: Something does not fit; the message names its key.
+        """
+        built = _built(data, self._base)
+        key = json.dumps(built, sort_keys=True)
+        if self._loop is None or key != self._key:
+            self._loop = None
+            self.builds += 1
+            self._loop, self._key = build_loop(read_scenario(built)), key
+        return self._loop
+
+    def why_not(self, variation: Variation) -> ScenarioError | None:
+        """What is wrong with the words of a variation; None if nothing is.
+
+        That a start is out of reach, or an assumption fails, is an outcome of a run.
+        """
+        try:
+            data = varied_data(self._base, variation)
+            start_scenario(read_scenario(data), self.loop(data))
+        except ScenarioError as error:
+            return None if _is_about_states(error) else error
+        except DrakeDaeError:
+            return None
+        return None
+
+    def run_all(self, batch: Batch) -> Iterator[RunResult]:
+        """Simulates runs; each is told when it has ended."""
+        for number, variation in batch:
+            began = time.perf_counter()
+            try:
+                result = self._run(number, variation)
+            except Exception as error:  # A study of thousands goes on.
+                text = f"{type(error).__name__}: {brief(str(error))}"
+                result = RunResult(number, Outcome.CRASHED, text)
+            yield RunResult(**{**vars(result), "seconds": time.perf_counter() - began})
+
+    def _run(self, number: int, variation: Variation) -> RunResult:
+        try:
+            data = varied_data(self._base, variation)
+            scenario = read_scenario(data)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # Each worker would tell the same.
+                loop = self.loop(data)
+        except DrakeDaeError as error:
+            return RunResult(number, Outcome.REFUSED, str(error))
+        return _simulated(number, scenario, loop)
+
+
+def _is_about_states(error: BaseException | None) -> bool:
+    """Whether an error comes from states or assumptions, rather than from what a file says."""
+    while error is not None:
+        if isinstance(error, (AssumptionError, InconsistentStateError, SimulationError)):
+            return True
+        error = error.__cause__
+    return False
+
+
+def _simulated(number: int, scenario: Scenario, loop: ClosedLoop) -> RunResult:
+    """What a run comes to, from a new context of the loop."""
+    outcome, reason = Outcome.FINISHED, ""
+    try:
+        context = start_scenario(scenario, loop)
+    except DrakeDaeError as error:
+        return RunResult(number, Outcome.NO_START, str(error))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+        except InconsistentStateError as error:
+            return RunResult(number, Outcome.NO_START, str(error))
+        except SimulationError as error:
+            outcome, reason = Outcome.FAILED, str(error)
+        else:
+            if run.interrupted:
+                raise KeyboardInterrupt(run.interrupted)
+    record, limits = loop.record(context), Limits.of(cast(RobotPlant, loop.plant).model)
+    figures = run_figures(record, limits)
+    if outcome is Outcome.FINISHED:
+        figures["steps"] = float(run.steps)
+    return RunResult(number, outcome, reason, figures, tuple(exceeded(record, limits)))
+
+
+_ALONE = Lock()
+"""Threads of one process share what is built."""
+
+
+def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
+    """Simulates runs in this process, for a cluster's workers.
+
+    Args:
+        base: The scenario's plain data as JSON.
+        batch: The runs.
+    """
+    with _ALONE:
+        return [result.to_dict() for result in _runner(base).run_all(batch)]
+
+
+@lru_cache(maxsize=1)
+def _runner(base: str) -> Runner:
+    return Runner(json.loads(base))
+
+
+def batches(
+    base: Mapping[str, Any], runs: Iterable[tuple[int, Variation]], workers: int
+) -> list[Batch]:
+    """The runs by structure, in portions: a worker builds a loop once for each portion at most.
+
+    Args:
+        base: The plain data of the study's scenario.
+        runs: The runs.
+        workers: Among how many they are shared.
+    """
+    groups: dict[str, list[tuple[int, Variation]]] = {}
+    for number, variation in runs:
+        key = structure_key(varied_data(base, variation), base)
+        groups.setdefault(key, []).append((number, variation))
+    total = sum(map(len, groups.values()))
+    size = max(1, min(32, total // (8 * workers)))
+    return [
+        group[first : first + size]
+        for group in groups.values()
+        for first in range(0, len(group), size)
+    ]

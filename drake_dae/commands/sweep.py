@@ -1,0 +1,37 @@
+"""`drake-dae sweep`: runs a scenario many times with other values."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.diagrams.sweep.sweep import sweep
+from drake_dae.diagrams.sweep.variations import parse_variations
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """Runs the study that the options describe; returns the exit code."""
+    path = find_scenario(options.scenario)
+    scenario = load_scenario(path, options.settings)
+    variations = parse_variations(
+        options.vary, scenario, options.random, options.seed, options.together
+    )
+    folder = options.out or Path("runs") / f"{path.stem}-sweep"
+    file = folder / "runs.jsonl"
+    try:
+        study = sweep(
+            scenario,
+            variations,
+            file,
+            workers=options.workers,
+            cluster=options.cluster,
+            progress=True,
+        )
+    except KeyboardInterrupt:
+        print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
+        raise
+    files = study.save(folder)
+    names = ", ".join([file.name, *(written.name for written in files)])
+    print(f"{study}\nwritten to {folder}/: {names}", flush=True)
+    return 0

@@ -1,0 +1,134 @@
+"""Runs of a study against the same scenarios run alone, and how each ends."""
+
+import numpy as np
+import pytest
+from runs import run_scenario, scenario
+
+from drake_dae.diagrams.scenario import read_scenario, scenario_data, varied_data
+from drake_dae.diagrams.sweep.runs import Outcome, Runner, RunResult, batches, structure_key
+from drake_dae.simulation.figures import run_figures
+from drake_dae.simulation.summary import Limits
+
+SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
+
+# All of them live in a context of one closed loop.
+NUMBERS = [
+    {},
+    {"start.errors.tool.z": 0.02},
+    {"start.positions.joint1": 1.1},
+    {"plant_parameters.link1.mass": 11.0},
+    {"plant_parameters.link1.mass": [11.0]},
+    {"plant_parameters": {"wall.position": [1.21, 0.0, 0.0]}},
+    {"gains.all": [-8.0]},
+    {"gains": {"outputs": {"tool.z": [-3.0, -5.0]}}},
+    {"integrator.accuracy": 1e-4, "duration": 0.2},
+    {"integrator.start_time": 0.5},
+    {"write.plots": False, "description": "other"},
+    {},
+]
+
+
+def alone(base, changes):
+    """The figures of a variation in a closed loop of its own."""
+    chosen = read_scenario(varied_data(base, changes))
+    loop, _, record = run_scenario(chosen)
+    return run_figures(record, Limits.of(loop.plant.model))
+
+
+def check(base, changes, result, tolerance=0.0):
+    assert (result.outcome, result.reason) == (Outcome.FINISHED, "")
+    figures = dict(result.figures)
+    assert figures.pop("steps") >= 1
+    expected = alone(base, changes)
+    assert list(figures) == list(expected)
+    np.testing.assert_allclose(
+        list(figures.values()), list(expected.values()), rtol=tolerance, atol=tolerance
+    )
+
+
+@pytest.mark.slow
+def test_runs_that_share_a_loop_equal_runs_alone():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    assert len({structure_key(varied_data(base, changes), base) for changes in NUMBERS}) == 1
+    runner = Runner(base)
+    found = list(runner.run_all(list(enumerate(NUMBERS))))
+    assert runner.builds == 1
+    assert [result.run for result in found] == list(range(len(NUMBERS)))
+    for changes, result in zip(NUMBERS, found, strict=True):
+        # To the last bit, but where the nominal state of the model is another one, and a start is
+        # found from there by Newton's method to round-off.
+        check(base, changes, result, 1e-9 if "start.positions.joint1" in changes else 0.0)
+    assert found[0].figures == found[-1].figures
+    assert found[3].figures == found[4].figures != found[0].figures
+
+
+@pytest.mark.slow
+def test_seeds_of_the_sensor():
+    base = scenario_data(scenario("two_link_measured_force", "duration=0.05", "compiled=false"))
+    runner = Runner(base)
+    seeds = [1, 2, 1]
+    found = list(runner.run_all([(i, {"force.seed": seed}) for i, seed in enumerate(seeds)]))
+    assert runner.builds == 1
+    for seed, result in zip(seeds, found, strict=True):
+        check(base, {"force.seed": seed}, result)
+    assert found[0].figures == found[2].figures != found[1].figures
+
+
+@pytest.mark.slow
+def test_another_structure_is_built():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    variations = [
+        {"constraints.0.surface.point": [1.25, 0.0, 0.0]},
+        {"references.0.offset": 0.2},
+        {"gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}},
+        {"actuation": [{"_tag": "!DcMotors", "torque_constant": 0.5, "inductance": 1e-2,
+                        "resistance": 1.0, "gear_ratio": 100.0}],
+         "integrator.max_step_size": 1e-3},
+    ]  # fmt: skip
+    assert len({structure_key(varied_data(base, v), base) for v in [*variations, {}]}) == 5
+    runner = Runner(base)
+    for changes, result in zip(
+        variations, runner.run_all(list(enumerate(variations))), strict=True
+    ):
+        check(base, changes, result)
+    assert runner.builds == 4
+
+
+@pytest.mark.slow
+def test_what_goes_wrong_is_an_outcome_with_its_reason():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    far = {"references.0.offset": 1.0, "references.0.amplitudes": [0.9], "duration": 2.0}
+    cases = [
+        ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "found no configuration"),
+        ({"start.positions.joint1": 9.0}, Outcome.NO_START, "outside its limits"),
+        ({"plant_parameters.link7.mass": 1.0}, Outcome.NO_START, "no parameter 'link7.mass'"),
+        ({"gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
+        ({"constraints": []}, Outcome.REFUSED, ": "),
+        ({"duration": -1.0}, Outcome.REFUSED, "a duration must be positive"),
+        (far, Outcome.FAILED, "the simulation cannot go on at t = "),
+        ({}, Outcome.FINISHED, ""),
+    ]
+    results = Runner(base).run_all([(i, changes) for i, (changes, _, _) in enumerate(cases)])
+    for (_, outcome, words), result in zip(cases, results, strict=True):
+        assert result.outcome is outcome, result
+        assert words in result.reason
+        assert bool(result.figures) == (outcome in (Outcome.FAILED, Outcome.FINISHED))
+        assert RunResult.from_dict(result.to_dict()) == result
+        if outcome is Outcome.FAILED:
+            assert 0.0 < result.figures["end [s]"] < 2.0
+
+
+def test_batches_have_one_structure_and_all_runs():
+    base = scenario_data(scenario("two_link_wall"))
+    walls = [1.2, 1.25, 1.3]
+    runs = [
+        (i, {"constraints.0.surface.point": [walls[i % 3], 0, 0], "start.errors.tool.z": 0.01 * i})
+        for i in range(300)
+    ]
+    found = batches(base, runs, workers=2)
+    assert sorted(pair for batch in found for pair in batch) == runs
+    for batch in found:
+        assert 1 <= len(batch) <= 32
+        assert len({run % 3 for run, _ in batch}) == 1
+    # With few runs no worker waits for another one.
+    assert [len(batch) for batch in batches(base, runs[:5], workers=2)] == [1] * 5

@@ -1,0 +1,67 @@
+"""The figures of a run, of a record made by hand."""
+
+import numpy as np
+
+from drake_dae import Record, Signal
+from drake_dae.simulation.figures import exceeded, margins, run_figures
+from drake_dae.simulation.record import Recorded
+from drake_dae.simulation.summary import Limits
+
+
+def recorded(names, unit, *columns):
+    return Recorded(np.array(columns, float).T, tuple(Signal(name, unit) for name in names))
+
+
+RECORD = Record(
+    np.array([0.0, 0.5, 2.0]),
+    {
+        "tracking_error": recorded(["z", "f"], "m", [0.1, -0.3, 0.05], [0.0, 1.0, -2.0]),
+        "constraint_force": recorded(["wall.force", "weld.fx"], "N", [5, -1, 8], [-3, -4, -5]),
+        "control": recorded(["motor", "free"], "N m", [1, -7, 2], [0, 0, 100]),
+        "constraint_residual": recorded(["wall"], "m", [1e-12, -3e-9, 0]),
+        "state": recorded(["q1", "q2", "v1"], "rad", [0, 0.5, 2], [-1 - 1e-12, 0, 1], [9, 9, 9]),
+    },
+)
+LIMITS = Limits(
+    control=np.array([10.0, np.inf]),
+    state=(np.array([-1.0, -1.0, -np.inf]), np.array([1.5, 2.0, np.inf])),
+    pushing=frozenset({"wall.force"}),
+)
+
+
+def test_figures_by_hand():
+    assert run_figures(RECORD, LIMITS) == {
+        "largest error of z [m]": 0.3,
+        "final error of z [m]": 0.05,
+        "largest error of f [m]": 2.0,
+        "final error of f [m]": -2.0,
+        "least wall.force [N]": -1.0,
+        "largest wall.force [N]": 8.0,
+        "least weld.fx [N]": -5.0,
+        "largest weld.fx [N]": -3.0,
+        "largest motor [N m]": 7.0,
+        "largest free [N m]": 100.0,
+        "margin of motor [N m]": 3.0,
+        "margin of q1 [rad]": -0.5,
+        "margin of q2 [rad]": 0.0,
+        "largest residual": 3e-9,
+        "end [s]": 2.0,
+    }
+
+
+def test_what_left_its_limits():
+    """A force that pulls, a joint beyond; round-off on a limit is none."""
+    assert exceeded(RECORD, LIMITS) == ["wall.force", "q1"]
+    assert [signal.name for signal, _ in margins(RECORD, Limits(pushing=frozenset()))] == []
+
+
+def test_an_empty_record_has_none():
+    empty = Record(
+        np.zeros(0),
+        {
+            name: Recorded(values.values[:0], values.signals)
+            for name, values in RECORD.signals.items()
+        },
+    )
+    assert run_figures(empty, LIMITS) == {}
+    assert exceeded(empty, LIMITS) == []
