@@ -149,12 +149,15 @@ def independent_constraints(samples: Samples) -> list[int]:
 
 def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
     """A system with some of its constraints and their inputs alone."""
+    signals = tuple(system.constraint_input_signals[i] for i in kept)
+    names = {signal.name for signal in signals}
     return replace(
         system,
         g=system.g[:, kept],
         k=system.k[kept],
         m=system.m[:, kept],
-        constraint_input_signals=tuple(system.constraint_input_signals[i] for i in kept),
+        contacts=tuple(contact for contact in system.contacts if contact.force in names),
+        constraint_input_signals=signals,
         constraint_output_signals=tuple(system.constraint_output_signals[i] for i in kept),
         implicit=_fewer(system, kept),
     )

@@ -172,4 +172,5 @@ class Kinematics(ABC):
             turning = ca.SX.sym("moment", 3)
             acting, given = ca.vertcat(pushing, turning), ca.vertcat(force, moment)
             power += ca.dot(turning, self.angular_velocity(frame))
+        given = ca.densify(given)
         return self.reaction(power).map(lambda part: ca.substitute(part, acting, given))
