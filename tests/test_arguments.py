@@ -40,6 +40,7 @@ from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.diagrams.sweep.runs import Outcome, RunResult
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.contact.constraint import Constraint
@@ -164,6 +165,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Reaction: lambda: Reaction(ca.SX(2, 1)),
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
     RigidTransform: RigidTransform,
+    RunResult: lambda: RunResult(0, Outcome.FINISHED, figures={"steps": 1.0}),
     SceneGraph: SceneGraph,
     Scenario: scenario,
     SimulatorConfig: fixed_step,
@@ -265,6 +267,11 @@ PLACES: dict[str, Callable[[], Any]] = {
     "mass_matrix": lambda: ca.SX(2.0),
     "bias": lambda: ca.SX(0.0),
     "path": lambda: find_scenario("two_link_wall"),
+    "values of grid_variations": lambda: {"duration": [1.0, 2.0]},
+    "values of listed_variations": lambda: {"duration": [1.0, 2.0]},
+    "ranges": lambda: {"duration": (1.0, 2.0)},
+    "variations of Study": lambda: ({"duration": 1.0},),
+    "figure": lambda: "steps",
     "loggers": lambda: loop().loggers,
     "groups": lambda: [np.eye(1), np.eye(1)],
 }
@@ -467,6 +474,8 @@ SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
     "Record.save": "it writes where it is told",
     "export_code": "it writes where it is told",
+    "sweep": "it writes where it is told",
+    "Study.save": "it writes where it is told",
 }
 
 

@@ -38,6 +38,13 @@ class Study:
     variations: tuple[Variation, ...]
     results: tuple[RunResult, ...]
 
+    def __post_init__(self) -> None:
+        if len(self.variations) != len(self.results):
+            raise ModelError(
+                f"a study has a result for each variation, got {len(self.results)} for "
+                f"{len(self.variations)}"
+            )
+
     def __repr__(self) -> str:
         return f"Study({count_of(len(self.results), 'run')}: {_counts(self.results)})"
 
