@@ -1,8 +1,8 @@
 """The one wiring: plant, reference, controller, loggers, and a view of the robot."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
@@ -43,6 +43,7 @@ class ClosedLoop:
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
+        memory: What `rollout` made of the loop, and uses again.
     """
 
     diagram: Diagram
@@ -54,6 +55,7 @@ class ClosedLoop:
     sensor: ForceSensor | None
     noise: RandomSource | None
     exogenous: ReferenceGenerator | None = None
+    memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.loggers)})"
@@ -76,7 +78,10 @@ class ClosedLoop:
             context: The diagram's context.
             after: Only what was logged later than this time, in s; None for all.
         """
-        record = Record.from_logs(self.loggers, context, after)
+        return self.with_errors(Record.from_logs(self.loggers, context, after))
+
+    def with_errors(self, record: Record) -> Record:
+        """A record of the logged signals with `desired_output` and `tracking_error` besides."""
         desired = record["reference"][:, self.controller.law.layout.lowest]
         outputs = record.signals["controlled_output"]
         derived = {

@@ -16,8 +16,9 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.redundancy import manifold_of_left_out
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.failures import off_manifold
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
@@ -67,6 +68,10 @@ class DaePlant(ParameterizedSystem):
         structure: The structure of the system, by `find_constraint_structure` or
             `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
+
+    Attributes:
+        structure: The structure.
+        projects: Whether the state is projected onto N* after each step.
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
@@ -132,7 +137,8 @@ class DaePlant(ParameterizedSystem):
             by_control if self._output_needs_control else by_state,
         )
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
-        if project and system.num_constraints:
+        self.projects = bool(project and system.num_constraints)
+        if self.projects:
             self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
 
     def state(self, context: Context) -> FloatArray:
@@ -206,11 +212,23 @@ class DaePlant(ParameterizedSystem):
         )
 
     def _check_start(self, context: Context) -> EventStatus:
+        self.check_start(self.state(context), self._values(context))
+        return EventStatus.DidNothing()
+
+    def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a start that is off N*.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters.
+
+        Raises:
+            InconsistentStateError: It is.
+        """
         manifold = self.structure.manifold
-        state, parameters = self.state(context), self._values(context)
         if manifold.is_consistent(state, parameters):
             self._check_left_out(state, parameters)
-            return EventStatus.DidNothing()
+            return
         residual = manifold.residual(state, parameters)
         table = ", ".join(
             f"{signal.name} = {value:.3g} {signal.unit}"
@@ -244,13 +262,6 @@ class DaePlant(ParameterizedSystem):
         try:
             x = self.structure.manifold.project(x, self._values(context))
         except InconsistentStateError as error:
-            time = context.get_time()
-            raise SimulationError(
-                f"the state left the constraint too far at t = {time:.6g} s, state "
-                f"{show(x)}: {error}. Take smaller "
-                "steps or a better accuracy",
-                time,
-                x,
-            ) from error
+            raise off_manifold(context.get_time(), x, error) from error
         state.get_mutable_continuous_state().SetFromVector(x)
         return EventStatus.Succeeded()
