@@ -1,7 +1,8 @@
 """The one wiring: plant, reference, controller, loggers, and a view of the robot."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,6 +48,7 @@ class ClosedLoop:
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
         plant_exogenous: That for the plant, or None.
+        memory: What `rollout` made of the loop, and uses again.
     """
 
     diagram: Diagram
@@ -60,6 +62,7 @@ class ClosedLoop:
     noise: RandomSource | None
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
+    memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.signals)})"
@@ -110,13 +113,18 @@ class ClosedLoop:
             values["control"] = known["control"] = function_along(law.function, given)
         values |= {port: self.plant.along(port, known) for port in self.plant.functions}
 
-        desired = values["reference"][:, self.controller.law.layout.lowest]
-        values["desired_output"] = desired
-        values["tracking_error"] = values["controlled_output"] - desired
-        outputs = self.signals["controlled_output"]
-        signals = {**self.signals, "desired_output": outputs, "tracking_error": outputs}
-        recorded = {name: Recorded(values[name], tuple(signals[name])) for name in signals}
-        return Record(times, recorded).while_finite()
+        recorded = {n: Recorded(values[n], tuple(self.signals[n])) for n in self.signals}
+        return self.with_errors(Record(times, recorded)).while_finite()
+
+    def with_errors(self, record: Record) -> Record:
+        """A record with `desired_output` and `tracking_error` besides."""
+        desired = record["reference"][:, self.controller.law.layout.lowest]
+        outputs = record.signals["controlled_output"]
+        derived = {
+            "desired_output": Recorded(desired, outputs.signals),
+            "tracking_error": Recorded(outputs.values - desired, outputs.signals),
+        }
+        return Record(record.time, {**record.signals, **derived})
 
     def _refuse_fixed_ports(self, context: Context) -> None:
         taker, own = self.controller, self.controller.GetMyContextFromRoot(context)

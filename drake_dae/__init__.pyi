@@ -34,6 +34,8 @@ from .diagrams.build import build_scenario as build_scenario
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
 from .diagrams.closed_loop import make_closed_loop as make_closed_loop
 from .diagrams.export.export import export_code as export_code
+from .diagrams.rollout.rollout import rollout as rollout
+from .diagrams.rollout.rollout import start_values as start_values
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
 from .diagrams.sweep.study import Study as Study

@@ -274,6 +274,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "figure": lambda: "steps",
     "loggers": lambda: loop().loggers,
     "groups": lambda: [np.eye(1), np.eye(1)],
+    "starts": state,
+    "parameters of rollout": lambda: None,
 }
 
 # What makes no sense for most arguments. Nothing is large: a long run that is asked for is none.

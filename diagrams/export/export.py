@@ -22,6 +22,7 @@ from drake_dae.diagrams.export.samples import Call, samples, tests
 from drake_dae.diagrams.export.text import braced, comment, string
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import generate
+from drake_dae.trace.functions import TracedFunction
 
 TEMPLATES = Path(__file__).parent / "c99"
 
@@ -172,7 +173,10 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
     residual = system.trace(
         "residual", {"constraint_residual": structure.manifold.residual_expression}
     )
-    step = structure.manifold.newton_step
+    own = structure.manifold.newton_step
+    inputs = {name: own.function.sx_in(i) for i, name in enumerate(own.input_names)}
+    moved = ca.SX(system.scale) * own.function(*inputs.values())[0]
+    step = TracedFunction("step to the manifold", inputs, {"step": moved}, often=False)
     names = law.function.input_names
     return {
         "law": Call(law.function, [*names[:-1], "law_parameters"], law.function.output_names),

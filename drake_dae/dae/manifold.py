@@ -123,11 +123,11 @@ class Manifold:
 
     @cached_property
     def _newton(self) -> TracedFunction:
-        """The Newton step from a state, by the gradients at another one."""
+        """The Newton step from a state, over its scale, by the gradients at another one."""
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(ca.jacobian(self.residual_expression, state), state, other)
         scale = ca.SX(self._scale)
-        step = scale * _shortest_step(gradient, scale)[0](self.residual_expression)
+        step = _shortest_step(gradient, scale)[0](self.residual_expression)
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
@@ -152,7 +152,7 @@ class Manifold:
 
     @property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, by the gradients at another one.
+        """The Newton step of least norm from a state, over its scale, by the gradients at another.
 
         A function of state, the other state and parameters.
         """
@@ -298,7 +298,7 @@ class Manifold:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""
         scale = self._scale
         return Linearization(
-            lambda z: self._newton.evaluate(scale * z, state, parameters)[0] / scale,
+            lambda z: self._newton.evaluate(scale * z, state, parameters)[0].copy(),
             is_regular=True,
         )
 

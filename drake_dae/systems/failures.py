@@ -4,7 +4,12 @@ from collections.abc import Mapping, Sequence
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.signals import Signal
-from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
+from drake_dae.errors import (
+    InconsistentStateError,
+    NonFiniteError,
+    SimulationError,
+    SingularityError,
+)
 from drake_dae.trace.functions import Failure, Fault
 
 
@@ -56,3 +61,83 @@ def simulation_error(
                 time,
                 state,
             )
+
+
+def no_step_leads_on(
+    name: str, time: float, state: FloatArray, reason: SimulationError, text: str
+) -> SimulationError:
+    """The exception where every trial failed, of the kind of the reason, however short the step.
+
+    Args:
+        name: The block.
+        time: The time of the last accepted state, in s.
+        state: That state.
+        reason: A trial's failure.
+        text: What the earliest trial said.
+    """
+    return reason.retold(
+        f"{name}: no step leads on from t = {time:.6g} s{_at(state)} since each that was tried "
+        f"failed, however short: {text}",
+        time,
+        state if state.size else reason.state,
+    )
+
+
+def spoilt_step(
+    name: str, start: float, end: float, state: FloatArray, text: str
+) -> NonFiniteError:
+    """The exception where an integrator without error control accepted a trial that failed.
+
+    Args:
+        name: The block.
+        start, end: The times of the step, in s.
+        state: Where it began.
+        text: What the earliest trial said; empty if none failed.
+    """
+    reason = f": {text}" if text else ""
+    return NonFiniteError(
+        f"{name}: the step from t = {start:.6g} s{_at(state)} to t = {end:.6g} s led to a state "
+        f"that is not finite{reason}. Take smaller steps, or an integrator with error control",
+        start,
+        state,
+    )
+
+
+def endless_steps(
+    name: str, steps: int, start: float, end: float, state: FloatArray
+) -> SimulationError:
+    """The exception where many steps hardly led on.
+
+    Args:
+        name: The block.
+        steps: How many.
+        start, end: The times that they led from and to, in s.
+        state: Where they led.
+    """
+    return SimulationError(
+        f"{name}: the last {steps} steps led from t = {start:.12g} s only to {end:.12g} s"
+        f"{_at(state)} where it grows without bound, or jumps. Look at the gains and at what the "
+        "model has wrong; where that is in order, choose a fixed step",
+        end,
+        state,
+    )
+
+
+def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError) -> SimulationError:
+    """The exception where a state cannot be projected onto N*.
+
+    Args:
+        time: The time, in s.
+        state: The state, shape (n,).
+        reason: What the projection said.
+    """
+    return SimulationError(
+        f"the state left the constraint too far at t = {time:.6g} s, state {show(state)}: "
+        f"{reason}. Take smaller steps or a better accuracy",
+        time,
+        state,
+    )
+
+
+def _at(state: FloatArray) -> str:
+    return f", state {show(state)}," if state.size else ""

@@ -29,6 +29,7 @@ from drake_dae.errors import (
 )
 from drake_dae.systems.along import function_along
 from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.failures import off_manifold
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
@@ -87,6 +88,8 @@ class DaePlant(ParameterizedSystem):
         project: False leaves the drift off N* uncorrected, to study it.
 
     Attributes:
+        structure: The structure.
+        projects: Whether the state is projected onto N* after each step.
         functions: Name of an output port -> its function of state, parameters and, for some, the
             control.
 
@@ -169,7 +172,8 @@ class DaePlant(ParameterizedSystem):
             by_control if self._output_needs_control else by_state,
         )
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
-        if project and system.num_constraints:
+        self.projects = bool(project and system.num_constraints)
+        if self.projects:
             self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
 
     def state(self, context: Context) -> FloatArray:
@@ -319,11 +323,23 @@ class DaePlant(ParameterizedSystem):
         )
 
     def _check_start(self, context: Context) -> EventStatus:
+        self.check_start(self.state(context), self._values(context))
+        return EventStatus.DidNothing()
+
+    def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a start that is off N*.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters.
+
+        Raises:
+            InconsistentStateError: It is.
+        """
         manifold = self.structure.manifold
-        state, parameters = self.state(context), self._values(context)
         if manifold.is_consistent(state, parameters):
             self._check_left_out(state, parameters)
-            return EventStatus.DidNothing()
+            return
         residual = manifold.residual(state, parameters)
         table = ", ".join(
             f"{signal.name} = {value:.3g} {signal.unit}"
@@ -359,13 +375,6 @@ class DaePlant(ParameterizedSystem):
                 x, self._values(context), lambda near: self._crosses(near, context)
             )
         except InconsistentStateError as error:
-            time = context.get_time()
-            raise SimulationError(
-                f"the state left the constraint too far at t = {time:.6g} s, state "
-                f"{show(x)}: {error}. Take smaller "
-                "steps or a better accuracy",
-                time,
-                x,
-            ) from error
+            raise off_manifold(context.get_time(), x, error) from error
         state.get_mutable_continuous_state().SetFromVector(x)
         return EventStatus.Succeeded()

@@ -109,6 +109,9 @@ class ReferenceGenerator(DifferentiableSystem):
         references: The references, in the order of the outputs; together they cover all of them.
         degrees: The degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
 
+    Attributes:
+        references, degrees: The arguments.
+
     The block converts to AutoDiffXd. A time that has derivatives itself asks each reference for
     one more.
 
@@ -128,7 +131,7 @@ class ReferenceGenerator(DifferentiableSystem):
             raise ReferenceSignalError(
                 f"the references cover {covered} outputs, the law has {len(degrees)}"
             )
-        self._references, self._degrees = tuple(references), tuple(degrees)
+        self.references, self.degrees = tuple(references), tuple(degrees)
         self._evaluate = stack_references(references, degrees)
         self.DeclareVectorOutputPort(
             "reference",
@@ -150,7 +153,7 @@ class ReferenceGenerator(DifferentiableSystem):
         output.SetFromVector(self._evaluate(context.get_time()))
 
     def _formulas(self) -> dict[str, Formula]:
-        return {"reference": _ReferenceFormula(self._references, self._degrees)}
+        return {"reference": _ReferenceFormula(self.references, self.degrees)}
 
 
 class _ReferenceFormula:

@@ -40,6 +40,10 @@ class ForceSensor(DifferentiableSystem):
         bias: A constant error in N, a number or shape (m,).
         noise_deviation: The standard deviation of the noise in N, a number or shape (m,).
 
+    Attributes:
+        time_constant, sample_period, bias, noise_deviation: The arguments, the last two as arrays
+            of shape (m,).
+
     Raises:
         ModelError: A number is negative, or there is neither lag nor sampling.
     """
@@ -59,15 +63,16 @@ class ForceSensor(DifferentiableSystem):
         self.time_constant = float(time_constant)
         self.sample_period = float(sample_period)
         try:
-            self._bias = np.broadcast_to(np.asarray(bias, dtype=float), (size,))
-            self._deviation = np.broadcast_to(np.asarray(noise_deviation, dtype=float), (size,))
+            given = [np.asarray(value, dtype=float) for value in (bias, noise_deviation)]
+            self.bias, self.noise_deviation = (np.broadcast_to(value, (size,)) for value in given)
         except ValueError:
             raise ModelError(
                 f"a ForceSensor's bias and noise_deviation are numbers or shape ({size},), got "
                 f"{bias!r} and {noise_deviation!r}"
             ) from None
-        numbers = [self.time_constant, self.sample_period, *self._bias, *self._deviation]
-        negative = self.time_constant < 0 or self.sample_period < 0 or (self._deviation < 0).any()
+        positive = [self.time_constant, self.sample_period, *self.noise_deviation]
+        negative = any(number < 0 for number in positive)
+        numbers = [*positive, *self.bias]
         if negative or not np.all(np.isfinite(numbers)):
             raise ModelError(
                 "a ForceSensor's time_constant, sample_period and noise_deviation must be finite "
@@ -80,7 +85,7 @@ class ForceSensor(DifferentiableSystem):
             )
         self._force_port = self.DeclareVectorInputPort("force", size)
         self._noise_port = None
-        if self._deviation.any():
+        if self.noise_deviation.any():
             self._noise_port = self.DeclareVectorInputPort("noise", size)
         if self.time_constant:
             self.DeclareContinuousState(size)
@@ -102,7 +107,7 @@ class ForceSensor(DifferentiableSystem):
         if self.time_constant:
             context.SetContinuousState(value)
         if self.sample_period:
-            context.SetDiscreteState(self._held, value + self._bias)
+            context.SetDiscreteState(self._held, value + self.bias)
 
     def largest_stable_gain(self) -> float:
         """The largest gain Gbar of (59) for which a rigid robot's force error decays.
@@ -138,8 +143,8 @@ class ForceSensor(DifferentiableSystem):
         else:
             value = self._force_port.Eval(context)
         if self._noise_port is not None:
-            value = value + self._deviation * self._noise_port.Eval(context)
-        return value + self._bias
+            value = value + self.noise_deviation * self._noise_port.Eval(context)
+        return value + self.bias
 
     def _sample(self, context: Context, state: object) -> None:
         state.set_value(self._held, self._felt(context))  # type: ignore[attr-defined]
@@ -166,8 +171,8 @@ class ForceSensor(DifferentiableSystem):
         inputs, measured = {"state": felt}, felt
         if self._noise_port is not None:
             inputs["noise"] = noise
-            measured = measured + self._deviation * noise
-        output = TracedFunction("measured force", inputs, {"value": measured + self._bias})
+            measured = measured + self.noise_deviation * noise
+        output = TracedFunction("measured force", inputs, {"value": measured + self.bias})
         return {
             "derivative": TracedFormula(rate),
             "measured_force": TracedFormula(output),

@@ -23,8 +23,9 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from drake_dae.arrays import FloatArray, show
-from drake_dae.errors import NonFiniteError, SimulationError
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import SimulationError
+from drake_dae.systems.failures import endless_steps, no_step_leads_on, spoilt_step
 from drake_dae.systems.lifetime import weakly
 
 FAILURES = 1000
@@ -118,12 +119,8 @@ class StepWatch:
             progress.reason, progress.reason_time = str(error), error.time
         if step > SHORTEST * abs(error.time) and progress.failures < FAILURES:
             return
-        raise error.retold(
-            f"{self._system.get_name()}: no step leads on from t = {progress.time:.6g} s"
-            f"{_at(progress.state)} since each that was tried failed, however short: "
-            f"{progress.reason}",
-            progress.time,
-            progress.state if progress.state.size else error.state,
+        raise no_step_leads_on(
+            self._system.get_name(), progress.time, progress.state, error, progress.reason
         ) from None
 
     def parameters_along(self, context: Context, times: FloatArray) -> FloatArray:
@@ -158,7 +155,8 @@ class StepWatch:
             state = context.get_continuous_state_vector().value().copy()
             # The sum takes a fifth of the time, and may overflow.
             if not (isfinite(sum(state.tolist())) or np.isfinite(state).all()):
-                raise self._spoilt(progress, time)
+                name = self._system.get_name()
+                raise spoilt_step(name, progress.time, time, progress.state, progress.reason)
             progress.state = state
             progress.steps += 1
             if progress.steps % STEPS == 0:
@@ -168,28 +166,11 @@ class StepWatch:
             progress.failures, progress.reason, progress.reason_time = 0, "", inf
         return _DONE
 
-    def _spoilt(self, progress: Progress, time: float) -> NonFiniteError:
-        """The error where an integrator without error control accepted a trial that failed."""
-        reason = f": {progress.reason}" if progress.reason else ""
-        return NonFiniteError(
-            f"{self._system.get_name()}: the step from t = {progress.time:.6g} s"
-            f"{_at(progress.state)} to t = {time:.6g} s led to a state that is not finite"
-            f"{reason}. Take smaller steps, or an integrator with error control",
-            progress.time,
-            progress.state,
-        )
-
     def _check_pace(self, progress: Progress, time: float) -> None:
         before, progress.mark = progress.mark, time
         if time - before < SLOWEST * (time - progress.start):
-            raise SimulationError(
-                f"{self._system.get_name()}: the last {STEPS} steps led from t = {before:.12g} s "
-                f"only to {time:.12g} s{_at(progress.state)} where it grows without bound, or "
-                "jumps. Look at the gains and at what the model has wrong; where that is in order, "
-                "choose a fixed step",
-                time,
-                progress.state,
-            )
+            name = self._system.get_name()
+            raise endless_steps(name, STEPS, before, time, progress.state)
 
 
 def _no_simulation() -> AbstractValue:
@@ -205,7 +186,3 @@ def _note_parameters(context: Context, value: AbstractValue) -> None:
 
 def _parameters(context: Context) -> FloatArray:
     return np.array(context.get_numeric_parameter(0).value())
-
-
-def _at(state: FloatArray) -> str:
-    return f", state {show(state)}," if state.size else ""

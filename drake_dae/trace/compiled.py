@@ -121,37 +121,67 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     Warns:
         MachineCodeWarning: It should be made and cannot be.
     """
+    # A branch for each result takes the compiler ten times as long where they are many.
+    source = without_branches(generate(function))
+    path = library(source, function.n_instructions(), compiled, make)
+    if path is None:
+        return None
     try:
-        return _machine_code(function, compiled, make)
+        return _load(function.name(), str(path))
     except MachineCodeError as error:
-        if make:
-            # One text at one place: Python tells it once.
-            warnings.warn(
-                f"{error}. Functions run interpreted, at about a tenth of the speed; that is "
-                "chosen without this warning by compiled=False (scenarios: compiled: false)",
-                MachineCodeWarning,
-                stacklevel=1,
-            )
+        _tell(error, make)
         return None
 
 
-def _machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Function | None:
+def library(source: str, operations: int, compiled: Compiled, make: bool) -> Path | None:
+    """C source as a shared library in the cache; None if there is none.
+
+    Args:
+        source: The source.
+        operations: About how many operations it has, which tells how long it compiles.
+        compiled: The choice, True or "auto".
+        make: Whether to make it where the cache has none.
+
+    Warns:
+        MachineCodeWarning: It should be made and cannot be.
+    """
+    try:
+        return _library(source, operations, compiled, make)
+    except MachineCodeError as error:
+        _tell(error, make)
+        return None
+
+
+def _tell(error: MachineCodeError, make: bool) -> None:
+    if make:
+        # One text at one place: Python tells it once.
+        warnings.warn(
+            f"{error}. Functions run interpreted, at about a tenth of the speed; that is "
+            "chosen without this warning by compiled=False (scenarios: compiled: false)",
+            MachineCodeWarning,
+            stacklevel=1,
+        )
+
+
+def _library(source: str, operations: int, compiled: Compiled, make: bool) -> Path | None:
     compiler = find_compiler()
-    # A branch for each result takes the compiler ten times as long where they are many.
-    source = re.sub(r"if \(res\[\d+\]!=0\) (?=res\[)", "", generate(function))
     levels = ("-O1", "-O0") if compiled == "auto" else ("-O1",)
     for level in levels:
         path = files.find(_key(source, compiler, level))
         if path is not None:
-            return _load(function.name(), str(path))
-    level = _level(compiled, function.n_instructions())
+            return path
+    level = _level(compiled, operations)
     if not (make and level):
         return None
     with files.workplace() as place:
         seconds = HANGS if compiled is True else PATIENCE * LIMIT
         compiler.compile(source, place / "code", level, seconds)
-        path = files.store(_key(source, compiler, level), place / "code.so")
-    return _load(function.name(), str(path))
+        return files.store(_key(source, compiler, level), place / "code.so")
+
+
+def without_branches(source: str) -> str:
+    """C source of CasADi's that writes all results, without a look whether they are wanted."""
+    return re.sub(r"if \(res\[\d+\]!=0\) (?=res\[)", "", source)
 
 
 def generate(*functions: ca.Function) -> str:

@@ -1,0 +1,216 @@
+"""A closed loop as functions of time, state and parameters."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.references import Reference
+from drake_dae.dae.signals import Signal
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.trace.functions import TracedFunction
+
+
+@dataclass(frozen=True, eq=False)
+class LoopFunctions:
+    """The functions of a closed loop, from which its derivative and its record are computed.
+
+    Attributes:
+        loop: The closed loop.
+        signals: t -> R(t), and what moves with its derivatives, for the plant and for the law.
+        plant: (x, u, parameters) -> x' and v.
+        rest: (x, v, parameters) -> what else the record has of the plant, below each other.
+        rest_signals: Name -> names and units of its entries.
+    """
+
+    loop: ClosedLoop
+    signals: TracedFunction
+    plant: TracedFunction
+    rest: TracedFunction
+    rest_signals: Mapping[str, Sequence[Signal]]
+
+    @property
+    def law(self) -> TracedFunction:
+        """The law: (x, R, measured forces if it takes them, parameters) -> u, and the error."""
+        return self.loop.controller.law.function
+
+    @property
+    def newton(self) -> TracedFunction:
+        """The Newton step to N*, in states over their scale."""
+        return self.loop.plant.structure.manifold.newton_step
+
+    @cached_property
+    def motion(self) -> TracedFunction:
+        """Plant, law and sensor at once: what both compute of the state is computed once.
+
+        A function of the state with that of the sensor, of R, of what the sensor holds (or its
+        noise), and of the parameters of plant and law. It returns the derivative, v, u, the
+        measured force, and a number that is finite if all matrices are regular.
+        """
+        loop, dae = self.loop, self.loop.plant.dae
+        lags, sensor = self.num_lags, loop.sensor
+        names = ("state", "reference", "hold", "plant", "law")
+        sizes = (
+            dae.num_states + lags,
+            self.law.sizes[1],
+            dae.num_constraints,
+            self.plant.sizes[-1],
+            self.law.sizes[-1],
+        )
+        inputs = {name: ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)}
+        state, reference, hold, plant, law = inputs.values()
+        x, felt, measured = state[: dae.num_states], state[dae.num_states :], []
+        if self.is_direct:
+            measured = [self.plant.function(x, ca.SX.zeros(dae.num_controls), plant)[1]]
+        elif sensor is not None and sensor.sample_period:
+            measured = [hold]
+        elif sensor is not None:
+            measured = [felt + sensor.bias + sensor.noise_deviation * hold]
+        control, _, *of_law = self.law.function(x, reference, *measured, law)
+        rate, force, *of_plant = self.plant.function(x, control, plant)
+        if lags and sensor is not None:
+            rate = ca.vertcat(rate, (force - felt) / sensor.time_constant)
+        shown = measured[0] if sensor is not None else ca.SX(0, 1)
+        outputs = {"rate": rate, "force": force, "control": control, "measured": shown}
+        valid = {"valid": of_law[-1] + of_plant[-1]}
+        return TracedFunction(f"{dae.name} closed loop", inputs, {**outputs, **valid})
+
+    @cached_property
+    def residual(self) -> TracedFunction:
+        """What is zero on N*, as a function of state and parameters."""
+        manifold = self.loop.plant.structure.manifold
+        return manifold.system.trace("manifold", {"residual": manifold.residual_expression})
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether the law reads the constraint force without a sensor."""
+        return bool(self.loop.controller.law.measured_force) and self.loop.sensor is None
+
+    @property
+    def num_lags(self) -> int:
+        """How many states the sensor has."""
+        sensor = self.loop.sensor
+        return self.loop.plant.dae.num_constraints if sensor and sensor.time_constant else 0
+
+    def plant_parameters(self, values: FloatArray) -> Callable[[float], FloatArray]:
+        """The plant's parameters at a time in s, those that move as they are then.
+
+        Args:
+            values: The others.
+        """
+        if self.loop.exogenous is None:
+            return lambda time: values
+
+        def current(time: float) -> FloatArray:
+            found = values.copy()
+            moving = self.signals.evaluate(np.array([time]))[1]
+            found[self.loop.plant.exogenous_places] = moving
+            return found
+
+        return current
+
+    def measured(self, state: FloatArray, hold: FloatArray) -> FloatArray:
+        """What the sensor measures, shape (m,).
+
+        Args:
+            state: x, and then the state of the sensor if it has a lag.
+            hold: What it holds if it samples, else its noise.
+        """
+        sensor = self.loop.sensor
+        if sensor is None or sensor.sample_period:
+            return hold
+        return state[-self.num_lags :] + sensor.bias + sensor.noise_deviation * hold
+
+    @property
+    def num_operations(self) -> int:
+        """How many operations all functions have together."""
+        functions = (self.signals, self.motion, self.rest, self.residual, self.newton)
+        return sum(function.num_operations for function in functions)
+
+    @property
+    def columns(self) -> dict[str, Sequence[Signal]]:
+        """The columns of a row of the record: name -> names and units."""
+        loop, dae = self.loop, self.loop.plant.dae
+        moving = loop.plant.exogenous_layout.reference_signals(dae.exogenous.signals)
+        return {
+            "state": dae.state_signals,
+            **self.rest_signals,
+            "control": dae.control_signals,
+            "reference": loop.controller.law.reference_signals,
+            "exogenous": moving if "exogenous" in loop.signals else (),
+            "measured_force": dae.constraint_input_signals if loop.sensor else (),
+        }
+
+
+def loop_functions(loop: ClosedLoop) -> LoopFunctions:
+    """The functions of a closed loop.
+
+    Raises:
+        ModelError: A reference is no expression of time, or the loop has memory that no rollout
+            has: integrals of the law, a sampled law, or drives with limits.
+    """
+    plant, law = loop.plant, loop.controller.law
+    if law.integral.outputs or "control" in loop.loggers:
+        what = "integrals" if law.integral.outputs else "a sampled law, or drives with limits"
+        raise ModelError(f"a rollout does not know {what}; run the loop by simulate")
+    dae, structure = plant.dae, plant.structure
+    time = ca.SX.sym("t")
+    moving = loop.exogenous.references if loop.exogenous is not None else ()
+    signals = TracedFunction(
+        "reference",
+        {"time": time},
+        {
+            "R": _stacked(loop.reference.references, law.degrees, time),
+            "plant": _stacked(moving, plant.exogenous_layout.degrees, time),
+            "law": _stacked(moving, loop.controller.exogenous_layout.degrees, time),
+        },
+    )
+    derivatives = structure.derivatives
+    force = derivatives.expand(derivatives.constraint_input)
+    acting = ca.SX.sym("v", dae.num_constraints)
+    rest = {
+        "constraint_force": dae.forces(acting),
+        "constraint_residual": structure.manifold.residual_expression,
+        "controlled_output": dae.l + ca.mtimes(dae.m, acting),
+    }
+    named = {
+        "constraint_force": dae.force_signals,
+        "constraint_residual": structure.manifold.residual_signals,
+        "controlled_output": dae.output_signals,
+    }
+    if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
+        rest["loop_state"] = plant.model.loop_joints.state
+        named["loop_state"] = plant.model.loop_joints.signals
+    return LoopFunctions(
+        loop,
+        signals,
+        dae.trace(
+            "plant",
+            {"rate": derivatives.expand(derivatives.rate), "force": force},
+            {"control": derivatives.control},
+            structure.elimination.pivot,
+            "A(x) of Assumption (2)",
+        ),
+        dae.trace("signals", {"rest": ca.vertcat(*rest.values())}, {"force": acting}),
+        named,
+    )
+
+
+def _stacked(references: Sequence[Reference], degrees: Sequence[int], time: ca.SX) -> ca.SX:
+    rows, left = [ca.SX(0, 1)], list(degrees)
+    for reference in references:
+        own, left = left[: reference.size], left[reference.size :]
+        row = reference.expression(own, time)
+        if row is None:
+            raise ModelError(
+                f"a {type(reference).__name__} is no expression of time, and a rollout needs one: "
+                "take an ExpressionReference, PointToPointReference or SinusoidReference, or run "
+                "the loop by simulate"
+            )
+        rows.append(row)
+    return ca.vertcat(*rows)

@@ -1,0 +1,253 @@
+"""The whole closed loop as one function of start and parameters, without Drake in between."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, numbers
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.rollout import interpreted, machine
+from drake_dae.diagrams.rollout.failures import failure_of
+from drake_dae.diagrams.rollout.functions import LoopFunctions, loop_functions
+from drake_dae.diagrams.rollout.fused import Fused
+from drake_dae.diagrams.rollout.run import Ending, Problem, Run, Settings, num_cores
+from drake_dae.diagrams.rollout.samples import Samples
+from drake_dae.errors import ModelError, SimulationError
+from drake_dae.simulation.record import Record, Recorded
+from drake_dae.simulation.simulate import check_config
+from drake_dae.systems.plant import DaePlant
+from drake_dae.trace.compiled import Compiled, attempts, check_choice
+
+T = TypeVar("T")
+
+STAGES_PER_SECOND = 500
+"""About so many evaluations takes a simulated second under error control."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A run of a closed loop.
+
+    Attributes:
+        record: Its signals at the given times, up to where it came.
+        steps: How many steps it took.
+        failure: Why it could not go on, with time and state; None if it came to its end.
+    """
+
+    record: Record
+    steps: int
+    failure: SimulationError | None
+
+
+@checked(ModelError)
+def rollout(
+    loop: ClosedLoop,
+    starts: ArrayLike,
+    parameters: ArrayLike | None,
+    times: ArrayLike,
+    *,
+    config: SimulatorConfig | None = None,
+    compiled: Compiled | None = None,
+    seeds: Sequence[int] | None = None,
+) -> list[Rollout]:
+    """Runs a closed loop from one start or from thousands, without Drake, on all cores.
+
+    It computes what `simulate` does: plant, law, references, exogenous signals and sensor, and the
+    projection onto N* at the start of each step. With fixed steps the record is Drake's, of states
+    before their projection; under error control steps are those of DOP853 (Hairer, Norsett and
+    Wanner, 1993), a thousandth of the accuracy each, and rows between them are on N*. Where a C
+    compiler is found the whole loop is machine code; otherwise SciPy and CasADi step it.
+
+    Args:
+        loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it; what is drawn
+            or logged in its diagram plays no part.
+        starts: Where runs start, as `start_values` has it: the state, and what a sensor keeps;
+            shape (n,), or (k, n) for k runs.
+        parameters: All parameters as `start_values` has them: those of the plant and those of the
+            law; shape (m,) for all runs or (k, m); the defaults of the loop if None.
+        times: When the record has rows, in s, from the start of the runs to their end, shape (j,).
+        config: Drake's settings: with `use_error_control` the accuracy and the longest step,
+            without it steps of max_step_size by the scheme. Drake's default if None.
+        compiled: Whether to make machine code; the choice of the plant's system if None. "auto"
+            makes it if that pays for the runs at hand.
+        seeds: The seed of the sensor's noise in each run; the same noise for all if None.
+
+    Returns:
+        A run for each start. One that fails has its failure, and its record up to there.
+
+    Raises:
+        ModelError: Arguments have wrong shapes, or a reference is no expression of time.
+        InconsistentStateError: A start is not on N*.
+
+    Warns:
+        MachineCodeWarning: Machine code should be made and cannot be.
+    """
+    config = config or SimulatorConfig()
+    check_config(config)
+    choice: Compiled = loop.plant.dae.compiled if compiled is None else compiled
+    check_choice("rollout", choice)
+    moments = _times(times)
+    functions = _kept(loop, "functions", lambda: loop_functions(loop))
+    scale = np.concatenate([loop.plant.dae.scale, np.ones(functions.num_lags)])
+    settings = Settings.of(config, scale)
+    problems = _problems(functions, starts, parameters, moments, seeds)
+    code = _machine_code(functions, choice, settings, len(problems) * np.ptp(moments))
+    # Machine code lets go of Python's lock: threads are enough for all cores.
+    if code is None:
+        fused = _kept(loop, "fused", lambda: Fused(functions))
+        run = interpreted.runner(fused, settings)
+        return [_result(functions, problem, run(problem)) for problem in problems]
+
+    def run_one(problem: Problem) -> Rollout:
+        return _result(functions, problem, machine.run(code, functions, problem, settings))
+
+    if len(problems) == 1:
+        return [run_one(problems[0])]
+    with ThreadPoolExecutor(num_cores()) as pool:
+        return list(pool.map(run_one, problems))
+
+
+@checked(ModelError)
+def start_values(loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatArray]:
+    """Start and parameters of a closed loop as `rollout` takes them.
+
+    Args:
+        loop: The closed loop.
+        context: Its context.
+
+    Returns:
+        The state x, then of a force sensor its state, if it has a lag, and what it holds, if it
+        samples, shape (n,); and the parameters of the plant, then the model's of the law and its
+        gains, shape (m,).
+    """
+    plant, controller, sensor = loop.plant, loop.controller, loop.sensor
+    own = plant.GetMyContextFromRoot(context)
+    parts = [plant.state(own)]
+    if sensor is not None:
+        felt = sensor.GetMyContextFromRoot(context)
+        parts.append(felt.get_continuous_state_vector().CopyToVector())
+        if felt.num_discrete_state_groups():
+            parts.append(felt.get_discrete_state(0).value())
+    law = controller.GetMyContextFromRoot(context)
+    values = [block.get_numeric_parameter(0).value() for block in (own, law)]
+    return np.concatenate(parts), np.concatenate(values)
+
+
+def _kept(loop: ClosedLoop, name: str, make: Callable[[], T]) -> T:
+    """What is made once for a loop."""
+    if name not in loop.memory:
+        loop.memory[name] = make()
+    found: T = loop.memory[name]
+    return found
+
+
+def _times(times: ArrayLike) -> FloatArray:
+    found = numbers("times", times)
+    if found.ndim != 1 or found.size < 2 or not np.isfinite(found).all():
+        raise ModelError(f"times must be two or more finite numbers, shape (j,), got {times!r}")
+    if np.any(np.diff(found) <= 0.0):
+        raise ModelError("times must be strictly increasing")
+    return found
+
+
+def _table(what: str, given: ArrayLike, size: int, hint: str) -> FloatArray:
+    found = np.atleast_2d(numbers(what, given))
+    if found.ndim != 2 or found.shape[1] != size:
+        raise ModelError(
+            f"{what} must have shape ({size},), or (k, {size}) for k runs, got "
+            f"{np.shape(given)}: {hint}"
+        )
+    if not np.isfinite(found).all():
+        raise ModelError(f"{what} must be finite")
+    return found
+
+
+def _problems(
+    functions: LoopFunctions,
+    starts: ArrayLike,
+    parameters: ArrayLike | None,
+    times: FloatArray,
+    seeds: Sequence[int] | None,
+) -> list[Problem]:
+    loop = functions.loop
+    default, values = start_values(loop, loop.diagram.CreateDefaultContext())
+    hint = "see start_values"
+    states = _table("starts", starts, default.size, hint)
+    given = _table("parameters", values if parameters is None else parameters, values.size, hint)
+    count = len(states)
+    if len(given) not in (1, count):
+        raise ModelError(f"{len(given)} rows of parameters for {count} starts")
+    if seeds is not None and len(seeds) != count:
+        raise ModelError(f"{len(seeds)} seeds for {count} starts")
+    bad = [seed for seed in seeds or () if not 0 <= seed < 2**32]
+    if bad:
+        raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
+    rows = np.broadcast_to(given, (count, values.size))
+    samples = Samples.of(loop, times)
+    size = loop.plant.dae.num_states + functions.num_lags
+    split = functions.plant.sizes[-1]
+    problems = []
+    for index, (start, row) in enumerate(zip(states, rows, strict=True)):
+        plant, law = row[:split].copy(), row[split:].copy()
+        current = functions.plant_parameters(plant)
+        loop.plant.check_start(start[: loop.plant.dae.num_states], current(times[0]))
+        noise = samples.noise(None if seeds is None else seeds[index])
+        hold = start[size:].copy() if samples.holds else noise[0].copy()
+        project = partial(_project, loop.plant, current)
+        problems.append(
+            Problem(times, start[:size], hold, plant, law, samples.events, noise[1:], project)
+        )
+    return problems
+
+
+def _project(
+    plant: DaePlant, parameters: Callable[[float], FloatArray], time: float, state: FloatArray
+) -> FloatArray:
+    """The state on N* next to one, that of a sensor left out."""
+    return plant.structure.manifold.project(state[: plant.dae.num_states], parameters(time))
+
+
+def _machine_code(
+    functions: LoopFunctions, compiled: Compiled, settings: Settings, seconds: float
+) -> machine.Library | None:
+    """The closed loop as machine code, by the choice and by what its runs take without."""
+    if compiled is False:
+        return None
+    kept: machine.Library | None = functions.loop.memory.get("library")
+    if kept is not None:
+        return kept
+    make = True
+    if compiled == "auto":
+        stages = STAGES_PER_SECOND
+        if settings.tableau is not None:
+            stages = int(len(settings.tableau.b) / settings.longest)
+        pays = attempts("auto", functions.num_operations)
+        make = any(each.make and stages * seconds >= each.calls for each in pays)
+    found = machine.load(functions, compiled, make)
+    if found is not None:
+        functions.loop.memory["library"] = found
+    return found
+
+
+def _result(functions: LoopFunctions, problem: Problem, run: Run) -> Rollout:
+    time = problem.times[: len(run.rows)]
+    stops = np.cumsum([len(signals) for signals in functions.columns.values()])
+    parts = np.split(run.rows, stops[:-1], axis=1)
+    found = {
+        name: Recorded(values, tuple(signals))
+        for (name, signals), values in zip(functions.columns.items(), parts, strict=True)
+    }
+    signals = {name: found[name] for name in functions.loop.signals}
+    record = functions.loop.with_errors(Record(time, signals))
+    failure = None
+    if run.ending is not Ending.DONE:
+        failure = failure_of(functions, problem, run)
+    return Rollout(record, run.steps, failure)

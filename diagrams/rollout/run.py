@@ -1,0 +1,152 @@
+"""What a rollout steps, how, and how it ends; the same for machine code and without."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Self
+
+import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
+from scipy.integrate import RK23, RK45
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+
+SHARE = 1e-3
+"""Of the accuracy that a step may use up: then what is read between long steps is as good."""
+
+SMALLEST = 1e-13
+"""Less than this, relative to the state, no step can promise."""
+
+
+def num_cores() -> int:
+    """How many cores this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)  # macOS has none.
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+class Tableau(NamedTuple):
+    """An explicit Runge-Kutta method: A, shape (s, s), b and c, shape (s,)."""
+
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+
+def _tableau(a: list[list[float]], b: list[float], c: list[float]) -> Tableau:
+    square = np.zeros((len(b), len(b)))
+    for row, values in enumerate(a):
+        square[row, : len(values)] = values
+    return Tableau(square, np.array(b, dtype=float), np.array(c, dtype=float))
+
+
+FIXED = {
+    "explicit_euler": _tableau([[]], [1.0], [0.0]),
+    "runge_kutta2": _tableau([[], [1.0]], [0.5, 0.5], [0.0, 1.0]),
+    "runge_kutta3": _tableau([[], [0.5], [-1.0, 2.0]], [1 / 6, 2 / 3, 1 / 6], [0.0, 0.5, 1.0]),
+    "bogacki_shampine3": _tableau(RK23.A, RK23.B, RK23.C),
+    "runge_kutta5": _tableau(RK45.A, RK45.B, RK45.C),
+}
+"""Drake's explicit schemes."""
+
+
+class Ending(IntEnum):
+    """How the stepping ended; stepper.c has the same list."""
+
+    DONE = 0
+    PAUSED = 1
+    INVALID = 2
+    OFF_MANIFOLD = 3
+    STUCK = 4
+    SPOILT = 5
+    SLOW = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """How to step.
+
+    Attributes:
+        longest: The longest step, or the fixed one, in s.
+        tableau: The method of fixed steps; None for error control, by DOP853.
+        absolute: The error that a step may make, for each state, shape (n,).
+        relative: The same relative to the state.
+    """
+
+    longest: float
+    tableau: Tableau | None
+    absolute: FloatArray
+    relative: float
+
+    @classmethod
+    def of(cls, config: SimulatorConfig, scale: FloatArray) -> Self:
+        """The settings of a scenario.
+
+        Args:
+            config: Drake's settings.
+            scale: How large the states are, shape (n,).
+
+        Raises:
+            ModelError: Its scheme has fixed steps, and is implicit.
+        """
+        tableau, scheme = None, config.integration_scheme
+        if not config.use_error_control:
+            if scheme not in FIXED:
+                raise ModelError(
+                    f"integration_scheme: a rollout takes no fixed steps of {scheme}; choose "
+                    f"{', '.join(FIXED)}, or use_error_control"
+                )
+            tableau = FIXED[scheme]
+        relative = max(SHARE * config.accuracy, SMALLEST)
+        return cls(config.max_step_size, tableau, relative * scale, relative)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One run.
+
+    Attributes:
+        times: When rows of the record are written, in s, from the start to the end, shape (k,).
+        state: x, and then the state of the sensor if it has a lag.
+        hold: What the sensor holds, or its noise, shape (m,).
+        plant, law: What their functions take as parameters.
+        events: When the sensor samples, or its noise changes, in s.
+        noise: The noise of each of these, shape (len(events), m).
+        project: (time, x) -> the state on N*; raises InconsistentStateError.
+    """
+
+    times: FloatArray
+    state: FloatArray
+    hold: FloatArray
+    plant: FloatArray
+    law: FloatArray
+    events: FloatArray
+    noise: FloatArray
+    project: Callable[[float, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a run came to.
+
+    Attributes:
+        rows: The rows of the record, up to where it came.
+        ending: How it ended.
+        time: The time of the last accepted state, in s.
+        state: That state.
+        steps: How many steps were accepted.
+        mark: The time a thousand steps ago, in s.
+        next: The time that a step led to that was no step, in s.
+        trial_time, trial: The earliest trial that failed after it, not finite if none did.
+    """
+
+    rows: FloatArray
+    ending: Ending
+    time: float
+    state: FloatArray
+    steps: int
+    mark: float
+    next: float
+    trial_time: float
+    trial: FloatArray

@@ -1,0 +1,433 @@
+/* The closed loop over time: what CasADi generated comes first, then the constants of this loop. */
+
+#ifdef __FAST_MATH__
+#error "not with -ffast-math: nan would pass for a number"
+#endif
+#define CASADI_SYMBOL_EXPORT static
+
+$generated
+#include <math.h>
+#include <string.h>
+
+$constants
+/* How a call ended; Python has the same list. */
+enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW };
+
+/* A run, which can be stopped at any step and go on. */
+typedef struct {
+  double time, step;       /* the state is accepted at this time; what step to try next, 0 if none */
+  double start, mark;      /* of the run, and after its last thousand steps */
+  double before;           /* the mark before */
+  double from;             /* where a row of fixed steps began, to its end */
+  double next;             /* where the last step should have led */
+  double trial;            /* of the earliest trial that failed since the accepted state */
+  long long row, event;    /* which come next */
+  long long steps;         /* that were accepted */
+  long long number, index; /* of fixed steps in this row, and which comes next */
+  long long failures;      /* of trials since the accepted state */
+  long long pending;       /* whether projection and samples at this time are to come */
+} Run;
+
+/* What is computed at a moment; parameters that move are written over. */
+typedef struct {
+  double plant[NUM_PLANT + 1], law[NUM_LAW + 1];
+  double reference[NUM_REFERENCES + 1], moving[NUM_PLANT_MOVING + 1];
+  double control[NUM_CONTROLS + 1], force[NUM_FORCES + 1], measured[NUM_FORCES + 1];
+  const double *hold;
+  double time; /* at which references and what moves are; not a number before the first */
+} Moment;
+
+static int is_finite(const double *vector, int size) {
+  int i;
+  for (i = 0; i < size; i++) {
+    if (!isfinite(vector[i])) return 0;
+  }
+  return 1;
+}
+
+/* References, and the parameters that move. */
+static int set_time(double time, Moment *m) {
+  double moving[NUM_LAW_MOVING + 1], checks[3];
+  const double *arg[SIGNALS_ARG] = {&time};
+  double *res[SIGNALS_RES] = {m->reference, m->moving, moving, checks, checks + 1};
+  int i;
+  if (time == m->time) return 1;
+  dae_signals(arg, res, 0, 0, 0);
+  for (i = 0; i < NUM_PLANT_MOVING; i++) m->plant[plant_places[i]] = m->moving[i];
+  for (i = 0; i < NUM_LAW_MOVING; i++) m->law[law_places[i]] = moving[i];
+  m->time = isfinite(checks[1]) ? time : NAN;
+  return isfinite(checks[1]) != 0;
+}
+
+/* The derivative of the state; where it has no value all of it is nan. */
+static int rates(double time, const double *x, Moment *m, double *rate) {
+  double valid, checks[2];
+  const double *arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
+  double *res[MOTION_RES] = {rate, m->force, m->control, m->measured, &valid, checks, checks + 1};
+  int i, good = set_time(time, m);
+  dae_motion(arg, res, 0, 0, 0);
+  good &= isfinite(valid) && isfinite(checks[1]);
+  for (i = 0; !good && i < SIZE; i++) rate[i] = NAN;
+  return good;
+}
+
+/* One row of the record. */
+static int write(double time, const double *x, Moment *m, double *row) {
+  double rate[SIZE + 1], checks[3];
+  const double *arg[REST_ARG] = {x, m->force, m->plant};
+  double *res[REST_RES] = {row + NUM_STATES, checks, checks + 1};
+  int i, valid = rates(time, x, m, rate);
+  const double *parts[4] = {m->control, m->reference, m->moving, m->measured};
+  const int sizes[4] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING, NUM_MEASURED};
+  memcpy(row, x, NUM_STATES * sizeof(double));
+  dae_rest(arg, res, 0, 0, 0);
+  row += NUM_STATES + NUM_REST;
+  for (i = 0; i < 4; row += sizes[i++]) memcpy(row, parts[i], (size_t)sizes[i] * sizeof(double));
+  return valid & (isfinite(checks[1]) != 0);
+}
+
+/* The Newton step from z by the gradients at another state, both in states over their scale. */
+static void newton(const double *z, const double *other, Moment *m, double *step) {
+  double x[NUM_STATES], y[NUM_STATES], checks[2];
+  const double *arg[NEWTON_ARG] = {x, y, m->plant};
+  double *res[NEWTON_RES] = {step, checks, checks + 1};
+  int i;
+  for (i = 0; i < NUM_STATES; i++) {
+    x[i] = scale[i] * z[i];
+    y[i] = scale[i] * other[i];
+  }
+  dae_newton(arg, res, 0, 0, 0);
+}
+
+static double norm(const double *vector, const double *unit) {
+  double sum = 0.0;
+  int i;
+  for (i = 0; i < NUM_STATES; i++) {
+    double entry = unit ? vector[i] / unit[i] : vector[i];
+    sum += entry * entry;
+  }
+  return sqrt(sum);
+}
+
+static void move(const double *from, double length, const double *step, double *to) {
+  int i;
+  for (i = 0; i < NUM_STATES; i++) to[i] = from[i] + length * step[i];
+}
+
+static int is_zero(const double *x, Moment *m) {
+  double residual[NUM_RESIDUALS + 1], checks[2];
+  const double *arg[RESIDUAL_ARG] = {x, m->plant};
+  double *res[RESIDUAL_RES] = {residual, checks, checks + 1};
+  int i;
+  dae_residual(arg, res, 0, 0, 0);
+  for (i = 0; i < NUM_RESIDUALS; i++) {
+    if (residual[i] != 0.0) return 0;
+  }
+  return 1;
+}
+
+/* The projection onto N* as trace/newton.py has it; 0 where that has to decide. */
+static int project(double time, double *x, Moment *m) {
+  double z[NUM_STATES], y[NUM_STATES], unit[NUM_STATES], step[NUM_STATES], next[NUM_STATES];
+  double size, left = 0.0, length, moved = 0.0;
+  int i, iteration, halving;
+  if (!PROJECTS) return 1;
+  if (NUM_PLANT_MOVING) set_time(time, m);
+  for (i = 0; i < NUM_STATES; i++) {
+    z[i] = x[i] / scale[i];
+    unit[i] = fmax(1.0, fabs(z[i]));
+  }
+  newton(z, z, m, step);
+  size = norm(step, 0);
+  if (size > 0.0 ? size <= 1e-15 : size == 0.0 && is_zero(x, m)) return 1;
+  for (iteration = 0;; iteration++) {
+    if (iteration == 20) return 0;
+    if (iteration) newton(z, z, m, step);
+    size = norm(step, unit);
+    if (size <= 1e-15) {
+      memcpy(y, z, sizeof(z));
+      memcpy(next, step, sizeof(step));
+      break;
+    }
+    for (halving = 0, length = 1.0;; halving++, length *= 0.5) {
+      if (halving == 30) return 0;
+      move(z, length, step, y);
+      newton(y, z, m, next);
+      left = norm(next, unit);
+      if (left * left <= 1e-16 * size || left <= (1.0 - 0.25 * length) * size) break;
+    }
+    if (left * left <= 1e-16 * size) break;
+    memcpy(z, y, sizeof(z));
+  }
+  /* The steps that follow, by the matrix of z, until they are round-off. */
+  for (size = norm(next, 0); size > 1e-15; size = left) {
+    move(y, 1.0, next, y);
+    newton(y, z, m, next);
+    left = norm(next, 0);
+    if (!(left < 0.5 * size)) break;
+  }
+  for (i = 0; i < NUM_STATES; i++) {
+    double found = scale[i] * y[i];
+    moved = fmax(moved, fabs(found - x[i]) / (scale[i] * unit[i]));
+    if (!isfinite(found)) return 0;
+    y[i] = found;
+  }
+  if (moved == 0.0 && !(size <= 1e-12)) return 0;
+  memcpy(x, y, sizeof(y));
+  return 1;
+}
+
+/* What happens at the start of a step: the projection, then a sample. */
+static int update(Run *run, double *x, double *hold, Moment *m, const double *events,
+                  long long num_events, const double *noise) {
+  if (!run->pending) return DONE;
+  if (!project(run->time, x, m)) return OFF_MANIFOLD;
+  while (run->event < num_events && events[run->event] <= run->time) {
+    double rate[SIZE + 1], held[NUM_FORCES + 1];
+    int i;
+    if (SAMPLES && !rates(run->time, x, m, rate)) return INVALID;
+    for (i = 0; i < NUM_FORCES; i++) {
+      double now = noise[run->event * NUM_FORCES + i];
+      held[i] = (NUM_LAGS ? x[NUM_STATES + i] : m->force[i]) + bias[i] + deviation[i] * now;
+      if (!SAMPLES) held[i] = now;
+    }
+    memcpy(hold, held, NUM_FORCES * sizeof(double));
+    run->event++;
+  }
+  run->pending = 0;
+  return DONE;
+}
+
+/* Takes over a step; refuses one in a thousand that hardly led on. */
+static int accept(Run *run, double time, double *x, const double *reached) {
+  memcpy(x, reached, SIZE * sizeof(double));
+  run->time = time;
+  run->failures = 0;
+  run->pending = 1;
+  if (++run->steps % 1000 == 0) {
+    run->before = run->mark;
+    run->mark = time;
+    if (time - run->before < 1e-8 * (time - run->start)) return SLOW;
+  }
+  return DONE;
+}
+
+static void note(Run *run, double time, const double *x, double *trial) {
+  if (run->failures++ && time >= run->trial) return;
+  if (!is_finite(x, SIZE)) return; /* It follows from another failure. */
+  run->trial = time;
+  memcpy(trial, x, SIZE * sizeof(double));
+}
+
+/* The state and the rate at a stage of an explicit Runge-Kutta method. */
+static void stage(Run *run, double time, double step, int count, const double *a, double c,
+                  const double *x, Moment *m, double (*k)[SIZE], double *trial) {
+  double at[SIZE];
+  int i, j;
+  for (i = 0; i < SIZE; i++) {
+    double sum = 0.0;
+    for (j = 0; j < count; j++) sum += a[j] * k[j][i];
+    at[i] = x[i] + step * sum;
+  }
+  if (!rates(time + c * step, at, m, k[count])) note(run, time + c * step, at, trial);
+}
+
+static void weigh(double step, int count, const double *b, const double *x, double (*k)[SIZE],
+                  double *reached) {
+  int i, j;
+  for (i = 0; i < SIZE; i++) {
+    double sum = 0.0;
+    for (j = 0; j < count; j++) sum += b[j] * k[j][i];
+    reached[i] = x[i] + step * sum;
+  }
+}
+
+/* Fixed steps, whose number divides what lies between two times of the record or of a sample. */
+__attribute__((visibility("default"))) int run_fixed(
+    Run *run, double *x, double *hold, const double *plant_parameters, const double *law_parameters,
+    double *trial, long long num_rows, const double *times, double *rows, long long num_events,
+    const double *events, const double *noise, double longest, int stages, const double *a,
+    const double *b, const double *c, long long budget) {
+  Moment m;
+  double k[16][SIZE], reached[SIZE];
+  int s, status;
+  memcpy(m.plant, plant_parameters, NUM_PLANT * sizeof(double));
+  memcpy(m.law, law_parameters, NUM_LAW * sizeof(double));
+  m.hold = hold;
+  m.time = NAN;
+  for (;;) {
+    double end, step;
+    if (run->row < num_rows && run->time >= times[run->row]) {
+      if (run->row == num_rows - 1) {
+        status = update(run, x, hold, &m, events, num_events, noise);
+        if (status != DONE) return status;
+      }
+      if (!write(run->time, x, &m, rows + run->row * WIDTH)) return INVALID;
+      run->row++;
+    }
+    if (run->row == num_rows) return DONE;
+    if (budget-- == 0) return PAUSED;
+    status = update(run, x, hold, &m, events, num_events, noise);
+    if (status != DONE) return status;
+    end = times[run->row];
+    if (run->event < num_events && events[run->event] < end) end = events[run->event];
+    if (run->index == run->number) {
+      run->from = run->time;
+      run->index = 0;
+      run->number = (long long)fmax(1.0, ceil((end - run->from) / longest - 0.01));
+    }
+    run->index++;
+    if (run->index < run->number) {
+      end = run->from + (end - run->from) * ((double)run->index / (double)run->number);
+    }
+    step = end - run->time;
+    if (!rates(run->time, x, &m, k[0])) return INVALID;
+    for (s = 1; s < stages; s++) stage(run, run->time, step, s, a + s * stages, c[s], x, &m, k, trial);
+    weigh(step, stages, b, x, k, reached);
+    run->next = end;
+    if (!is_finite(reached, SIZE)) return SPOILT;
+    status = accept(run, end, x, reached);
+    if (status != DONE) return status;
+  }
+}
+
+static double weighted(const double *vector, const double *unit) {
+  double sum = 0.0;
+  int i;
+  for (i = 0; i < SIZE; i++) sum += vector[i] / unit[i] * (vector[i] / unit[i]);
+  return sqrt(sum / SIZE);
+}
+
+/* A first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4). */
+static double first_step(Run *run, const double *x, const double *rate, const double *absolute,
+                         double relative, double longest, Moment *m) {
+  double unit[SIZE], other[SIZE], change[SIZE], d0, d1, d2, h0, h1;
+  int i;
+  for (i = 0; i < SIZE; i++) unit[i] = absolute[i] + fabs(x[i]) * relative;
+  d0 = weighted(x, unit), d1 = weighted(rate, unit);
+  h0 = fmin(d0 < 1e-5 || d1 < 1e-5 ? 1e-6 : 0.01 * d0 / d1, longest);
+  for (i = 0; i < SIZE; i++) other[i] = x[i] + h0 * rate[i];
+  if (!rates(run->time + h0, other, m, change)) return fmin(h0, longest);
+  for (i = 0; i < SIZE; i++) change[i] -= rate[i];
+  d2 = weighted(change, unit) / h0;
+  h1 = d1 <= 1e-15 && d2 <= 1e-15 ? fmax(1e-6, h0 * 1e-3) : pow(0.01 / fmax(d1, d2), 1.0 / 8.0);
+  return fmin(fmin(100.0 * h0, h1), longest);
+}
+
+static double error_of(double step, const double *x, const double *reached, double (*k)[SIZE],
+                       const double *absolute, double relative) {
+  double fifth = 0.0, third = 0.0;
+  int i, j;
+  for (i = 0; i < SIZE; i++) {
+    double unit = absolute[i] + fmax(fabs(x[i]), fabs(reached[i])) * relative, e5 = 0.0, e3 = 0.0;
+    for (j = 0; j < 13; j++) {
+      e5 += dop_e5[j] * k[j][i];
+      e3 += dop_e3[j] * k[j][i];
+    }
+    fifth += e5 / unit * (e5 / unit);
+    third += e3 / unit * (e3 / unit);
+  }
+  if (fifth == 0.0 && third == 0.0) return 0.0;
+  return step * fifth / sqrt((fifth + 0.01 * third) * SIZE);
+}
+
+/* Error control by DOP853 as SciPy has it; rows between steps from its interpolant, on N*. */
+__attribute__((visibility("default"))) int run_controlled(
+    Run *run, double *x, double *hold, const double *plant_parameters, const double *law_parameters,
+    double *trial, long long num_rows, const double *times, double *rows, long long num_events,
+    const double *events, const double *noise, double longest, const double *absolute,
+    double relative, long long budget) {
+  Moment m;
+  double k[16][SIZE], reached[SIZE], f[7][SIZE], between[SIZE];
+  int i, j, s, status, valid;
+  memcpy(m.plant, plant_parameters, NUM_PLANT * sizeof(double));
+  memcpy(m.law, law_parameters, NUM_LAW * sizeof(double));
+  m.hold = hold;
+  m.time = NAN;
+  while (run->row < num_rows && run->time >= times[run->row]) {
+    if (run->row == num_rows - 1) {
+      status = update(run, x, hold, &m, events, num_events, noise);
+      if (status != DONE) return status;
+    }
+    if (!write(run->time, x, &m, rows + run->row * WIDTH)) return INVALID;
+    run->row++;
+  }
+  for (;;) {
+    double limit, error = 0.0, size;
+    int rejected = 0;
+    if (run->row == num_rows) return DONE;
+    if (budget-- == 0) return PAUSED;
+    status = update(run, x, hold, &m, events, num_events, noise);
+    if (status != DONE) return status;
+    if (!rates(run->time, x, &m, k[0])) return INVALID;
+    limit = times[num_rows - 1];
+    if (run->event < num_events && events[run->event] < limit) limit = events[run->event];
+    if (run->step == 0.0) {
+      run->step = first_step(run, x, k[0], absolute, relative, longest, &m);
+    }
+    size = fmin(run->step, longest);
+    for (;;) {
+      double end = run->time + size, factor;
+      if (end >= limit - 1e-12 * fabs(limit)) end = limit;
+      size = end - run->time;
+      if (!(size > 1e-12 * fabs(run->time)) || run->failures >= 1000) return STUCK;
+      for (s = 1; s < 12; s++) stage(run, run->time, size, s, dop_a[s], dop_c[s], x, &m, k, trial);
+      weigh(size, 12, dop_b, x, k, reached);
+      if (!rates(end, reached, &m, k[12])) note(run, end, reached, trial);
+      error = error_of(size, x, reached, k, absolute, relative);
+      valid = isfinite(error) != 0;
+      factor = error == 0.0 ? 10.0 : fmin(10.0, fmax(0.2, 0.9 * pow(error, -1.0 / 8.0)));
+      if (valid && error < 1.0) {
+        /* A step that only ended early, at a sample, says nothing against longer ones. */
+        run->step = rejected ? size * fmin(1.0, factor) : fmax(size * factor, size < run->step ? run->step : 0.0);
+        limit = end;
+        break;
+      }
+      rejected = 1;
+      size *= valid ? factor : 0.2;
+    }
+    if (times[run->row] <= limit) {
+      for (s = 13; s < 16; s++) {
+        stage(run, run->time, size, s, dop_a_more[s - 13], dop_c_more[s - 13], x, &m, k, trial);
+      }
+      for (i = 0; i < SIZE; i++) {
+        f[0][i] = reached[i] - x[i];
+        f[1][i] = size * k[0][i] - f[0][i];
+        f[2][i] = 2.0 * f[0][i] - size * (k[12][i] + k[0][i]);
+        for (j = 0; j < 4; j++) {
+          f[3 + j][i] = 0.0;
+          for (s = 0; s < 16; s++) f[3 + j][i] += dop_d[j][s] * k[s][i];
+          f[3 + j][i] *= size;
+        }
+      }
+    }
+    while (run->row < num_rows && times[run->row] <= limit) {
+      double time = times[run->row], part = (time - run->time) / size;
+      if (time == limit) break; /* The step itself, below. */
+      for (i = 0; i < SIZE; i++) {
+        between[i] = 0.0;
+        for (j = 6; j >= 0; j--) between[i] = (between[i] + f[j][i]) * (j % 2 ? 1.0 - part : part);
+        between[i] += x[i];
+      }
+      project(time, between, &m);
+      if (!write(time, between, &m, rows + run->row * WIDTH)) {
+        run->failures = 0;
+        note(run, time, between, trial);
+        return INVALID;
+      }
+      run->row++;
+    }
+    status = accept(run, limit, x, reached);
+    if (status != DONE) return status;
+    if (run->row < num_rows && times[run->row] == limit) {
+      if (run->row == num_rows - 1) {
+        status = update(run, x, hold, &m, events, num_events, noise);
+        if (status != DONE) return status;
+      } else if (!project(limit, x, &m)) {
+        return OFF_MANIFOLD;
+      }
+      if (!write(limit, x, &m, rows + run->row * WIDTH)) return INVALID;
+      run->row++;
+    }
+  }
+}
