@@ -31,6 +31,7 @@ from drake_dae.diagrams.scenario import (
     save_scenario,
     shipped_scenarios,
 )
+from drake_dae.diagrams.sweep.study import FILES as STUDY_FILES
 from drake_dae.diagrams.sweep.sweep import sweep
 from drake_dae.diagrams.sweep.variations import parse_variations
 from drake_dae.errors import (
@@ -265,6 +266,11 @@ def _sweep(options: argparse.Namespace) -> int:
     )
     folder = options.out or Path("runs") / f"{path.stem}-sweep"
     file = folder / "runs.jsonl"
+    others = [name for name in STUDY_FILES if (folder / name).exists()]
+    if others and not file.exists():
+        raise ModelError(
+            f"'{folder}' holds {', '.join(others)}, not from a study; choose another folder"
+        )
     try:
         study = sweep(
             scenario,
