@@ -59,6 +59,13 @@ def test_what_is_wrong_is_told_before_anything_runs(options, line, tmp_path, cap
     assert not folder.exists()
 
 
+def test_the_files_of_others_are_left_alone(tmp_path, capsys):
+    (tmp_path / "summary.txt").write_text("mine")
+    assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--out", str(tmp_path)]) == 1
+    assert "holds summary.txt, not from a study" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.txt"]
+
+
 @pytest.mark.parametrize(
     "options", [[], [*VARY, "--random", "3", "--together"], [*VARY, "--random", "many"]]
 )

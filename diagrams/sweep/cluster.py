@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Generator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from typing import Any
 
 from drake_dae.arrays import brief
@@ -70,8 +71,13 @@ class Cluster:
                 if len(batch) > 1:
                     awaited.update([submit([run]) for run in batch])
                     continue
-                reason = f"the worker ended: {brief(str(error))}"
+                said = str(error).partition(". ")[0]
+                reason = f"the workers that had it ended: {said}"
                 found = [RunResult(batch[0][0], Outcome.CRASHED, reason)]
+            except CancelledError:
+                raise ModelError(
+                    f"the Dask scheduler at {self._address} is gone; runs that have ended are kept"
+                ) from None
             except Exception as error:
                 raise ModelError(
                     f"the Dask cluster at {self._address} failed, {type(error).__name__}: "

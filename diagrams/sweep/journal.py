@@ -51,12 +51,19 @@ class Journal:
         """Adds runs, and returns when they are on the disk.
 
         Raises:
-            OSError: They cannot be written.
+            ModelError: They cannot be written, as on a full disk.
         """
-        for result in results:
-            _write(self._file, _line(result.to_dict()))
-            self.results[result.run] = result
-        os.fsync(self._file)
+        found = list(results)
+        try:
+            for result in found:
+                _write(self._file, _line(result.to_dict()))
+            os.fsync(self._file)
+        except OSError as error:
+            raise ModelError(
+                f"cannot write to '{self.path}': {error.strerror or error}; the study continues "
+                "from what it has when there is room again"
+            ) from None
+        self.results.update((result.run, result) for result in found)
 
 
 @contextmanager

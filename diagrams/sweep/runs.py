@@ -126,7 +126,7 @@ class Runner:
     def __init__(self, base: Mapping[str, Any]) -> None:
         self._base = base
         self._key = ""
-        self._loop: ClosedLoop | None = None
+        self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
 
     def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
@@ -137,11 +137,17 @@ class Runner:
         """
         built = _built(data, self._base)
         key = json.dumps(built, sort_keys=True)
-        if self._loop is None or key != self._key:
-            self._loop = None
+        if key != self._key:
+            self._key, self._built = "", None
             self.builds += 1
-            self._loop, self._key = build_loop(read_scenario(built)), key
-        return self._loop
+            try:
+                self._built = build_loop(read_scenario(built))
+            except DrakeDaeError as error:
+                self._built = error
+            self._key = key
+        if isinstance(self._built, ClosedLoop):
+            return self._built
+        raise cast(DrakeDaeError, self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
         """What is wrong with the words of a variation; None if nothing is.
@@ -195,7 +201,8 @@ def _simulated(number: int, scenario: Scenario, loop: ClosedLoop) -> RunResult:
     try:
         context = start_scenario(scenario, loop)
     except DrakeDaeError as error:
-        return RunResult(number, Outcome.NO_START, str(error))
+        outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
+        return RunResult(number, outcome, str(error))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

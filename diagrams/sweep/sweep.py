@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from importlib.metadata import version
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,8 @@ def sweep(
 
     A study that ended early, by whatever, continues when the same call is made again: runs that the
     file has are not run again, and the table is the same as without the interruption. Runs that
-    fail are outcomes with a reason. All values are checked before the first run, and the first, the
-    middle and the last variation are built: one of them must start.
+    fail are outcomes with a reason. Before the first run, keys and values are checked, of numbers
+    the least and the largest, and the first, the middle or the last variation is built.
 
     Runs that differ in start, plant_parameters, seed of the sensor, gains that couple no outputs,
     or in the integrator share one closed loop in each process.
@@ -141,13 +142,13 @@ def _bar(total: int, done: int, is_wanted: bool) -> Iterator[Callable[[list[RunR
 
 
 def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
-    """Refuses keys and values that a scenario cannot have; they are all read."""
+    """Refuses keys and values that a scenario cannot have."""
     if not variations:
         raise ScenarioError(("", "a study needs at least one variation"))
     if len(variations) > MOST_RUNS:
         raise ScenarioError(("", f"a study has at most {MOST_RUNS} runs, got {len(variations)}"))
     problems: dict[tuple[str, str], None] = {}
-    for changes in variations:
+    for changes in _telling(variations):
         try:
             robot = read_scenario(varied_data(base, changes)).robot
             for path in (robot.file, *robot.packages.values()):
@@ -162,6 +163,37 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
         raise ScenarioError(*problems)
 
 
+def _telling(variations: Sequence[Variation]) -> Iterator[Variation]:
+    """Variations that together have each value of each key, of its numbers the extreme ones."""
+    for alike in _same_keys(variations):
+        first = alike[0]
+        yield first
+        for key in first:
+            for value in _extremes([changes[key] for changes in alike]):
+                yield {**first, key: value}
+
+
+def _same_keys(variations: Sequence[Variation]) -> list[list[Variation]]:
+    """The variations, those that change the same keys together."""
+    groups: dict[tuple[str, ...], list[Variation]] = {}
+    for changes in variations:
+        groups.setdefault(tuple(changes), []).append(changes)
+    return list(groups.values())
+
+
+def _extremes(values: Sequence[Any]) -> list[Any]:
+    """Different values; of finite numbers the least and the largest of each type."""
+    numbers: dict[type, list[float]] = {int: [], float: []}
+    others = {}
+    for value in values:
+        if type(value) is int or (type(value) is float and isfinite(value)):
+            numbers[type(value)].append(value)
+        else:
+            others[repr(value)] = value
+    ends = [end for found in numbers.values() if found for end in (min(found), max(found))]
+    return [*others.values(), *ends]
+
+
 def _try(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
     """Refuses a study of which nothing starts, as where a parameter has another name.
 
@@ -171,10 +203,7 @@ def _try(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
             cannot.
     """
     runner = Runner(base)
-    same_keys: dict[tuple[str, ...], list[Variation]] = {}
-    for changes in variations:
-        same_keys.setdefault(tuple(changes), []).append(changes)
-    for alike in same_keys.values():
+    for alike in _same_keys(variations):
         reasons = []
         for place in dict.fromkeys((0, len(alike) // 2, len(alike) - 1)):
             reason = runner.why_not(alike[place])

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from drake_dae.diagrams.scenario import load_scenario
 from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.diagrams.sweep.study import FILES
 from drake_dae.diagrams.sweep.sweep import sweep
 from drake_dae.diagrams.sweep.variations import parse_variations
+from drake_dae.errors import ModelError
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -19,6 +21,11 @@ def run_command(options: argparse.Namespace) -> int:
     )
     folder = options.out or Path("runs") / f"{path.stem}-sweep"
     file = folder / "runs.jsonl"
+    others = [name for name in FILES if (folder / name).exists()]
+    if others and not file.exists():
+        raise ModelError(
+            f"'{folder}' holds {', '.join(others)}, not from a study; choose another folder"
+        )
     try:
         study = sweep(
             scenario,

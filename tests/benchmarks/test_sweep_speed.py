@@ -1,4 +1,4 @@
-"""How studies gain from cores, reported and never judged: whole calls with start of processes."""
+"""How studies gain from cores, reported and never judged; the start of processes is in it."""
 
 import time
 

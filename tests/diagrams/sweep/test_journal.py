@@ -1,6 +1,7 @@
 """The file of a study: what any interruption leaves of it is read, and of another study nothing."""
 
 import json
+import resource
 
 import pytest
 
@@ -142,3 +143,23 @@ def test_where_it_cannot_write_it_says_so(tmp_path):
             open_journal(path, head()),
         ):
             pass
+
+
+def test_a_full_disk_is_told_and_the_study_continues(tmp_path):
+    path = tmp_path / "runs.jsonl"
+    data = written(tmp_path / "whole.jsonl")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with open_journal(path, head()) as journal:
+        journal.append(RESULTS[:1])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, limits[1]))
+        try:
+            with pytest.raises(ModelError, match=f"cannot write to '{path}'.* continues"):
+                journal.append(RESULTS[1:])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert list(journal.results) == [2]
+    assert path.stat().st_size > data.index(b"\n") + 1
+    with open_journal(path, head()) as journal:
+        assert list(journal.results.values()) == RESULTS[:1]
+        journal.append(RESULTS[1:])
+    assert path.read_bytes() == data

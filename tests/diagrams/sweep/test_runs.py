@@ -100,15 +100,19 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason():
     far = {"references.0.offset": 1.0, "references.0.amplitudes": [0.9], "duration": 2.0}
     cases = [
         ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "found no configuration"),
-        ({"start.positions.joint1": 9.0}, Outcome.NO_START, "outside its limits"),
-        ({"plant_parameters.link7.mass": 1.0}, Outcome.NO_START, "no parameter 'link7.mass'"),
+        ({"start.positions.joint1": 9.0}, Outcome.REFUSED, "outside its limits"),
+        ({"plant_parameters.link7.mass": 1.0}, Outcome.REFUSED, "no parameter 'link7.mass'"),
         ({"gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
         ({"constraints": []}, Outcome.REFUSED, ": "),
+        ({"constraints": []}, Outcome.REFUSED, ": "),
+        ({"gains.all": [4.0]}, Outcome.REFUSED, "gains: "),
         ({"duration": -1.0}, Outcome.REFUSED, "a duration must be positive"),
         (far, Outcome.FAILED, "the simulation cannot go on at t = "),
         ({}, Outcome.FINISHED, ""),
     ]
-    results = Runner(base).run_all([(i, changes) for i, (changes, _, _) in enumerate(cases)])
+    runner = Runner(base)
+    results = list(runner.run_all([(i, changes) for i, (changes, _, _) in enumerate(cases)]))
+    assert runner.builds == 6  # A structure that is refused twice was sought once.
     for (_, outcome, words), result in zip(cases, results, strict=True):
         assert result.outcome is outcome, result
         assert words in result.reason

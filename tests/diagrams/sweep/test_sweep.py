@@ -153,6 +153,14 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
         ([], "at least one variation"),
         ([{"start.error.tool.z": 1.0}], "start: has no key 'error'; did you mean 'errors'"),
         ([{"duration": 1.0}, {"duration": "a"}], "duration: expected a number, got 'a'"),
+        (
+            [{"duration": value} for value in (1.0, float("nan"), 2.0)],
+            "duration: expected a number, got nan",
+        ),
+        (
+            [{"force.seed": 0.0}, {"force.seed": 1}],
+            "force: !ModelForce has no key 'seed'",
+        ),
         ([{"duration": -1.0}], "duration: a duration must be positive, got -1.0"),
         ([{"outputs.3.axes": "z"}], "outputs: no entry '3'; entries: 0"),
         ([{"a..b": 1}], "expected a dotted key"),
