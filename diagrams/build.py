@@ -1,6 +1,7 @@
 """The closed loop that a scenario describes."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
@@ -14,8 +15,11 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
+from drake_dae.diagrams.contact_material import ContactMaterial
+from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
+    add_robot,
     at,
     each,
     index_of,
@@ -97,9 +101,10 @@ def wire_scenario(
     exogenous = exogenous_references(scenario, law)
 
     # The diagram.
+    plant = _plant(scenario, model, structure)
     with at("force" if force.is_measured else "start.positions"):
         loop = make_closed_loop(
-            RobotPlant(model, structure=structure),
+            plant,
             law,
             references,
             exogenous=exogenous,
@@ -116,6 +121,23 @@ def wire_scenario(
     context.SetTime(scenario.integrator.start_time)
     _start(scenario, model, loop, context)
     return loop, context
+
+
+def _plant(
+    scenario: Scenario, model: RobotModel, structure: Structure
+) -> RobotPlant | ContactPlant:
+    """What is simulated."""
+    material = scenario.plant
+    if not isinstance(material, ContactMaterial):
+        return RobotPlant(model, structure=structure)
+    with at("plant or plant_parameters"):
+        return ContactPlant(
+            model,
+            partial(add_robot, scenario.robot),
+            material,
+            structure=structure,
+            parameters=scenario.plant_parameters,
+        )
 
 
 @at("saturation")
@@ -182,9 +204,10 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
     """Sets parameters, state and sensor of a context."""
     plant = loop.plant
     own = plant.GetMyMutableContextFromRoot(context)
-    with at("plant_parameters"):
-        for name, numbers in scenario.plant_parameters.items():
-            plant.set_parameter(own, name, numbers)
+    if isinstance(plant, RobotPlant):
+        with at("plant_parameters"):
+            for name, numbers in scenario.plant_parameters.items():
+                plant.set_parameter(own, name, numbers)
     parameters = plant.current_parameters(own)
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
     positions, forces = np.split(wanted, [len(model.position_signals)])

@@ -1,13 +1,14 @@
 """The one wiring: plant, reference, controller, loggers, and a view of the robot."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
+from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.systems.framework import (
     Context,
     Diagram,
@@ -28,20 +29,20 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
-from drake_dae.simulation.view import add_live_view
+from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.limits import ControlLimits
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
-from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sampling import ControlHold, Sampling
 from drake_dae.systems.sensors import ForceSensor
 
-Block = TypeVar("Block", DaePlant, ForceSensor)
+Block = TypeVar("Block", bound=System)
 
 
 @checked(WiringError)
@@ -62,7 +63,7 @@ class ClosedLoop:
     """
 
     diagram: Diagram
-    plant: DaePlant
+    plant: DaePlant | ContactPlant
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
@@ -116,7 +117,7 @@ class ClosedLoop:
 
 @checked(WiringError)
 def make_closed_loop(
-    system: DaePlant,
+    system: DaePlant | ContactPlant,
     law: TrackingLaw,
     references: Sequence[Reference],
     *,
@@ -131,7 +132,8 @@ def make_closed_loop(
     """Wires plant, reference generator and controller, with loggers and a view.
 
     Args:
-        system: A `RobotPlant`, or any `DaePlant`.
+        system: A `RobotPlant`, any `DaePlant`, or a `ContactPlant`, with which everything is logged
+            at its steps.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order.
         exogenous: The exogenous signals of the plant, which its law knows too, as references that
@@ -170,10 +172,12 @@ def make_closed_loop(
         outputs = law.layout.values(reference.reference(start_time))
     except DrakeDaeError:
         outputs = None  # A trajectory that begins later.
-    controller = builder.AddSystem(TrackingController(law, outputs))
+    period = plant.time_step if sampling is None else sampling.period
+    controller = builder.AddSystem(TrackingController(law, outputs, sample_period=period))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
-    control, limits = _add_drives(builder, controller, sampling, control_limits)
+    held = None if sampling is None else _hold_before(plant, sampling)
+    control, limits = _add_drives(builder, controller, held, control_limits)
     builder.Connect(control, plant.GetInputPort("control"))
 
     moving = [_add_exogenous(builder, block, exogenous) for block in (plant, controller)]
@@ -188,7 +192,7 @@ def make_closed_loop(
 
     # Every signal under its own name: exported, and logged once per step.
     dae = plant.dae
-    loggers = {}
+    loggers: dict[str, tuple[VectorLogSink, Sequence[Signal]]] = {}
     named: dict[str, tuple[System, Sequence[Signal]]] = {
         "state": (plant, dae.state_signals),
         "constraint_force": (plant, dae.force_signals),
@@ -197,31 +201,36 @@ def make_closed_loop(
         "control": (control.get_system(), dae.control_signals),
         "reference": (reference, law.reference_signals),
     }
+    if isinstance(plant, ContactPlant):
+        named["contact_force"] = (plant, plant.contact_force_signals)
     if limits is not None:
         named["excess"] = (limits, dae.control_signals)
     if law.integral.outputs:
         named["integral"] = (controller, law.integral.signals)
     if law.measured_force and sensor is not None:
         named["measured_force"] = (sensor, dae.constraint_input_signals)
-    if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
+    if isinstance(plant, RobotBlock) and plant.model.loop_joints.signals:
         named["loop_state"] = (plant, plant.model.loop_joints.signals)
     if moving[0] is not None:
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         builder.ExportOutput(moving[0].get_output_port(), "exogenous")
-        sink = LogVectorOutput(moving[0].get_output_port(), builder, {TriggerType.kPerStep})
-        loggers["exogenous"] = (sink, signals)
-    for name, (owner, signals) in named.items():
+        loggers["exogenous"] = (_log(builder, moving[0].get_output_port(), plant), signals)
+    for name, (owner, labels) in named.items():
         port = owner.GetOutputPort(name)
         builder.ExportOutput(port, name)
-        loggers[name] = (LogVectorOutput(port, builder, {TriggerType.kPerStep}), signals)
+        loggers[name] = (_log(builder, port, plant), labels)
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
-    if isinstance(plant, RobotPlant):
+    if isinstance(plant, RobotBlock):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
         if meshcat is not None:
             source = moving[0].get_output_port() if moving[0] is not None else None
             add_live_view(builder, plant, scene_graph, meshcat, source)
+            if isinstance(plant, ContactPlant):
+                contact = builder.AddSystem(ContactVisualizer(meshcat))
+                for name in ("contact_results", "query_object"):
+                    builder.Connect(plant.GetOutputPort(name), contact.GetInputPort(name))
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")
@@ -238,6 +247,31 @@ def _add(builder: DiagramBuilder, block: Block) -> Block:
         raise WiringError(
             f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
         ) from None
+
+
+def _log(
+    builder: DiagramBuilder, port: OutputPort, plant: DaePlant | ContactPlant
+) -> VectorLogSink:
+    """Logs once per step.
+
+    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
+    instant that the run has not reached.
+    """
+    if plant.time_step:
+        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
+    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
+
+
+def _hold_before(plant: DaePlant | ContactPlant, sampling: Sampling) -> Sampling:
+    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
+    step = plant.time_step
+    if step and sampling.delay < step * (1.0 - 1e-9):
+        raise WiringError(
+            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
+            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
+            "delay at each step of the plant needs no sampling"
+        )
+    return replace(sampling, delay=max(sampling.delay - step, 0.0))
 
 
 def _add_drives(
@@ -269,7 +303,9 @@ def _add_drives(
 
 
 def _add_exogenous(
-    builder: DiagramBuilder, block: ParameterizedSystem, exogenous: Sequence[Reference]
+    builder: DiagramBuilder,
+    block: ParameterizedSystem | ContactPlant,
+    exogenous: Sequence[Reference],
 ) -> ReferenceGenerator | None:
     """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
 
