@@ -1,6 +1,7 @@
 """The closed loop that a scenario describes."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -15,8 +16,11 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
+from drake_dae.diagrams.contact_material import ContactMaterial
+from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
+    add_robot,
     at,
     each,
     index_of,
@@ -142,9 +146,10 @@ def wire_loop(
     exogenous = exogenous_references(scenario, law)
 
     # The diagram.
+    plant = _plant(scenario, model, structure)
     with at("force" if force.is_measured else "start.positions"):
         return make_closed_loop(
-            RobotPlant(model, structure=structure),
+            plant,
             law,
             references,
             exogenous=exogenous,
@@ -154,6 +159,23 @@ def wire_loop(
             scene_graph=scene_graph,
             meshcat=meshcat,
             start_time=scenario.integrator.start_time,
+        )
+
+
+def _plant(
+    scenario: Scenario, model: RobotModel, structure: Structure
+) -> RobotPlant | ContactPlant:
+    """What is simulated."""
+    material = scenario.plant
+    if not isinstance(material, ContactMaterial):
+        return RobotPlant(model, structure=structure)
+    with at("plant or plant_parameters"):
+        return ContactPlant(
+            model,
+            partial(add_robot, scenario.robot),
+            material,
+            structure=structure,
+            parameters=scenario.plant_parameters,
         )
 
 
@@ -221,9 +243,10 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
     """Sets parameters, state and sensor: at rest, where the references begin, plus the errors."""
     plant = loop.plant
     own = plant.GetMyMutableContextFromRoot(context)
-    with at("plant_parameters"):
-        for name, numbers in scenario.plant_parameters.items():
-            plant.set_parameter(own, name, numbers)
+    if isinstance(plant, RobotPlant):
+        with at("plant_parameters"):
+            for name, numbers in scenario.plant_parameters.items():
+                plant.set_parameter(own, name, numbers)
     parameters = plant.current_parameters(own)
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
     positions, forces = np.split(wanted, [len(model.position_signals)])

@@ -1,13 +1,14 @@
 """The one wiring: plant, reference, controller, loggers, and a view of the robot."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
+from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 
@@ -16,16 +17,16 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
-from drake_dae.simulation.view import add_live_view
+from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
-from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
 
@@ -52,7 +53,7 @@ class ClosedLoop:
     """
 
     diagram: Diagram
-    plant: DaePlant
+    plant: DaePlant | ContactPlant
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
@@ -92,10 +93,16 @@ class ClosedLoop:
             WiringError: An input port of the controller has a fixed value in this context, of which
                 nobody knows since when.
         """
-        self._refuse_fixed_ports(context)
         logged = Record.from_logs(self.loggers, context, after)
+        if isinstance(self.plant, DaePlant):
+            logged = self._completed(logged, self.plant, context)
+        return self.with_errors(logged).while_finite()
+
+    def _completed(self, logged: Record, plant: DaePlant, context: Context) -> Record:
+        """A record with what follows from what was logged."""
+        self._refuse_fixed_ports(plant, context)
         times, values = logged.time, {name: logged[name] for name in logged.signals}
-        known = {**values, "parameters": self._parameters_along(self.plant, context, times)}
+        known = {**values, "parameters": self._parameters_along(plant, context, times)}
         if self.plant_exogenous is not None:
             values["exogenous"] = self.plant_exogenous.along(times)
         values["reference"] = self.reference.along(times)
@@ -106,15 +113,13 @@ class ClosedLoop:
             if law.measured_force and "measured_force" not in known:
                 # Without a sensor; a law that does but integrate the force reads none here.
                 given["measured_force"] = (
-                    self.plant.along("constraint_force", known)
+                    plant.along("constraint_force", known)
                     if law.control_takes_force
-                    else np.zeros((times.size, self.plant.dae.num_constraints))
+                    else np.zeros((times.size, plant.dae.num_constraints))
                 )
             values["control"] = known["control"] = function_along(law.function, given)
-        values |= {port: self.plant.along(port, known) for port in self.plant.functions}
-
-        recorded = {n: Recorded(values[n], tuple(self.signals[n])) for n in self.signals}
-        return self.with_errors(Record(times, recorded)).while_finite()
+        values |= {port: plant.along(port, known) for port in plant.functions}
+        return Record(times, {n: Recorded(values[n], tuple(self.signals[n])) for n in self.signals})
 
     def with_errors(self, record: Record) -> Record:
         """A record with `desired_output` and `tracking_error` besides."""
@@ -126,10 +131,10 @@ class ClosedLoop:
         }
         return Record(record.time, {**record.signals, **derived})
 
-    def _refuse_fixed_ports(self, context: Context) -> None:
+    def _refuse_fixed_ports(self, plant: DaePlant, context: Context) -> None:
         taker, own = self.controller, self.controller.GetMyContextFromRoot(context)
         for giver, source, name in (
-            (self.plant, "state", "estimated_state"),
+            (plant, "state", "estimated_state"),
             (self.reference, "reference", "reference"),
         ):
             try:
@@ -168,7 +173,7 @@ class ClosedLoop:
 
 @checked(WiringError)
 def make_closed_loop(
-    system: DaePlant,
+    system: DaePlant | ContactPlant,
     law: TrackingLaw,
     references: Sequence[Reference],
     *,
@@ -183,7 +188,8 @@ def make_closed_loop(
     """Wires plant, reference generator and controller, with loggers and a view.
 
     Args:
-        system: A `RobotPlant`, or any `DaePlant`.
+        system: A `RobotPlant`, any `DaePlant`, or a `ContactPlant`, with which everything is logged
+            at its steps.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order.
         exogenous: The exogenous signals of the plant, which its law knows too, as references that
@@ -222,10 +228,12 @@ def make_closed_loop(
         outputs = law.layout.values(reference.reference(start_time))
     except DrakeDaeError:
         outputs = None  # A trajectory that begins later.
-    controller = builder.AddSystem(TrackingController(law, outputs))
+    period = plant.time_step if sampling is None else sampling.period
+    controller = builder.AddSystem(TrackingController(law, outputs, sample_period=period))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
-    control, limits = add_drives(builder, controller, sampling, control_limits)
+    held = None if sampling is None else _hold_before(plant, sampling)
+    control, limits = add_drives(builder, controller, held, control_limits)
     builder.Connect(control, plant.GetInputPort("control"))
 
     moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
@@ -253,6 +261,9 @@ def make_closed_loop(
     }.items():
         named[name] = (owner.GetOutputPort(name), signals)
     named["control"] = (control, dae.control_signals)
+    if isinstance(plant, ContactPlant):
+        port = plant.GetOutputPort("contact_force")
+        named["contact_force"] = (port, plant.contact_force_signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     if law.integral.outputs:
@@ -260,24 +271,30 @@ def make_closed_loop(
     if law.measured_force and sensor is not None:
         port = sensor.GetOutputPort("measured_force")
         named["measured_force"] = (port, dae.constraint_input_signals)
-    if isinstance(plant, RobotPlant) and plant.model.loop_joints.signals:
+    if isinstance(plant, RobotBlock) and plant.model.loop_joints.signals:
         named["loop_state"] = (plant.GetOutputPort("loop_state"), plant.model.loop_joints.signals)
-    told = {*plant.functions, "reference", "exogenous"}
-    if control.get_system() is controller:
-        told.add("control")
+    told: set[str] = set()
+    if isinstance(plant, DaePlant):
+        told = {*plant.functions, "reference", "exogenous"}
+        if control.get_system() is controller:
+            told.add("control")
     loggers = {}
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
         if name not in told:
-            loggers[name] = (LogVectorOutput(port, builder, {TriggerType.kPerStep}), signals)
+            loggers[name] = (_log(builder, port, plant), signals)
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
-    if isinstance(plant, RobotPlant):
+    if isinstance(plant, RobotBlock):
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
         if meshcat is not None:
             source = moving[0].get_output_port() if moving[0] is not None else None
             add_live_view(builder, plant, scene_graph, meshcat, source)
+            if isinstance(plant, ContactPlant):
+                contact = builder.AddSystem(ContactVisualizer(meshcat))
+                for name in ("contact_results", "query_object"):
+                    builder.Connect(plant.GetOutputPort(name), contact.GetInputPort(name))
 
     diagram = builder.Build()
     diagram.set_name("closed_loop")
@@ -294,3 +311,28 @@ def make_closed_loop(
         moving[1],
         moving[0],
     )
+
+
+def _log(
+    builder: DiagramBuilder, port: OutputPort, plant: DaePlant | ContactPlant
+) -> VectorLogSink:
+    """Logs once per step.
+
+    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
+    instant that the run has not reached.
+    """
+    if plant.time_step:
+        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
+    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
+
+
+def _hold_before(plant: DaePlant | ContactPlant, sampling: Sampling) -> Sampling:
+    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
+    step = plant.time_step
+    if step and sampling.delay < step * (1.0 - 1e-9):
+        raise WiringError(
+            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
+            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
+            "delay at each step of the plant needs no sampling"
+        )
+    return replace(sampling, delay=max(sampling.delay - step, 0.0))

@@ -1,6 +1,7 @@
 """Whether a robot can do what its scenario asks for, before it is simulated."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,7 @@ from drake_dae.diagrams.build import exogenous_references, wire_scenario
 from drake_dae.diagrams.feasibility_report import Feasibility, SignalRange
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import scenario_model, scenario_structure
+from drake_dae.diagrams.scenario_parts import IdealConstraints
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.summary import Limits
@@ -50,7 +52,9 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         structure = scenario_structure(model)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    loop, context = wire_scenario(scenario, model, structure)
+    # The law's model alone, without what it does not know of the plant.
+    ideal = replace(scenario, plant=IdealConstraints())
+    loop, context = wire_scenario(ideal, model, structure)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 
     def signals(time: float) -> FloatArray:

@@ -5,6 +5,7 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
+from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.errors import WiringError
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
@@ -14,7 +15,7 @@ from drake_dae.systems.sensors import ForceSensor
 
 def add_force_feedback(
     builder: DiagramBuilder,
-    plant: DaePlant,
+    plant: DaePlant | ContactPlant,
     controller: TrackingController,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
@@ -50,7 +51,7 @@ def add_force_feedback(
 
 
 def _check_loop(
-    plant: DaePlant,
+    plant: DaePlant | ContactPlant,
     controller: TrackingController,
     sensor: ForceSensor | None,
     sampling: Sampling | None,

@@ -17,6 +17,7 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
 from drake_dae.dae import references
+from drake_dae.diagrams import contact_material
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
@@ -78,6 +79,11 @@ Reference = Annotated[
 ]
 Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
+Plant = Annotated[
+    parts.IdealConstraints
+    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")],
+    Choice(),
+]
 Sampling = Annotated[sampling.Sampling, Form()]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
@@ -127,6 +133,8 @@ class Scenario:
             positions, and forces where `force` is measured.
         constraint_damping: What the law's model demands of constraints that give way, written as
             gains are, for r_i - 1 poles per constraint; none where left out.
+        plant: Whether constraints are ideal, or Drake's own contact is in their place: a discrete
+            MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
         references: The references, in the order of the outputs, the forces last.
@@ -153,6 +161,7 @@ class Scenario:
     gains: Gains = field(default_factory=parts.Poles)
     integral: list[str] = field(default_factory=list)
     constraint_damping: Gains | None = None
+    plant: Plant = field(default_factory=parts.IdealConstraints)
     sampling: Sampling | None = None
     saturation: bool = False
     references: list[Reference] = field(kw_only=True)

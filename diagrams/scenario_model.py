@@ -146,6 +146,28 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
     # Continuous: only then are the plant's own dynamics those of (37).
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
+    add_robot(robot, plant, scene_graph, MultibodyPlant.Finalize)
+    return plant
+
+
+def add_robot(
+    robot: Robot,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    then: Callable[[MultibodyPlant], None] = lambda plant: None,
+) -> None:
+    """Adds the robot of a scenario to a plant.
+
+    Args:
+        robot: The robot.
+        plant: A plant that is not finalized.
+        scene_graph: Where the plant is registered.
+        then: What is done to the plant at last.
+
+    Raises:
+        ModelError: Drake cannot read the file, or drops something of it.
+    """
+    is_url = robot.file.startswith("package://")
     parser = Parser(plant)
     log = logging.getLogger("drake")
     level, dropped = log.level, _Dropped(log.getEffectiveLevel())
@@ -164,7 +186,7 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
         folders = [FOLDER / "models", *map(Path, robot.packages.values())]
         check_resources(scene_graph, [package_folder(Path(file)), *folders])
         _add_free_joints(robot.free, plant)
-        plant.Finalize()
+        then(plant)
     except ScenarioError:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
@@ -175,7 +197,6 @@ def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
         log.removeFilter(dropped)
     if dropped.warnings:
         raise ModelError("; ".join(map(_explained, dropped.warnings)))
-    return plant
 
 
 @at("robot.free")

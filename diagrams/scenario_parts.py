@@ -137,6 +137,11 @@ class MeasuredForce:
 
 
 @dataclass(frozen=True)
+class IdealConstraints:
+    """The plant is a `RobotPlant`: its constraints hold exactly."""
+
+
+@dataclass(frozen=True)
 class PerOutput:
     """Numbers for all outputs, or per output name ("*" for all others)."""
 

@@ -33,6 +33,8 @@ from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.build import build_scenario as build_scenario
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
 from .diagrams.closed_loop import make_closed_loop as make_closed_loop
+from .diagrams.contact_material import ContactMaterial as ContactMaterial
+from .diagrams.contact_plant import ContactPlant as ContactPlant
 from .diagrams.export.export import export_code as export_code
 from .diagrams.rollout.rollout import rollout as rollout
 from .diagrams.rollout.rollout import start_values as start_values

@@ -39,6 +39,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.diagrams.scenario import Scenario
+from drake_dae.diagrams.scenario_model import add_robot
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.diagrams.sweep.runs import Outcome, RunResult
 from drake_dae.errors import DrakeDaeError
@@ -61,6 +62,17 @@ def loop() -> dd.ClosedLoop:
     references = [dd.ConstantReference(0.3), dd.ConstantReference(10.0)]
     plant = dd.RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
     return dd.make_closed_loop(plant, tracking, references)
+
+
+def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    robot = scenario().robot
+    add_robot(robot, plant, scene_graph)
+
+
+@cache
+def contact_plant() -> dd.ContactPlant:
+    found = arm("two_link")
+    return dd.ContactPlant(found.model, add_arm, dd.ContactMaterial(), structure=found.structure)
 
 
 @cache
@@ -124,6 +136,8 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Diagram: lambda: loop().diagram,
     dd.Analysis: analysis,
     dd.ClosedLoop: loop,
+    dd.ContactMaterial: dd.ContactMaterial,
+    dd.ContactPlant: contact_plant,
     dd.DaePlant: lambda: loop().plant,
     dd.DaeSystem: lambda: arm("two_link").model.dae,
     dd.Extension: lambda: dd.Extension(
@@ -187,6 +201,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "reference": lambda: record()["reference"][0],
     "coordinates": lambda: normal_form().coordinates(state()),
     "parameters": lambda: arm("two_link").model.dae.parameter_values,
+    "add_robot": lambda: add_arm,
+    "parameters of ContactPlant": lambda: {"wall.position": [1.2, 0.0, 0.0]},
     "limits of ControlLimits": lambda: [1.0],
     "axes": lambda: "xz",
     "axis": lambda: (0.0, 0.0, 1.0),

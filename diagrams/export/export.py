@@ -121,7 +121,7 @@ def _vectors(
     moves = "; what moves comes here, too, with its derivatives" if system.exogenous else ""
     gains = [
         Signal(f"K of {system.output_signals[i].name} for {chain.name}")
-        for j, chain in enumerate(law.layout.chain_signals(system.output_signals))
+        for j, chain in enumerate(law.coordinate_signals)
         for i in np.flatnonzero(law.gains.matrix[:, j])
     ]
     vectors = {
@@ -142,6 +142,10 @@ def _vectors(
     }
     if not law.measured_force:
         del vectors["measured_force"]
+    if law.integral.outputs:
+        vectors["integral"] = _Vector("the integrals of errors", law.integral.signals)
+        rates = [Signal(f"d/dt {s.name}", s.unit.removesuffix(" s")) for s in law.integral.signals]
+        vectors["integral_rate"] = _Vector("their derivatives by the time", rates)
     return vectors
 
 

@@ -67,6 +67,7 @@ def samples(
             "other": states[0],
             "reference": loop.reference.reference(time),
             "measured_force": random.normal(size=plant.dae.num_constraints),
+            "integral": random.normal(size=len(loop.controller.law.integral.outputs)),
             "parameters": given,
             "law_parameters": model,
             "control": np.zeros(plant.dae.num_controls),

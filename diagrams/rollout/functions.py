@@ -12,6 +12,7 @@ from drake_dae.dae.references import Reference
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.trace.functions import TracedFunction
 
@@ -151,13 +152,17 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
     """The functions of a closed loop.
 
     Raises:
-        ModelError: A reference is no expression of time, or the loop has memory that no rollout
-            has: integrals of the law, a sampled law, or drives with limits.
+        ModelError: A reference is no expression of time, or the loop has what no rollout has:
+            Drake's own contact, integrals of the law, a sampled law, or drives with limits.
     """
     plant, law = loop.plant, loop.controller.law
-    if law.integral.outputs or "control" in loop.loggers:
-        what = "integrals" if law.integral.outputs else "a sampled law, or drives with limits"
-        raise ModelError(f"a rollout does not know {what}; run the loop by simulate")
+    unknown = "Drake's own contact" if not isinstance(plant, DaePlant) else ""
+    unknown = unknown or ("integrals" if law.integral.outputs else "")
+    unknown = unknown or (
+        "a sampled law, or drives with limits" if "control" in loop.loggers else ""
+    )
+    if unknown or not isinstance(plant, DaePlant):
+        raise ModelError(f"a rollout does not know {unknown}; run the loop by simulate")
     dae, structure = plant.dae, plant.structure
     time = ca.SX.sym("t")
     moving = loop.exogenous.references if loop.exogenous is not None else ()

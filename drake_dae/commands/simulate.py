@@ -28,8 +28,7 @@ from drake_dae.simulation.record_writer import RecordWriter
 from drake_dae.simulation.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
-from drake_dae.simulation.view import start_meshcat
-from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.simulation.view import RobotBlock, start_meshcat
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -113,7 +112,7 @@ def _write(run: _Run) -> bool:
         if record.time.size == 0:
             return True
         predicted = loop.predicted_error(record)
-        limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotPlant) else Limits()
+        limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
         text = summary(record, predicted, limits, run.statistics, run.failure)
         if write.record:
             with _collected(problems):

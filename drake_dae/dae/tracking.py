@@ -184,7 +184,7 @@ class TrackingLaw:
         has = self.gains.matrix != 0.0
         if np.any(chosen.matrix[~has]):
             i, j = np.argwhere((chosen.matrix != 0.0) & ~has)[0]
-            signals = self._coordinate_signals
+            signals = self.coordinate_signals
             raise GainError(
                 f"the law has no gain from the error of {signals[j].name} to "
                 f"{self.system.output_signals[i].name}; make a new law with such a gain"
@@ -193,7 +193,7 @@ class TrackingLaw:
         return np.concatenate([values, chosen.matrix.T[has.T]])
 
     @property
-    def _coordinate_signals(self) -> list[Signal]:
+    def coordinate_signals(self) -> list[Signal]:
         """Names and units of the error coordinates."""
         integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
         found = []

@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 from pydrake.geometry import Meshcat, Rgba, SceneGraph
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -14,13 +14,12 @@ from drake_dae.simulation.constraint_forces import ConstraintLoads
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import (
     FRAME_RATE,
+    RobotBlock,
     draw_scene,
     draw_surroundings,
     start_meshcat,
     view_of_links,
 )
-from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.robot_plant import RobotPlant
 
 _DESIRED, _ACTUAL = Rgba(0.1, 0.6, 0.2, 1.0), Rgba(0.1, 0.2, 0.8, 1.0)
 
@@ -29,7 +28,7 @@ class Loop(Protocol):
     """A diagram with a plant and its geometry, as a `ClosedLoop`."""
 
     @property
-    def plant(self) -> DaePlant:
+    def plant(self) -> System:
         """What was simulated."""
 
     @property
@@ -53,7 +52,7 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
         ModelError: There is no robot.
     """
     plant = loop.plant
-    if not isinstance(plant, RobotPlant):
+    if not isinstance(plant, RobotBlock):
         raise ModelError("an animation needs a closed loop of a RobotPlant")
     # A server of its own, made only now: a run that nobody watches opens no port.
     meshcat, model = start_meshcat(), plant.model

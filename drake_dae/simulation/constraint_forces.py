@@ -18,7 +18,6 @@ from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.contact.surface import axes_along
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.trace.functions import TracedFunction
 
 _FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
@@ -182,18 +181,21 @@ class ConstraintForceVisualizer(LeafSystem):
 
     Args:
         arrows: What draws them.
-        plant: The robot.
+        model: The robot.
+        places: Where the entries of `exogenous` stand among the parameters.
         period: Time between pictures in s.
     """
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(self, arrows: ForceArrows, plant: RobotPlant, period: float) -> None:
+    def __init__(
+        self, arrows: ForceArrows, model: RobotModel, places: Sequence[int], period: float
+    ) -> None:
         super().__init__()
         self.set_name("constraint_force_visualizer")
-        model = self._model = plant.model
+        self._model = model
         self._arrows, self._loads = arrows, ConstraintLoads(model)
-        self._values, self._places = model.dae.parameter_values, plant.exogenous_places
+        self._values, self._places = model.dae.parameter_values, list(places)
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
         self._force = self.DeclareVectorInputPort("constraint_force", len(model.dae.force_signals))

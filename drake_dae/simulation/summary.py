@@ -12,6 +12,8 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 
+_PROJECTED = "before each step's projection"
+
 SLACK = 1e-9
 """How far a value must be beyond a joint limit to count, in its unit: a start may be on it."""
 
@@ -74,7 +76,9 @@ def summary(
     limits = limits or Limits()
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
-    notes = [f"constraint residual  {residual:.2g} at most, before each step's projection"]
+    # Drake's own contact gives way, and is not projected.
+    kind = "in contact that gives way" if "contact_force" in record.signals else _PROJECTED
+    notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
     if run is not None:
         notes.append(

@@ -1,6 +1,7 @@
 """A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
 
 import errno
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from pydrake.geometry import (
@@ -11,11 +12,13 @@ from pydrake.geometry import (
     Rgba,
     SceneGraph,
 )
-from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import (
@@ -25,7 +28,6 @@ from drake_dae.simulation.constraint_forces import (
     own_values,
     path_of,
 )
-from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.trace.functions import TracedFunction
 
 FRAME_RATE = 32.0
@@ -33,6 +35,26 @@ FRAME_RATE = 32.0
 
 _ON_REQUEST = 1e9
 """A publish period so long that only a forced publish draws."""
+
+
+@runtime_checkable
+class RobotBlock(Protocol):
+    """A block that simulates a robot, as a `RobotPlant`."""
+
+    model: RobotModel
+    dae: DaeSystem
+    structure: ConstraintStructure
+    exogenous_places: list[int]
+
+    def GetOutputPort(self, port_name: str) -> OutputPort:
+        """Ports as `link_state` and `constraint_force`."""
+
+    def GetMyContextFromRoot(self, root_context: Context) -> Context:
+        """Its part of a diagram's context."""
+
+    def parameters(self, context: Context) -> FloatArray:
+        """All parameters in the order of `dae.parameters`, shape (k,)."""
+
 
 _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
@@ -56,7 +78,7 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
 
 def add_live_view(
     builder: DiagramBuilder,
-    plant: RobotPlant,
+    plant: RobotBlock,
     scene_graph: SceneGraph | None,
     meshcat: Meshcat,
     exogenous: OutputPort | None = None,
@@ -72,7 +94,9 @@ def add_live_view(
     """
     period = 1.0 / FRAME_RATE
     arrows = draw_scene(plant, meshcat)
-    forces = builder.AddSystem(ConstraintForceVisualizer(arrows, plant, period))
+    forces = builder.AddSystem(
+        ConstraintForceVisualizer(arrows, plant.model, plant.exogenous_places, period)
+    )
     for name in ("link_state", "constraint_force"):
         builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
     if exogenous is not None:
@@ -83,7 +107,7 @@ def add_live_view(
         builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
 
 
-def draw_scene(plant: RobotPlant, meshcat: Meshcat) -> ForceArrows:
+def draw_scene(plant: RobotBlock, meshcat: Meshcat) -> ForceArrows:
     """Draws what does not move, and returns what draws the constraint forces.
 
     Args:
@@ -101,7 +125,7 @@ def draw_scene(plant: RobotPlant, meshcat: Meshcat) -> ForceArrows:
 
 
 def view_of_links(
-    plant: RobotPlant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
+    plant: RobotBlock, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
 ) -> Diagram | None:
     """Drake's own picture of a robot, posed by our link state; its plant is not simulated.
 

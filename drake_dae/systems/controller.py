@@ -4,7 +4,14 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, ContinuousState, DependencyTicket
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    ContinuousState,
+    DependencyTicket,
+    EventStatus,
+    State,
+)
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
@@ -53,6 +60,9 @@ class TrackingController(ParameterizedSystem):
         integral_limits: The largest |integral| of each error in its unit times s, a number or shape
             (k,), positive. Converted to AutoDiffXd it has neither limits nor holds, and a force
             that it integrates has direct feedthrough, so that it must come from a sensor.
+        sample_period: Integrals are sums of the errors at the multiples of this time in s, as those
+            of a `Sampling`, and do not convert; 0 for integrals by the integrator. An integrator
+            has no use for a discrete plant, whose state jumps while time goes on.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
@@ -69,6 +79,7 @@ class TrackingController(ParameterizedSystem):
         law: TrackingLaw,
         outputs: ArrayLike | None = None,
         integral_limits: ArrayLike = np.inf,
+        sample_period: float = 0.0,
     ) -> None:
         dae = law.system
         signals = {
@@ -87,7 +98,7 @@ class TrackingController(ParameterizedSystem):
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         if law.integral.outputs:
-            sources = self._add_integrals(integral_limits)
+            sources = self._add_integrals(integral_limits, sample_period)
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
@@ -95,7 +106,7 @@ class TrackingController(ParameterizedSystem):
             "tracking_error", dae.num_outputs, weakly(self._calc_tracking_error), sources
         )
 
-    def _add_integrals(self, limits: ArrayLike) -> set[DependencyTicket]:
+    def _add_integrals(self, limits: ArrayLike, sample_period: float) -> set[DependencyTicket]:
         """Declares the integrals, and returns what the control depends on."""
         count = len(self.law.integral.outputs)
         given = np.asarray(limits, dtype=float)
@@ -103,23 +114,30 @@ class TrackingController(ParameterizedSystem):
             raise ModelError(
                 f"integral_limits must be a positive number or shape ({count},), got {limits!r}"
             )
-        self._limits = np.broadcast_to(given, (count,))
+        if not sample_period >= 0.0:
+            raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
+        self._limits, self.sample_period = np.broadcast_to(given, (count,)), sample_period
         self._hold = self.DeclareVectorInputPort("hold", count)
-        self.DeclareContinuousState(count)
-        self._evaluators.append(_integrals_of)
+        if sample_period:
+            self.DeclareDiscreteState(count)
+            # Unrestricted, as the step of a discrete MultibodyPlant: so both see one instant.
+            self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sum))
+            tickets = {self.xd_ticket()}
+        else:
+            self.DeclareContinuousState(count)
+            tickets = state_tickets(self)
+        self._evaluators.append(weakly(self._integrals))
         self._rate_evaluators = list(self._evaluators)
         if self.law.measured_force and not self.law.control_takes_force:
             # Whatever it is: reading it would close an algebraic loop.
             nothing = np.zeros(self.dae.num_constraints)
             self._evaluators[2] = lambda context: nothing
-        self.DeclareVectorOutputPort(
-            "integral", count, weakly(self._copy_integrals), state_tickets(self)
-        )
+        self.DeclareVectorOutputPort("integral", count, weakly(self._copy_integrals), tickets)
         read = ["estimated_state", "reference", "exogenous"]
         read += ["measured_force"] if self.law.control_takes_force else []
         ports = [self.GetInputPort(name) for name in read if self.HasInputPort(name)]
-        tickets = {self.input_port_ticket(port.get_index()) for port in ports}
-        return tickets | {self.all_parameters_ticket()} | state_tickets(self)
+        tickets |= {self.input_port_ticket(port.get_index()) for port in ports}
+        return tickets | {self.all_parameters_ticket()}
 
     def set_integral(self, context: Context, integral: ArrayLike) -> None:
         """Starts the integrals of the errors at values, shape (k,).
@@ -131,21 +149,32 @@ class TrackingController(ParameterizedSystem):
         size = len(self.law.integral.outputs)
         if not size:
             raise ModelError(f"{self.get_name()}: its law integrates nothing")
-        context.SetContinuousState(vector("integral", integral, size))
+        values = vector("integral", integral, size)
+        if self.sample_period:
+            context.SetDiscreteState(values)
+        else:
+            context.SetContinuousState(values)
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        if not self.law.integral.outputs:
-            return
+        if self.law.integral.outputs and not self.sample_period:
+            derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
+
+    def _sum(self, context: Context, state: State) -> EventStatus:
+        summed = self._integrals(context) + self.sample_period * self._integral_rate(context)
+        state.get_mutable_discrete_state().set_value(0, summed)
+        return EventStatus.Succeeded()
+
+    def _integral_rate(self, context: Context) -> FloatArray:
         inputs = [evaluate(context) for evaluate in self._rate_evaluators]
         rate = self._checked(self.law.function, context, *inputs)[2].copy()
-        sigma = _integrals_of(context)
+        sigma = self._integrals(context)
         rate[(np.abs(sigma) >= self._limits) & (rate * sigma > 0.0)] = 0.0
         if self._hold.HasValue(context):
             rate[self._hold.Eval(context) != 0.0] = 0.0
-        derivatives.get_mutable_vector().SetFromVector(rate)
+        return rate
 
     def _copy_integrals(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(_integrals_of(context))
+        output.SetFromVector(self._integrals(context))
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
         """Changes the gains in a context.
@@ -176,6 +205,11 @@ class TrackingController(ParameterizedSystem):
         inputs = [evaluate(context) for evaluate in self._evaluators]
         return self._checked(self.law.function, context, *inputs)
 
+    def _integrals(self, context: Context) -> FloatArray:
+        if self.sample_period:
+            return context.get_discrete_state(0).CopyToVector()
+        return context.get_continuous_state_vector().CopyToVector()
+
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function
         named = {"state": "estimated_state", "integral": "state"}
@@ -185,6 +219,11 @@ class TrackingController(ParameterizedSystem):
             for name in ("control", "tracking_error")
         }
         if self.law.integral.outputs:
+            if self.sample_period:
+                raise ModelError(
+                    f"{self.get_name()} does not convert to AutoDiffXd: its integrals are sampled, "
+                    "and a sample has no derivative by the time. Give it no sample_period"
+                )
             formulas["derivative"] = TracedFormula(
                 function, "integral_rate", sources, self._signals
             )
@@ -192,10 +231,6 @@ class TrackingController(ParameterizedSystem):
             own = TracedFunction("integral", {"state": sigma}, {"value": sigma})
             formulas["integral"] = TracedFormula(own)
         return formulas
-
-
-def _integrals_of(context: Context) -> FloatArray:
-    return context.get_continuous_state_vector().CopyToVector()
 
 
 def _warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:

@@ -104,6 +104,8 @@ class DaePlant(ParameterizedSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    #: The step of a discrete plant in s; 0 for one that is continuous, as this is.
+    time_step = 0.0
 
     def __init__(
         self,

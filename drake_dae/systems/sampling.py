@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import ceil, floor, isfinite
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
@@ -60,13 +60,13 @@ class ControlHold(LeafSystem):
 
         u(t) = control(t_k)    for    t_k + delay <= t < t_(k+1) + delay,    t_k = k period.
 
-    A controller is evaluated at the samples alone, at the time, the state and the reference of that
-    instant: what else happens at the same instant, as the step of a discrete plant, comes after it.
-    Before the first control acts, that of the start is held, as if the robot had stood there.
+    A controller is evaluated at the samples alone. Before the first control acts, that of the start
+    is held, as if the robot had stood there.
 
-    Its updates are those of discrete states, and Drake makes all of an instant at once: a discrete
-    plant that steps at t_k takes what was held before, so that it sees a delay that is longer by
-    one step of its own.
+    The updates are unrestricted ones, which Drake makes before those of discrete states, and all of
+    an instant at once: so the controller sees the time, the state and the reference of t_k also
+    where a discrete MultibodyPlant steps at t_k, which is such an update, too. That plant takes
+    what was held before, and sees a delay that is longer by one step of its own.
 
     Input port:
         control: What the controller wants now, shape (p,).
@@ -89,40 +89,40 @@ class ControlHold(LeafSystem):
         # What is held; then what was read and does not act yet, the oldest first.
         waiting = sampling.whole_periods + (sampling.rest > 0.0)
         self._state = self.DeclareDiscreteState(np.full((1 + waiting) * size, np.nan))
-        self.DeclareInitializationDiscreteUpdateEvent(weakly(self._begin))
+        self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
         read = self._read if sampling.rest else self._read_and_act
-        self.DeclarePeriodicDiscreteUpdateEvent(sampling.period, 0.0, weakly(read))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(sampling.period, 0.0, weakly(read))
         if sampling.rest:
-            self.DeclarePeriodicDiscreteUpdateEvent(
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
                 sampling.period, sampling.rest, weakly(self._act)
             )
         self.DeclareVectorOutputPort("control", size, weakly(self._calc), {self.xd_ticket()})
 
-    def _begin(self, context: Context, values: DiscreteValues) -> EventStatus:
+    def _begin(self, context: Context, state: State) -> EventStatus:
         rows = self._rows(context)
         if not np.isnan(rows).any():
             return EventStatus.DidNothing()  # A run that goes on.
         rows[:] = self._port.Eval(context)
-        return self._set(values, rows)
+        return self._set(state, rows)
 
-    def _read_and_act(self, context: Context, values: DiscreteValues) -> EventStatus:
-        return self._set(values, np.vstack([self._rows(context)[1:], self._port.Eval(context)]))
+    def _read_and_act(self, context: Context, state: State) -> EventStatus:
+        return self._set(state, np.vstack([self._rows(context)[1:], self._port.Eval(context)]))
 
-    def _read(self, context: Context, values: DiscreteValues) -> EventStatus:
+    def _read(self, context: Context, state: State) -> EventStatus:
         rows = self._rows(context)
-        return self._set(values, np.vstack([rows[:1], rows[2:], self._port.Eval(context)]))
+        return self._set(state, np.vstack([rows[:1], rows[2:], self._port.Eval(context)]))
 
-    def _act(self, context: Context, values: DiscreteValues) -> EventStatus:
+    def _act(self, context: Context, state: State) -> EventStatus:
         rows = self._rows(context)
         rows[0] = rows[1]
-        return self._set(values, rows)
+        return self._set(state, rows)
 
     def _rows(self, context: Context) -> np.ndarray:
         vector = context.get_discrete_state(self._state).CopyToVector()
         return vector.reshape(-1, self._port.size())
 
-    def _set(self, values: DiscreteValues, rows: np.ndarray) -> EventStatus:
-        values.set_value(self._state, rows.ravel())
+    def _set(self, state: State, rows: np.ndarray) -> EventStatus:
+        state.get_mutable_discrete_state().set_value(self._state, rows.ravel())
         return EventStatus.Succeeded()
 
     def _calc(self, context: Context, output: BasicVector) -> None:

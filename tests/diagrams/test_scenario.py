@@ -156,8 +156,12 @@ def test_actuated_scenario_has_the_predicted_error(name):
     assert np.abs(record["tracking_error"][-1, -1]) < 0.3 * 5.0
 
 
+# Drake's own contact has a suite of its own: it touches without a force at the start.
+IDEAL = [name for name in shipped_scenarios() if not name.startswith("wall_")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", shipped_scenarios())
+@pytest.mark.parametrize("name", IDEAL)
 def test_shipped_scenario_runs_from_its_start_errors(name):
     scenario = load_scenario(find_scenario(name), ["duration=0.3"])
     assert scenario.description

@@ -104,6 +104,8 @@ class Constraint(ABC):
         it too.
     13. Where what lambda does besides grows with one of its parameters, a coefficient of friction,
         `friction_parameter` names that.
+    14. `solid` is what its one force comes from where Drake's own contact is the plant: what stands
+        in the world and pushes frame B of its first application at the point there.
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
@@ -197,6 +199,14 @@ class Constraint(ABC):
             values: The values of its parameters, below each other.
         """
         return RigidTransform()
+
+    def solid(self, values: FloatArray) -> Picture | None:
+        """What Drake's own contact takes in its place; None where there is no such thing.
+
+        Args:
+            values: The values of its parameters, below each other.
+        """
+        return None
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
         """What is to be seen where the robot touches, or None.

@@ -166,6 +166,10 @@ class PointOnSurface(Constraint):
         picture = self.surface.picture(stands.inverse() @ point, size)
         return None if picture is None else picture.moved(stands)
 
+    def solid(self, values: FloatArray) -> Picture | None:
+        solid = self.surface.solid()
+        return None if solid is None else solid.moved(self.placement(values))
+
 
 @checked(ModelError)
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class Surface(ABC):
        long there. Balls roll on such surfaces alone.
     5. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
        with a shape of its own gives that.
+    6. `solid` is what fills the side that is not free, as a shape of Drake, for its own contact. A
+       surface may have none.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
@@ -93,6 +95,10 @@ class Surface(ABC):
             )
             return None
         return Picture(mesh_of_grid(grid), RigidTransform())
+
+    def solid(self) -> Picture | None:
+        """What lies below the surface, standing with its reference point at the origin."""
+        return None
 
     def _patch(self, center: FloatArray, size: float) -> FloatArray:
         """A grid of points on the surface, shape (k, k, 3); NaN where there is none.

@@ -62,6 +62,10 @@ class Plane(Surface):
         pose = RigidTransform(RotationMatrix(axes_along(normal)), foot - thickness / 2 * normal)
         return Picture(geometry.Box(size, size, thickness), pose)
 
+    def solid(self) -> Picture:
+        pose = RigidTransform(RotationMatrix(axes_along(self.normal)), np.zeros(3))
+        return Picture(geometry.HalfSpace(), pose)
+
 
 @checked(ModelError)
 @dataclass(frozen=True)
@@ -102,6 +106,9 @@ class Sphere(Surface):
 
     def picture(self, center: ArrayLike, size: float) -> Picture:
         return Picture(geometry.Sphere(self.radius), RigidTransform())
+
+    def solid(self) -> Picture | None:
+        return None if self.inside else Picture(geometry.Sphere(self.radius), RigidTransform())
 
 
 @checked(ModelError)

@@ -1,0 +1,272 @@
+"""Drake's own contact as the plant: a discrete MultibodyPlant in place of the ideal constraint."""
+
+import logging
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    HalfSpace,
+    Role,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import GetScopedFrameByName
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import Frame
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.dae.layout import Layout
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.diagrams.contact_material import ContactMaterial, ball_properties, surface_properties
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.simulation.constraint_forces import ConstraintLoads, own_values
+from drake_dae.systems.contact_forces import ContactForces
+from drake_dae.systems.lifetime import SHARED_DICTIONARY
+
+
+def _is_of_use(record: logging.LogRecord) -> bool:
+    """Each context would tell that half spaces have no deformable contact, which none here has."""
+    return "half spaces are not currently supported for deformable" not in record.getMessage()
+
+
+@checked(ModelError)
+class ContactPlant(Diagram):
+    """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
+
+    What an ideal constraint keeps exactly, compliant contact with friction keeps nearly, and it may
+    open. A ball on the robot stands for the point of each constraint, and its surface for what it
+    touches; nothing else of the robot collides.
+
+    The plant steps at t_n = n time_step: what is at its ports then is x(t_n), before the step to
+    t_(n+1), for which it takes the control that it finds at t_n. The force is that of the step that
+    led to t_n.
+
+    Input port:
+        control: The torques and forces of the actuators, N m (N), shape (p,).
+
+    Output ports:
+        state, link_state: x = (q, v), shape (n,).
+        constraint_force, contact_force, constraint_residual, controlled_output: As of
+            `ContactForces`.
+        contact_results: Drake's.
+        query_object: Drake's, of the scene with the contact geometry.
+
+    Args:
+        model: The robot: rigid joints, and each constraint a `PointOnSurface` that stands still, on
+            a surface that has a `solid`.
+        add_robot: Adds the robot to a plant as it was added to the one that the model is made of.
+        material: How it touches.
+        structure: The structure of the model's system.
+        parameters: Parameter name -> what the plant has otherwise: positions and friction of
+            surfaces.
+
+    Attributes:
+        dae, model, structure, time_step: Of the plant.
+        multibody: Drake's plant.
+        contact_force_signals: Names and units of `contact_force`.
+
+    Raises:
+        ModelError: The robot cannot touch in this way; why.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        model: RobotModel,
+        add_robot: Callable[[MultibodyPlant, SceneGraph], None],
+        material: ContactMaterial,
+        *,
+        structure: ConstraintStructure,
+        parameters: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        super().__init__()
+        _check_model(model)
+        self.model, self.dae, self.structure = model, model.dae, structure
+        self.time_step = material.time_step
+        self.exogenous_layout, self.exogenous_places = Layout(()), list[int]()
+        self._values = _changed(model, parameters or {})
+        logging.getLogger("drake").addFilter(_is_of_use)
+        builder = DiagramBuilder()
+        config = MultibodyPlantConfig(
+            time_step=material.time_step, contact_model=material.contact_model
+        )
+        plant, scene_graph = AddMultibodyPlant(config, builder)
+        self.multibody = plant
+        add_robot(plant, scene_graph)
+        pairs = self._add_contacts(plant, scene_graph, material)
+        plant.Finalize()
+        _check_same(plant, model)
+
+        forces = builder.AddSystem(ContactForces(model, structure, pairs, self._values))
+        self.contact_force_signals = forces.contact_force_signals
+        builder.Connect(plant.get_state_output_port(), forces.GetInputPort("state"))
+        results = plant.get_contact_results_output_port()
+        builder.Connect(results, forces.GetInputPort("contact_results"))
+        builder.ExportInput(plant.get_actuation_input_port(), "control")
+        for name in ("state", "link_state"):
+            builder.ExportOutput(plant.get_state_output_port(), name)
+        for name in (
+            "constraint_force",
+            "contact_force",
+            "constraint_residual",
+            "controlled_output",
+        ):
+            builder.ExportOutput(forces.GetOutputPort(name), name)
+        builder.ExportOutput(results, "contact_results")
+        builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")
+        builder.BuildInto(self)
+        self.set_name(model.dae.name)
+
+    def _add_contacts(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, material: ContactMaterial
+    ) -> list[tuple[GeometryId, GeometryId]]:
+        """A ball on the robot and a solid in the world for each constraint, and nothing else."""
+        pairs = []
+        for constraint, (frame, center) in zip(
+            self.model.constraints, self._balls(plant, material.radius), strict=True
+        ):
+            solid = constraint.solid(own_values(constraint, self.dae, self._values))
+            assert solid is not None  # _check_model.
+            friction = material.friction
+            if friction is None:
+                name = constraint.friction_parameter
+                friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
+            ball = plant.RegisterCollisionGeometry(
+                frame.body(),
+                RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
+                Sphere(material.radius),
+                f"{constraint.name}_ball",
+                ball_properties(material, friction),
+            )
+            touched = plant.RegisterCollisionGeometry(
+                plant.world_body(),
+                solid.pose,
+                solid.form,
+                f"{constraint.name}_surface",
+                surface_properties(material, friction, isinstance(solid.form, HalfSpace)),
+            )
+            pairs.append((ball, touched))
+        # A robot's own shapes collide with nothing, and a ball with its own surface alone.
+        every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
+        manager = scene_graph.collision_filter_manager()
+        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(every)))
+        for ball, touched in pairs:
+            allowed = GeometrySet([ball]), GeometrySet([touched])
+            manager.Apply(CollisionFilterDeclaration().AllowBetween(*allowed))
+        return pairs
+
+    def _balls(self, plant: MultibodyPlant, radius: float) -> list[tuple[Frame, FloatArray]]:
+        """The frame of the robot that each constraint holds, and where in it the ball stands."""
+        model, values, drawn = self.model, self._values, self.model.links.plant
+        assert drawn is not None  # _check_model.
+        state = self.structure.manifold.project(self.dae.nominal_state, values)
+        context = drawn.CreateDefaultContext()
+        drawn.SetPositionsAndVelocities(context, state)
+        loads = ConstraintLoads(model, values)
+        # A unit of force shows the normal, where nothing rubs.
+        state[model.links.q.numel() :] = 0.0
+        found = loads(state, np.ones(self.dae.num_constraints))
+        kinematics = model.links.kinematics()
+        balls = []
+        for constraint, point, normal in zip(
+            loads.constraints, found.points, found.forces, strict=True
+        ):
+            name = constraint.applications(kinematics)[0].frame_b
+            pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
+            center = pose.inverse() @ (point + radius * normal)
+            balls.append((GetScopedFrameByName(plant, name), center))
+        return balls
+
+    def parameters(self, context: Context) -> FloatArray:
+        """All parameters in the order of `dae.parameters`, shape (k,)."""
+        return self._values.copy()
+
+    def current_parameters(self, context: Context) -> FloatArray:
+        """The same: nothing moves."""
+        return self._values.copy()
+
+    def state(self, context: Context) -> FloatArray:
+        """The state x in a context, shape (n,)."""
+        own = self.GetSubsystemContext(self.multibody, context)
+        return np.array(self.multibody.GetPositionsAndVelocities(own))
+
+    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
+        """Sets the state on N* next to a guess, shape (n,), and returns it.
+
+        The robot then touches without a force, and sinks in when the run begins.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
+        state = self.structure.manifold.settle(guess, self._values)
+        own = self.GetMutableSubsystemContext(self.multibody, context)
+        self.multibody.SetPositionsAndVelocities(own, state)
+        return state
+
+
+def _check_model(model: RobotModel) -> None:
+    """Refuses what Drake's contact cannot stand for."""
+    if model.links.plant is None:
+        raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
+    if model.stages:
+        raise ModelError("Drake's contact as the plant takes rigid joints; leave actuation out")
+    if model.dae.exogenous or model.loads:
+        raise ModelError("Drake's contact as the plant takes no exogenous signals and no loads")
+    if not model.constraints:
+        raise ModelError("the robot has no constraints, so there is nothing to touch")
+    for constraint in model.constraints:
+        values = own_values(constraint, model.dae, model.dae.parameter_values)
+        if constraint.solid(values) is None:
+            raise ModelError(
+                f"'{constraint.name}' is no contact with a solid: take a PointOnSurface on a "
+                "Plane, or on the outside of a Sphere, or an ideal plant"
+            )
+
+
+def _changed(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
+    """The values of all parameters, those of what the robot touches as a plant has them."""
+    values = model.dae.parameter_values
+    own = [parameter for constraint in model.constraints for parameter in constraint.parameters]
+    known = {parameter.name: parameter for parameter in own}
+    for name, value in parameters.items():
+        if name not in known:
+            raise ModelError(
+                f"of Drake's contact as the plant {unknown_name('parameter', name, known)}; give "
+                "the law's model others instead"
+            )
+        given = numbers(f"parameter '{name}'", value)
+        if given.shape not in ((), known[name].value.shape):
+            raise ModelError(
+                f"parameter '{name}' has {known[name].value.size} entries, got {value!r}"
+            )
+        values[model.dae.parameter_slice(name)] = given
+        known[name].check(values[model.dae.parameter_slice(name)])
+    return values
+
+
+def _check_same(plant: MultibodyPlant, model: RobotModel) -> None:
+    """Refuses another robot than that of the model."""
+    drawn = model.links.plant
+    assert drawn is not None  # _check_model.
+    own, other = (
+        (one.GetPositionNames(), one.GetVelocityNames(), one.GetActuatorNames())
+        for one in (plant, drawn)
+    )
+    if own != other:
+        raise ModelError(
+            f"add_robot must add the robot of the model, with positions {', '.join(other[0])}; it "
+            f"has {', '.join(own[0]) or 'none'}"
+        )
