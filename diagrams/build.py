@@ -14,10 +14,9 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
+from drake_dae.diagrams.keys import at, each
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
-    at,
-    each,
     index_of,
     scenario_model,
     scenario_structure,
