@@ -97,8 +97,8 @@ def scenario_structure(model: RobotModel) -> Structure:
 
 @at("robot.file")
 def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
-    plant = read_robot(robot, scene_graph)
-    change_robot(robot, plant)
+    plant, efforts = read_robot(robot, scene_graph)
+    change_robot(robot, plant, efforts)
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         if isinstance(joint, QuaternionFloatingJoint):

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 import pydantic
@@ -72,7 +72,7 @@ def _actuators(value: Any) -> Any:
             if limit is not None and not (type(limit) in (int, float) and 0 < limit < np.inf):
                 raise ValueError(
                     f"the effort limit of {name} must be a positive number of N m or N, or nothing "
-                    f"for none, got {brief(limit)}"
+                    f"for that of the file, got {brief(limit)}"
                 )
         return value
     raise ValueError(
@@ -121,8 +121,11 @@ class Robot:
             joint that is coupled to it stays as well. Such joints are none in the rest of the
             scenario.
         actuators: The driven joints, where they are others than those of the file: a list of
-            names, or name -> effort limit in N m or N (nothing for none), or "all" that turn or
-            slide and mimic no other.
+            names, or name -> effort limit in N m or N, or "all" that turn or slide and mimic no
+            other. Where no limit is given it is that of the file. Controls have this order, after
+            those that the file gives actuators.
+        leave_out: What the file has and the equations have not: joint_friction, which is Coulomb
+            friction; without this it is refused.
     """
 
     file: str
@@ -131,6 +134,7 @@ class Robot:
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
+    leave_out: list[Literal["joint_friction"]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

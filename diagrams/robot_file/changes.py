@@ -20,6 +20,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.arrays import unknown_name
 from drake_dae.diagrams.keys import at
+from drake_dae.diagrams.robot_file.efforts import Efforts, limits_of
 from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario_parts import Base, Robot
 from drake_dae.errors import ModelError
@@ -27,12 +28,13 @@ from drake_dae.robots.contact.plant_constraints import Coupling, couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
 
 
-def change_robot(robot: Robot, plant: MultibodyPlant) -> None:
+def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     """Makes what a scenario says of a robot beside its file, and finalizes it.
 
     Args:
         robot: What the scenario has under `robot`.
         plant: The robot of that file, not finalized.
+        efforts: The effort limits of the file, for actuators that it has not.
 
     Raises:
         ModelError: Drake refuses to finalize the plant.
@@ -47,7 +49,7 @@ def change_robot(robot: Robot, plant: MultibodyPlant) -> None:
         lock_joints(robot.locked, plant, couplings)
     add_free_joints(robot.free, plant)
     if robot.actuators is not None:
-        drive_joints(robot.actuators, plant, couplings)
+        drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
     try:
         plant.Finalize()
     except (RuntimeError, ValueError, SystemExit) as error:
@@ -56,7 +58,7 @@ def change_robot(robot: Robot, plant: MultibodyPlant) -> None:
 
 def _read_couplings(robot: Robot) -> Sequence[Coupling]:
     """The couplings of the file, from a plant of its own: only a finalized one tells them."""
-    plant = read_robot(robot)
+    plant, _ = read_robot(robot)
     try:
         plant.Finalize()
     except (RuntimeError, ValueError, SystemExit) as error:
@@ -199,16 +201,18 @@ def drive_joints(
     driven: Literal["all"] | Sequence[str] | Mapping[str, float | None],
     plant: MultibodyPlant,
     couplings: Sequence[Coupling],
+    efforts: Mapping[str, float],
 ) -> None:
     """Gives actuators to the joints that a scenario names, and takes them from all others.
 
     An actuator that the file has stays, with its gear ratio and its rotor.
 
     Args:
-        driven: Names of joints, or name -> effort limit in N m or N; or "all" joints with one
-            position that follow no other.
+        driven: Names of joints, or name -> effort limit in N m or N; or "all" that turn or slide
+            and follow no other.
         plant: The robot, not finalized; changed.
         couplings: Those of the plant.
+        efforts: Name -> effort limit of the file, for actuators that are new and have none.
 
     Raises:
         ScenarioError: There is no such joint, or it has several positions.
@@ -222,6 +226,7 @@ def drive_joints(
         if name not in joints:
             raise ModelError(unknown_name("turning or sliding joint", name, joints))
     chosen = {joints[name].index(): limit for name, limit in limits.items()}
+    names = {joints[name].index(): name for name in limits}
     has: set[int] = set()
     for actuator in _actuators(plant):
         index = actuator.joint().index()
@@ -233,8 +238,9 @@ def drive_joints(
             actuator.set_effort_limit(chosen[index])
     for index, limit in chosen.items():
         if index not in has:
-            joint = plant.get_joint(index)
-            plant.AddJointActuator(joint.name(), joint, np.inf if limit is None else limit)
+            own = efforts.get(names[index], np.inf)
+            joint = joints[names[index]]
+            plant.AddJointActuator(joint.name(), joint, own if limit is None else limit)
 
 
 def _joints(plant: MultibodyPlant) -> list[Joint]:

@@ -45,7 +45,7 @@ class Copies:
         return text
 
 
-def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> None:
+def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict[str, Path]:
     """Adds the models of a file to a plant, without the collision meshes that Drake cannot read.
 
     Args:
@@ -54,27 +54,31 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> None
         folder: An empty one, where copies of files are written.
         copies: Empty; the copies are added, also where the files are refused then.
 
+    Returns:
+        The file of each model instance of directives, or the file itself under "".
+
     Raises:
         RuntimeError: Drake refuses the files; the message names copies.
     """
-    packages = parser.package_map()
-    if not parser.plant().geometry_source_is_registered():
-        parser.AddModels(str(file))
-        return
+    packages, has_geometry = parser.package_map(), parser.plant().geometry_source_is_registered()
     if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
-        parser.AddModels(str(_readable(file, packages, folder, copies)))
-        return
+        own = _readable(file, packages, folder, copies) if has_geometry else file
+        parser.AddModels(str(own))
+        return {"": file}
     directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
+    models: dict[str, Path] = {}
     for directive in directives.directives:
         if directive.add_model is not None:
             model = Path(packages.ResolveUrl(directive.add_model.file))
-            own = _readable(model, packages, folder, copies)
+            models[directive.add_model.name] = model
+            own = _readable(model, packages, folder, copies) if has_geometry else model
             if own != model:
                 directive.add_model.file = own.as_uri()
     if copies.left_out:
         ProcessModelDirectives(directives, parser)
     else:
         parser.AddModels(str(file))
+    return models
 
 
 def _readable(file: Path, packages: PackageMap, folder: Path, copies: Copies) -> Path:

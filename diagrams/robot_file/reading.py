@@ -14,6 +14,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.diagrams.resources import check_resources, package_folder
+from drake_dae.diagrams.robot_file.efforts import Efforts, read_efforts
 from drake_dae.diagrams.robot_file.meshes import Copies, add_models
 from drake_dae.diagrams.robot_file.packages import add_packages, explained, find_packages
 from drake_dae.diagrams.scenario_parts import Robot
@@ -24,12 +25,17 @@ _DRAWN = (".obj", ".gltf", ".dae")
 """The kinds of mesh that Drake's Meshcat draws."""
 
 
-def read_robot(robot: Robot, scene_graph: SceneGraph | None = None) -> MultibodyPlant:
+def read_robot(
+    robot: Robot, scene_graph: SceneGraph | None = None
+) -> tuple[MultibodyPlant, Efforts]:
     """A plant in continuous time with the models of the robot's file, not finalized.
 
     Args:
         robot: What the scenario has under `robot`.
         scene_graph: Where the robot's geometry is registered; None leaves geometry out.
+
+    Returns:
+        The plant, and the effort limits of joints without an actuator.
 
     Raises:
         ModelError: The files cannot be read, or hold what is not supported.
@@ -52,7 +58,7 @@ def read_robot(robot: Robot, scene_graph: SceneGraph | None = None) -> Multibody
             folders, missing = find_packages(robot.file, packages)
             file = Path(packages.ResolveUrl(robot.file) if is_url else robot.file)
             _check_one_robot(file)
-            add_models(file, parser, Path(scratch).resolve(), copies)
+            models = add_models(file, parser, Path(scratch).resolve(), copies)
         except ScenarioError:
             raise
         except (RuntimeError, ValueError, SystemExit) as error:
@@ -60,13 +66,21 @@ def read_robot(robot: Robot, scene_graph: SceneGraph | None = None) -> Multibody
             text = copies.named(str(error))
             unknown = {name: origin for name, origin in missing.items() if name in text}
             raise ModelError(explained(unknown) if unknown else text) from None
-    if dropped.warnings:
-        raise ModelError("; ".join(_explained(copies.named(text)) for text in dropped.warnings))
+    told = [text for text in dropped.warnings if not _is_answered(text, robot)]
+    if told:
+        raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
     if scene_graph is not None:
         own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
         check_resources(scene_graph, [*own, *folders])
         _tell_what_is_left_out(copies.left_out, scene_graph)
-    return plant
+    return plant, read_efforts(models)
+
+
+def _is_answered(warning: str, robot: Robot) -> bool:
+    """Whether the scenario says what to do about a warning of Drake's parser."""
+    if "effort limit" in warning:
+        return robot.actuators is not None
+    return "friction" in warning and "joint_friction" in robot.leave_out
 
 
 def _tell_what_is_left_out(collisions: list[Path], scene_graph: SceneGraph) -> None:
@@ -140,7 +154,12 @@ def _explained(warning: str) -> str:
             "none exceeds the sum of the others"
         )
     elif "friction" in text:
-        text = "Coulomb friction of a joint is not supported; leave <dynamics friction> out"
+        text = (
+            "Coulomb friction of a joint is not supported; write leave_out: [joint_friction] under "
+            "robot, or take <dynamics friction> out of the file"
+        )
+    elif "effort limit" in text:
+        text += " Name the driven joints under robot.actuators"
     elif "equality" in text:
         return (
             f"{place}: {' '.join(text.split())} Take it out of the file, and write it under "

@@ -14,6 +14,9 @@ from runs import run_scenario
 from vendors import joint, link, mobile_arm, panda, robot, write_panda
 
 from drake_dae import load_scenario
+from drake_dae.diagrams.robot_file.changes import change_robot
+from drake_dae.diagrams.robot_file.efforts import read_efforts
+from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario import save_scenario
 from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ScenarioError
@@ -241,7 +244,7 @@ def test_actuators_of_the_file_stay_or_go(tmp_path):
 
 def test_limits_of_the_scenario_are_those_of_actuators_that_it_adds(tmp_path):
     links = scenario_model(load_scenario(files(tmp_path, MOBILE))).links
-    np.testing.assert_array_equal(links.effort_limits, [60.0, np.inf])
+    np.testing.assert_array_equal(links.effort_limits, [60.0, 87.0])
 
 
 @pytest.mark.parametrize("text", [PANDA, MOBILE], ids=["arm", "cart"])
@@ -289,3 +292,78 @@ def test_what_does_not_fit_is_refused_with_its_key(settings, words, tmp_path):
     assert "\n" not in message
     assert [word for word in words if word not in message] == [], message
     assert not re.search(r"plant\.\w+\(|Finalize", message)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "limits"),
+    [
+        ("all", dict.fromkeys(ARM, 87.0)),
+        (
+            "{panda_joint3: 12.5, panda_joint1: null}",
+            {"panda_joint3": 12.5, "panda_joint1": 87.0},
+        ),
+        ("[panda_joint2]", {"panda_joint2": 87.0}),
+    ],
+)
+@pytest.mark.parametrize("file", ["panda_description/urdf/panda.urdf", "arm.dmd.yaml"])
+def test_effort_limits_are_those_of_the_file_where_none_is_given(actuators, limits, file, tmp_path):
+    path = files(tmp_path, PANDA)
+    (tmp_path / "arm.dmd.yaml").write_text(
+        "directives: [{add_model: {name: arm, file: package://panda_description/urdf/panda.urdf}}]"
+    )
+    settings = [f"robot.actuators={actuators}", f"robot.file={file}"]
+    settings += ["robot.packages.panda_description=panda_description"]
+    chosen = load_scenario(path, settings).robot
+    plant, efforts = read_robot(chosen)
+    change_robot(chosen, plant, efforts)
+    found = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
+    assert {actuator.name(): actuator.effort_limit() for actuator in found} == limits
+    assert [actuator.name() for actuator in found] == list(limits)
+
+
+@pytest.mark.parametrize("effort", ["0", "none", ""])
+def test_an_effort_limit_that_tells_nothing_is_none(effort, tmp_path):
+    file = tmp_path / "robot.urdf"
+    file.write_text(robot("one", joint("j", "a", "b", "0 0 1")).replace("87.0", effort))
+    assert read_efforts({"": file}) == {}
+
+
+FRICTION = """
+robot: {file: arm.urdf, base: {weld: base}, actuators: all, leave_out: [joint_friction]}
+outputs: [!JointPositions {joints: [j]}]
+references: [!Constant {values: [0]}]
+"""
+
+
+def test_joint_friction_is_left_out_where_the_scenario_says_so(tmp_path):
+    friction = '<dynamics damping="0.5" friction="1.0"/>'
+    arm = joint("j", "base", "arm", "0 1 0", rest=friction)
+    (tmp_path / "arm.urdf").write_text(robot("arm", link("base", 1), link("arm", 1), arm))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
+    assert links.plant.GetJointByName("j").default_damping() == 0.5
+    with pytest.raises(ScenarioError) as caught:
+        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[]"]))
+    message = str(caught.value)
+    assert message.startswith(f"robot.file: {tmp_path / 'arm.urdf'}:")
+    assert "joint 'j': Coulomb friction" in message
+    assert "leave_out: [joint_friction] under robot" in message
+    with pytest.raises(
+        ScenarioError, match=r"leave_out\.0: expected one of joint_friction, got 'x'"
+    ):
+        load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[x]"])
+
+
+def test_a_transmission_without_effort_needs_actuators(tmp_path):
+    """Drake leaves such a transmission out; whoever names the driven joints has answered it."""
+    drive = (
+        "<transmission><type>transmission_interface/SimpleTransmission</type>"
+        '<joint name="j"/><actuator name="m"/></transmission>'
+    )
+    arm = joint("j", "base", "arm", "0 1 0", effort=0.0)
+    (tmp_path / "arm.urdf").write_text(robot("arm", link("base", 1), link("arm", 1), arm, drive))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
+    np.testing.assert_array_equal(links.effort_limits, [np.inf])
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*joint 'j'.* under robot\.actuators"):
+        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))

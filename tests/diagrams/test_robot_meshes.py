@@ -20,7 +20,7 @@ def count(scene_graph: SceneGraph, role: Role) -> int:
 
 
 def read(file: Path, scene_graph: SceneGraph, **more: object):
-    return read_robot(Robot(str(file), **more), scene_graph)
+    return read_robot(Robot(str(file), **more), scene_graph)[0]
 
 
 def test_collision_meshes_are_left_out_by_name_and_the_rest_stays(tmp_path: Path):
