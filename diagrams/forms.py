@@ -209,6 +209,7 @@ class Reader(Generic[T]):
         kind, loc, value = details["type"], details["loc"], details["input"]
         if kind in ("missing", "extra_forbidden"):
             place = _place(loc[:-1], self.schema, data)
+            place = replace(place, schema=_with_parts(place.schema))
             if "properties" in place.schema:
                 return place.key, _wrong_key(place, str(loc[-1]), value, kind == "missing")
             return place.key, _wrong_value(place.schema, place.data)  # Of a tuple.
@@ -238,11 +239,9 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
     keys: list[str] = []
     tag = tags = ""
     for part in loc:
+        schema = _with_parts(schema)
         if "anyOf" in schema:
-            inside = [one for one in schema["anyOf"] if not _PARTS.isdisjoint(one)]
-            if len(inside) != 1:
-                break  # The rest of the location is about one of several types.
-            schema = inside[0]
+            break  # The rest of the location is about one of several types.
         if "oneOf" in schema:
             tag, tags = str(part), _tags(schema)
             schema = next(one for one in schema["oneOf"] if _tag(one) == tag)
@@ -252,6 +251,12 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
             schema = schema.get("properties", {}).get(part, inner)
             data, tag = data[part], ""
     return _Place(".".join(keys) or "scenario", schema, data, tag, tags)
+
+
+def _with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The only one of several types that has parts; the schema itself where it is not one."""
+    inside = [one for one in schema.get("anyOf", ()) if not _PARTS.isdisjoint(one)]
+    return inside[0] if len(inside) == 1 else schema
 
 
 def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:

@@ -1,26 +1,21 @@
 """The robot of a scenario, with what it touches and what it shall steer."""
 
-import logging
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from itertools import islice
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.parsing import GetScopedFrameByName, Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import QuaternionFloatingJoint, RpyFloatingJoint
+from pydrake.multibody.tree import QuaternionFloatingJoint
 
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.diagrams.resources import check_resources, package_folder
+from drake_dae.diagrams.keys import at, each
+from drake_dae.diagrams.robot_file.changes import change_robot, finalize
+from drake_dae.diagrams.robot_file.reading import read_into, read_robot
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
-from drake_dae.diagrams.shipped import FOLDER
-from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, ScenarioError
+from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
 from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.contact import Constraint
@@ -33,9 +28,6 @@ from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
-
-T = TypeVar("T")
-S = TypeVar("S")
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -57,10 +49,11 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
     if not actuators:
         text = (
-            f"'{Path(scenario.robot.file).name}' has no actuators; in a URDF, give each driven "
-            "joint a <transmission>"
+            f"no joint of '{Path(scenario.robot.file).name}' is driven; write all, or a list of "
+            "joints. Without this key those are driven to which the file gives an actuator, as a "
+            "URDF does by a <transmission>"
         )
-        raise ScenarioError(("robot.file", text))
+        raise ScenarioError(("robot.actuators", text))
 
     # What it shall steer, from where, and by what.
     outputs = _outputs(scenario.outputs, constraints, links)
@@ -103,176 +96,40 @@ def scenario_structure(model: RobotModel) -> Structure:
         raise ScenarioError(("constraints or start.positions", str(error))) from error
 
 
-@contextmanager
-def at(key: str) -> Iterator[None]:
-    """Puts the key of the scenario before whatever goes wrong."""
-    try:
-        yield
-    except ScenarioError:
-        raise  # It has a key already.
-    except DrakeDaeError as error:
-        raise ScenarioError((key, str(error))) from error
+@at("robot.file")
+def add_robot(robot: Robot, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Adds the robot of a scenario to a plant that is not finalized.
 
+    Args:
+        robot: The robot.
+        plant: The plant, registered in the scene graph.
+        scene_graph: The scene graph.
 
-def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
-    """What is made of each item; an error bears the key and the item's index."""
-    results = []
-    for index, item in enumerate(items):
-        with at(f"{key}.{index}"):
-            results.append(make(item))
-    return results
+    Raises:
+        ScenarioError: Drake cannot read the file, or drops something of it; or what the scenario
+            says beside it does not fit.
+    """
+    change_robot(robot, plant, read_into(plant, robot, scene_graph))
 
 
 @at("robot.file")
 def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
-    plant = _parse(robot, scene_graph)
+    plant, efforts = read_robot(robot, scene_graph)
+    change_robot(robot, plant, efforts)
+    finalize(plant)
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
         if isinstance(joint, QuaternionFloatingJoint):
+            name = joint.child_body().name()
             raise ModelError(
-                f"body '{joint.child_body().name()}' is free; weld it to the world in the file, or "
-                "name it in robot.free, which gives it a joint in roll, pitch and yaw. A "
-                "quaternion is not supported: no force keeps its length"
+                f"body '{name}' is free; weld it to the world by "
+                f"robot.base, as base: {{weld: {name}}}, or name it in robot.free, which gives it "
+                "a joint in roll, pitch and yaw. A quaternion is not supported: no force keeps its "
+                "length"
             )
     links = MultibodyExpressions(plant)
     plant_constraints(links)
     return links
-
-
-def _parse(robot: Robot, scene_graph: SceneGraph) -> MultibodyPlant:
-    is_url = robot.file.startswith("package://")
-    if not is_url and not _is_file(robot.file):
-        raise ModelError(f"no file '{robot.file}'; a relative path starts in the scenario's folder")
-    # Continuous: only then are the plant's own dynamics those of (37).
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    add_robot(robot, plant, scene_graph, MultibodyPlant.Finalize)
-    return plant
-
-
-def add_robot(
-    robot: Robot,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    then: Callable[[MultibodyPlant], None] = lambda plant: None,
-) -> None:
-    """Adds the robot of a scenario to a plant.
-
-    Args:
-        robot: The robot.
-        plant: A plant that is not finalized.
-        scene_graph: Where the plant is registered.
-        then: What is done to the plant at last.
-
-    Raises:
-        ModelError: Drake cannot read the file, or drops something of it.
-    """
-    is_url = robot.file.startswith("package://")
-    parser = Parser(plant)
-    log = logging.getLogger("drake")
-    level, dropped = log.level, _Dropped(log.getEffectiveLevel())
-    log.addFilter(dropped)
-    log.setLevel(logging.WARNING)  # Whoever wants to see less must still be told.
-    try:
-        parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
-        for name, folder in robot.packages.items():
-            parser.package_map().Add(name, folder)
-        file = parser.package_map().ResolveUrl(robot.file) if is_url else robot.file
-        _check_one_robot(Path(file))
-        if is_url:
-            parser.AddModelsFromUrl(robot.file)
-        else:
-            parser.AddModels(robot.file)
-        folders = [FOLDER / "models", *map(Path, robot.packages.values())]
-        check_resources(scene_graph, [package_folder(Path(file)), *folders])
-        _add_free_joints(robot.free, plant)
-        then(plant)
-    except ScenarioError:
-        raise
-    except (RuntimeError, ValueError, SystemExit) as error:
-        # Drake has all of them: SystemExit for what an assertion of its own finds.
-        raise ModelError(str(error)) from None
-    finally:
-        log.setLevel(level)
-        log.removeFilter(dropped)
-    if dropped.warnings:
-        raise ModelError("; ".join(map(_explained, dropped.warnings)))
-
-
-@at("robot.free")
-def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
-    """Gives bodies that no joint holds one in roll, pitch and yaw, for which files have no word."""
-    for name in bodies:
-        try:
-            body = GetScopedFrameByName(plant, name).body()
-            joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-            held = [j.name() for j in joints if j.child_body().index() == body.index()]
-            if held:
-                raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
-            plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
-        except RuntimeError as error:
-            raise ModelError(f"'{name}' is no body that can be free: {error}") from None
-
-
-class _Dropped(logging.Filter):
-    """Collects what Drake's parser changes or leaves out, with no more than a warning."""
-
-    KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
-
-    def __init__(self, level: int) -> None:
-        super().__init__()
-        self._level = level
-        self.warnings: list[str] = []
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        text = record.getMessage()
-        is_dropped = "warning: " in text and any(kind in text for kind in self.KINDS)
-        if is_dropped:
-            self.warnings.append(text)
-        return not is_dropped and record.levelno >= self._level
-
-
-def _explained(warning: str) -> str:
-    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint."""
-    place, text = warning.split(": warning: ", 1)
-    kind = "link" if "inertia" in text else "joint"
-    if "inertia" in text:
-        text = (
-            "mass or inertia of no body: a mass is positive, moments of inertia are positive and "
-            "none exceeds the sum of the others"
-        )
-    elif "friction" in text:
-        text = "Coulomb friction of a joint is not supported; leave <dynamics friction> out"
-    elif "equality" in text:
-        return (
-            f"{place}: {' '.join(text.split())} Take it out of the file, and write it under "
-            "constraints; two joints that move together are a !JointCoupler"
-        )
-    file, _, line = place.rpartition(":")
-    owner = ""
-    if _is_file(file) and line.isdecimal():
-        with open(file, encoding="utf-8", errors="replace") as lines:
-            before = "".join(islice(lines, int(line)))
-        names = re.findall(rf"<{kind}\s[^>]*?name\s*=\s*[\"']([^\"']*)", before)
-        owner = f"{kind} '{names[-1]}': " if names else ""
-    return f"{place}: {owner}{' '.join(text.split())}"
-
-
-def _check_one_robot(file: Path) -> None:
-    """Refuses a second robot in a URDF, which Drake would not read."""
-    if file.suffix != ".urdf":
-        return
-    text = re.sub(r"<!--.*?-->", "", file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
-    names = re.findall(r"<robot\b[^>]*", text)
-    if len(names) > 1:
-        raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
-
-
-def _is_file(name: str) -> bool:
-    try:
-        return Path(name).is_file()
-    except (OSError, ValueError):  # A null byte.
-        return False
 
 
 def _constraints(

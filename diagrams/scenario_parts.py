@@ -3,14 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
+import pydantic
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_dae.arrays import unknown_name
+from drake_dae.arrays import brief, unknown_name
 from drake_dae.dae.gains import GainDesign, gain_coefficients, gain_matrices, poles
-from drake_dae.diagrams.forms import Numbers, Triple
+from drake_dae.diagrams.forms import Form, Numbers, Triple
+from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import contact, outputs
 from drake_dae.systems.sensors import ForceSensor
@@ -39,28 +41,100 @@ def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
 
 
 @dataclass(frozen=True)
-class Robot:
-    """A robot that Drake's Parser reads.
-
-    Attributes:
-        file: A URDF, SDFormat or model-directives file, relative to the scenario, or
-            "package://drake_dae_models/<file>" for a shipped one.
-        packages: Name -> folder, relative to the scenario, for other "package://<name>/...".
-        free: Names of bodies that no joint holds, "object" or "puck::object": they get a joint in
-            roll, pitch and yaw, with the positions "object_qx", "_qy", "_qz", "_x", "_y", "_z".
-    """
-
-    file: str
-    packages: dict[str, str] = field(default_factory=dict)
-    free: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
 class Pose:
     """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
 
     translation: Triple = (0.0, 0.0, 0.0)
     rpy_deg: Triple = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Base:
+    """Where a robot stands whose file does not say it.
+
+    Attributes:
+        weld: A link that no joint holds, or a frame on it: "base_link", or "left::base_link".
+        pose: The pose of that frame in the world.
+    """
+
+    weld: str
+    pose: Pose = Pose()
+
+
+def _actuators(value: Any) -> Any:
+    """Refuses what is none of the ways to name driven joints."""
+    if value is None or value == "all":
+        return value
+    if isinstance(value, list) and all(isinstance(name, str) for name in value):
+        return value
+    if isinstance(value, dict) and TAG not in value:
+        for name, limit in value.items():
+            if limit is not None and not (type(limit) in (int, float) and 0 < limit < np.inf):
+                raise ValueError(
+                    f"the effort limit of {name} must be a positive number of N m or N, or nothing "
+                    f"for that of the file, got {brief(limit)}"
+                )
+        return value
+    raise ValueError(
+        f"expected all, a list of joints, or joints with effort limits, got {brief(value)}"
+    )
+
+
+Actuators = Annotated[
+    Any,
+    pydantic.PlainValidator(_actuators),
+    pydantic.PlainSerializer(lambda value: value),
+    pydantic.WithJsonSchema(
+        {
+            "anyOf": [
+                {"const": "all"},
+                {"type": "array", "items": {"type": "string"}},
+                {
+                    "type": "object",
+                    "additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]},
+                },
+                {"type": "null"},
+            ]
+        }
+    ),
+]
+"""Which joints are driven: "all", names, or name -> effort limit."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot that Drake's Parser reads, and what its file does not say of it.
+
+    Collision meshes that Drake cannot read, as .stl and .dae, are left out: no equation needs them.
+    Joints that mimic another one are constraints "<joint>_coupler".
+
+    Attributes:
+        file: A URDF, SDFormat or model-directives file, relative to the scenario, or
+            "package://drake_dae_models/<file>" for a shipped one.
+        packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Those
+            of which a package.xml lies in a folder above the file that names them, or beside such a
+            folder under their name, and those in ROS_PACKAGE_PATH are found without it.
+        free: Names of bodies that no joint holds, "object" or "puck::object": they get a joint in
+            roll, pitch and yaw, with the positions "object_qx", "_qy", "_qz", "_x", "_y", "_z".
+        base: What is welded to the world, where the file does not do it.
+        locked: Joint name -> position in rad or m where it stays, for joints that turn or slide; a
+            joint that is coupled to it stays as well. Such joints are none in the rest of the
+            scenario.
+        actuators: The driven joints, where they are others than those of the file: a list of
+            names, or name -> effort limit in N m or N, or "all" that turn or slide and mimic no
+            other. Where no limit is given it is that of the file. Controls have this order, after
+            those that the file gives actuators.
+        leave_out: What the file has and the equations have not: joint_friction, which is Coulomb
+            friction; without this it is refused.
+    """
+
+    file: str
+    packages: dict[str, str] = field(default_factory=dict)
+    free: list[str] = field(default_factory=list)
+    base: Annotated[Base, Form()] | None = None
+    locked: dict[str, float] = field(default_factory=dict)
+    actuators: Actuators = None
+    leave_out: list[Literal["joint_friction"]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,10 @@ class MachineCodeWarning(UserWarning):
     """Functions that run interpreted where machine code was asked for, or would have paid."""
 
 
+class GeometryWarning(UserWarning):
+    """Geometry of a robot that is left out, since it cannot be read or drawn."""
+
+
 def describe_os_error(error: OSError) -> str:
     """What a message says of a file that could not be read or written."""
     return f"{error.filename or 'output'}: {error.strerror or error}"

@@ -579,10 +579,10 @@ def test_a_robot_with_a_mesh(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"drive": ""}, ["robot.file: ", "lever.urdf", "no actuators", "<transmission>"]),
+        ({"drive": ""}, ["robot.actuators: no joint of 'lever.urdf' is driven", "all"]),
         ({"shape": '<mesh filename="shape.obj"/>'}, ["robot.file: ", "shape.obj", "not exist"]),
         ({"drive": "<transmission>"}, ["robot.file: ", "lever.urdf", "XML"]),
-        ({"world": "base"}, ["robot.file: ", "body 'base' is free", "quaternion", "weld"]),
+        ({"world": "base"}, ["robot.file: ", "body 'base' is free", "quaternion", "{weld: base}"]),
         ({"scenario": LEVER.replace("0.8", "1.8")}, ["start.positions: ", "wall.distance"]),
     ],
 )

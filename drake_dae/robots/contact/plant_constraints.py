@@ -1,6 +1,7 @@
 """Constraints that a MultibodyPlant has already: mimic joints, couplers, rods."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -8,13 +9,12 @@ from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
 
-from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.couplers import JointCoupler
 from drake_dae.robots.contact.points import FixedDistance
 from drake_dae.robots.contact.surface import triple
-from drake_dae.robots.links.frames import frame_name
+from drake_dae.robots.links.frames import frame_name, joint_names
 from drake_dae.robots.links.links import Links
 
 
@@ -42,8 +42,22 @@ def plant_constraints(links: Links) -> tuple[Constraint, ...]:
     return found
 
 
-def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
-    """q_0 - ratio q_1 = offset, which Drake tells as a row of a mathematical program."""
+@dataclass(frozen=True)
+class Coupling:
+    """Two joints of a plant with q_follower = ratio q_leader + offset, by their names."""
+
+    follower: str
+    leader: str
+    ratio: float
+    offset: float
+
+
+def couplings_of(plant: MultibodyPlant) -> list[Coupling]:
+    """The couplings of a finalized plant, each a row of a mathematical program as Drake tells it.
+
+    Raises:
+        ModelError: The plant has a constraint of which Drake tells nothing.
+    """
     program = MathematicalProgram()
     q = program.NewContinuousVariables(plant.num_positions(), "q")
     try:
@@ -52,28 +66,32 @@ def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
         raise ModelError(
             f"the plant has a constraint that is not supported ({error}); leave it out of the plant"
         ) from None
-    followers: set[Signal] = set()
+    found: list[Coupling] = []
+    followers: set[str] = set()
+    joints = {joint.position_start(): name for name, joint in joint_names(plant).items()}
     index = {variable.get_id(): i for i, variable in enumerate(q)}
     for binding in program.GetAllConstraints():
         row = binding.evaluator()
         if not isinstance(row, LinearEqualityConstraint) or binding.variables().size != 2:
             continue
-        names = [links.position_signals[index[v.get_id()]] for v in binding.variables()]
+        names = [joints[index[variable.get_id()]] for variable in binding.variables()]
         factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
         # The follower has the factor 1. Where both have it, either may; nobody follows twice.
         able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
         place = next((i for i in able if names[i] not in followers), able[0])
-        follower, leader = names[place], names[1 - place]
-        followers.add(follower)
-        unit: Literal["rad", "m"] = "m" if follower.unit == "m" else "rad"
-        yield JointCoupler(
-            follower.name,
-            leader.name,
-            -factors[1 - place] / factors[place],
-            float(row.lower_bound()[0]) / factors[place],
-            unit,
-            f"{follower.name}_coupler",
-        )
+        followers.add(names[place])
+        ratio = -factors[1 - place] / factors[place]
+        offset = float(row.lower_bound()[0]) / factors[place]
+        found.append(Coupling(names[place], names[1 - place], ratio, offset))
+    return found
+
+
+def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
+    units = {signal.name: signal.unit for signal in links.position_signals}
+    for one in couplings_of(plant):
+        unit: Literal["rad", "m"] = "m" if units[one.follower] == "m" else "rad"
+        name = f"{one.follower}_coupler"
+        yield JointCoupler(one.follower, one.leader, one.ratio, one.offset, unit, name)
 
 
 def _rods(plant: MultibodyPlant) -> Iterator[FixedDistance]:

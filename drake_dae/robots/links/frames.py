@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, FrameIndex
+from pydrake.multibody.tree import Frame, FrameIndex, Joint
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
@@ -155,3 +155,10 @@ def unique_names(plant: MultibodyPlant, items: Sequence[Any]) -> list[str]:
     """Names of joints, bodies, frames or actuators, scoped where they collide."""
     count = Counter(item.name() for item in items)
     return [item.name() if count[item.name()] == 1 else scoped_name(plant, item) for item in items]
+
+
+def joint_names(plant: MultibodyPlant) -> dict[str, Joint]:
+    """The joints that move, by names that are scoped where they collide."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    moving = [joint for joint in joints if joint.num_velocities() > 0]
+    return dict(zip(unique_names(plant, moving), moving, strict=True))

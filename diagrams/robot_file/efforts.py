@@ -1,0 +1,49 @@
+"""Effort limits that a URDF has for joints without a transmission, which Drake does not keep."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae.robots.links.frames import joint_names
+
+Efforts = Mapping[tuple[str, str], float]
+"""Model instance ("" where a file is read alone) and joint -> effort limit in N m or N."""
+
+
+def read_efforts(models: Mapping[str, Path]) -> Efforts:
+    """The effort limits of joints in URDF files; others have none.
+
+    Args:
+        models: Model instance, or "", -> file that Drake has read.
+    """
+    found: dict[tuple[str, str], float] = {}
+    for instance, file in models.items():
+        if file.suffix != ".urdf":
+            continue
+        try:
+            root = ElementTree.fromstring(file.read_bytes())
+        except ElementTree.ParseError:
+            continue  # Drake reads prefixes that nobody declares.
+        for joint in root.iterfind("joint"):
+            limit = joint.find("limit")
+            try:
+                effort = float("" if limit is None else limit.get("effort", ""))
+            except ValueError:
+                continue
+            if 0.0 < effort < np.inf:  # Many write 0 for what they do not know.
+                found[instance, joint.get("name", "")] = effort
+    return found
+
+
+def limits_of(plant: MultibodyPlant, efforts: Efforts) -> dict[str, float]:
+    """The effort limits by the names that joints have in a scenario."""
+    limits: dict[str, float] = {}
+    for name, joint in joint_names(plant).items():
+        instance = plant.GetModelInstanceName(joint.model_instance())
+        for key in ((instance, joint.name()), ("", joint.name())):
+            if key in efforts:
+                limits.setdefault(name, efforts[key])
+    return limits
