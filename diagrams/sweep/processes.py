@@ -50,7 +50,7 @@ def run_in_processes(
     Raises:
         ModelError: A process does not start.
     """
-    waiting = deque(batches)
+    waiting, workers = deque(batches), min(workers, len(batches))
     running: list[_Worker] = []
     with selectors.DefaultSelector() as selector:
         try:
@@ -110,7 +110,7 @@ class _Worker:
         self.left: Batch = []
         self.is_idle = False
         self.builds = 0
-        self._is_ready = self._is_dismissed = False
+        self._is_ready = False
         self._text = b""
         self._results: list[RunResult] = []
         self._send(base)
@@ -122,7 +122,6 @@ class _Worker:
 
     def dismiss(self) -> None:
         """Lets it end."""
-        self._is_dismissed = True
         with suppress(OSError):
             self._process.stdin.close()  # type: ignore[union-attr]
 

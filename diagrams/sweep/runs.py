@@ -256,7 +256,7 @@ def batches(
         key = structure_key(varied_data(base, variation), base)
         groups.setdefault(key, []).append((number, variation))
     total = sum(map(len, groups.values()))
-    size = max(1, min(32, total // (8 * workers)))
+    size = max(1, min(32, total // (32 * workers)))
     return [
         group[first : first + size]
         for group in groups.values()

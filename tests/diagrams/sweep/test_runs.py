@@ -126,13 +126,14 @@ def test_batches_have_one_structure_and_all_runs():
     base = scenario_data(scenario("two_link_wall"))
     walls = [1.2, 1.25, 1.3]
     runs = [
-        (i, {"constraints.0.surface.point": [walls[i % 3], 0, 0], "start.errors.tool.z": 0.01 * i})
-        for i in range(300)
+        (i, {"constraints.0.surface.point": [walls[i % 3], 0, 0], "start.errors.tool.z": 1e-5 * i})
+        for i in range(3000)
     ]
     found = batches(base, runs, workers=2)
     assert sorted(pair for batch in found for pair in batch) == runs
     for batch in found:
         assert 1 <= len(batch) <= 32
         assert len({run % 3 for run, _ in batch}) == 1
+    assert max(map(len, found)) > 1
     # With few runs no worker waits for another one.
     assert [len(batch) for batch in batches(base, runs[:5], workers=2)] == [1] * 5
