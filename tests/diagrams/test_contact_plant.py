@@ -156,6 +156,15 @@ def test_shipped_hydroelastic_wall_is_tracked():
     assert np.sqrt(np.mean(late[:, -1] ** 2)) < 0.05
 
 
+@pytest.mark.slow
+def test_sphere_is_a_sphere():
+    """The dome of the ideal plant in point contact: measured 0.04 N rms."""
+    found = scenario("seven_joint_dome", *CONTACT, ONE_LATE, "duration=3.0")
+    _, _, record = run_scenario(found)
+    late = record["tracking_error"][record.time > 2.0]
+    assert np.abs(late[:, -1]).max() < 0.2
+
+
 def test_wall_may_stand_elsewhere_than_the_law_believes():
     """2 mm farther: the robot goes there, since the law demands nothing of phi itself."""
     found = two_link(ONE_LATE, "plant_parameters={wall.position: [1.202, 0.0, 0.0]}")
