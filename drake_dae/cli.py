@@ -8,14 +8,16 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from io import TextIOWrapper
+from math import ceil
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
 from pydrake.systems.framework import Context
 
 import drake_dae
@@ -23,6 +25,7 @@ from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.export.export import export_code
 from drake_dae.diagrams.feasibility import find_feasibility
+from drake_dae.diagrams.rollout.rollout import rollout, start_values
 from drake_dae.diagrams.scenario import (
     DEFAULT_SCENARIO,
     Scenario,
@@ -50,6 +53,9 @@ from drake_dae.simulation.view import start_meshcat
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiled import find_compiler
+
+ROWS = 1000
+"""So many rows has the record of a rollout under error control, after the first."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,6 +98,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument(
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
     )
+    run.add_argument(
+        "--rollout",
+        action="store_true",
+        help="run without Drake's Simulator, the whole loop as one function: some ten to a hundred "
+        f"times as fast; the record has every fixed step, or {ROWS} rows under error control",
+    )
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -118,6 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
     kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)
+    if options.command == "simulate" and options.rollout and options.meshcat:
+        parser.error("--rollout shows nothing while it runs; leave out --meshcat")
     if isinstance(sys.stdout, TextIOWrapper):
         # Names may have letters that the terminal does not.
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -219,13 +233,14 @@ def _simulate(options: argparse.Namespace) -> int:
     meshcat = start_meshcat() if options.meshcat else None
     began = time.perf_counter()
     loop, context = build_scenario(scenario, meshcat)
+    simulate_by = _roll if options.rollout else _step
     print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
     folder = options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     with ending_signals(end_at_once), run_folder(folder):
         save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
-        return _run(loop, context, scenario, folder)
+        return _run(loop, context, scenario, folder, simulate_by)
 
 
 def _unused(name: str) -> Path:
@@ -253,21 +268,54 @@ class _Run:
     statistics: RunStatistics | None = None
     failure: str = ""
     pictures: bool = True
+    record: Record | None = None
 
 
-def _run(loop: ClosedLoop, context: Context, scenario: Scenario, folder: Path) -> int:
+def _step(run: _Run) -> RunStatistics:
+    """Runs by Drake's Simulator."""
+    return simulate(
+        run.loop.diagram,
+        run.context,
+        run.scenario.duration,
+        run.scenario.integrator,
+        progress=True,
+        after_step=run.writer.update if run.scenario.write.record else None,
+    )
+
+
+def _roll(run: _Run) -> RunStatistics:
+    """Runs by `rollout`.
+
+    Raises:
+        SimulationError: The run cannot go on.
+    """
+    scenario, config = run.scenario, run.scenario.integrator
+    rows = ROWS
+    if not config.use_error_control:
+        rows = max(1, ceil(scenario.duration / config.max_step_size - 0.01))
+    times = config.start_time + np.linspace(0.0, scenario.duration, rows + 1)
+    seeds = [scenario.force.seed] if scenario.force.is_measured else None
+    start, parameters = start_values(run.loop, run.context)
+    began = time.perf_counter()
+    (found,) = rollout(run.loop, start, parameters, times, config=config, seeds=seeds)
+    run.record = found.record
+    if found.failure is not None:
+        raise found.failure
+    return RunStatistics(scenario.duration, time.perf_counter() - began, found.steps, None)
+
+
+def _run(
+    loop: ClosedLoop,
+    context: Context,
+    scenario: Scenario,
+    folder: Path,
+    simulate_by: Callable[[_Run], RunStatistics],
+) -> int:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     with RecordWriter(folder / PART, loop.record) as writer:
         run = _Run(loop, context, scenario, folder, writer)
         try:
-            run.statistics = simulate(
-                loop.diagram,
-                context,
-                scenario.duration,
-                scenario.integrator,
-                progress=True,
-                after_step=writer.update if scenario.write.record else None,
-            )
+            run.statistics = simulate_by(run)
         except DrakeDaeError as error:
             run.failure = str(error)
             raise
@@ -287,7 +335,7 @@ def _write(run: _Run) -> bool:
     problems: list[str] = []
     # A signal that comes now does not stop before the record is written, but before the pictures.
     with ending_signals(ending := Ending()):
-        record = loop.record(run.context)
+        record = run.record or loop.record(run.context)
         if record.time.size == 0:
             return True
         predicted = loop.predicted_error(record)
