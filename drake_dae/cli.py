@@ -63,6 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument(
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
     )
+    run.add_argument(
+        "--rollout",
+        action="store_true",
+        help="run without Drake's Simulator, the whole loop as one function: some ten to a hundred "
+        f"times as fast; the record has every fixed step, or {ROWS} rows under error control",
+    )
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -90,6 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
     kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)
+    if options.command == "simulate" and options.rollout and options.meshcat:
+        parser.error("--rollout shows nothing while it runs; leave out --meshcat")
     if isinstance(sys.stdout, TextIOWrapper):
         # Names may have letters that the terminal does not.
         sys.stdout.reconfigure(errors="backslashreplace")

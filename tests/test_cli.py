@@ -548,3 +548,28 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
     assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty\n"
     assert main(["analyze", "two_tanks"]) == 1
     assert capsys.readouterr().err == "error: empty\n"
+
+
+def test_a_rollout_leaves_the_files_of_a_run(tmp_path, capsys):
+    """With fixed steps the record is that of the simulation, to 1e-12 of forces of some 10 N."""
+    steps = ["integrator.integration_scheme=runge_kutta3", "integrator.use_error_control=false"]
+    steps += ["integrator.max_step_size=0.001", "duration=0.05", "write.plots=false"]
+    settings = [text for setting in steps for text in ("--set", setting)]
+    for folder, options in (("drake", []), ("rollout", ["--rollout"])):
+        arguments = ["simulate", "two_link_wall", "--out", str(tmp_path / folder), *options]
+        assert main([*arguments, *settings, "--set", "write.animation=false"]) == 0
+    records = [Record.load(tmp_path / name / "record.npz") for name in ("drake", "rollout")]
+    assert {path.name for path in (tmp_path / "drake").iterdir()} == {
+        path.name for path in (tmp_path / "rollout").iterdir()
+    }
+    for name in records[0].signals:
+        difference = records[0][name][:49] - records[1][name][:49]
+        assert np.max(np.abs(difference)) < 1e-11
+    assert "50 steps" in capsys.readouterr().out
+
+
+def test_a_rollout_that_fails_keeps_its_record(tmp_path, capsys):
+    settings = ["--set", "references.0.amplitudes=[3.0]", "--set", "compiled=false"]
+    assert main(["simulate", "two_link_wall", "--rollout", "--out", str(tmp_path), *settings]) == 1
+    assert "the simulation cannot go on at t = 0.38" in capsys.readouterr().err
+    assert 0.3 < Record.load(tmp_path / "record.npz").time[-1] < 0.4

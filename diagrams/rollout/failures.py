@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show
 from drake_dae.diagrams.rollout.functions import LoopFunctions
 from drake_dae.diagrams.rollout.run import Ending, Problem, Run
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
@@ -41,9 +41,10 @@ def failure_of(functions: LoopFunctions, problem: Problem, run: Run) -> Simulati
             return no_step_leads_on(name, run.time, state, trial, str(trial))
         case Ending.STUCK:
             return SimulationError(
-                f"{name}: no step from t = {run.time:.6g} s, however short, is as accurate as it "
-                "should be. Where the state grows without bound or a reference leaves what the "
-                "robot can reach, change these; otherwise choose a lower accuracy",
+                f"the simulation cannot go on at t = {run.time:.6g} s, state {show(state)}: no "
+                "step, however short, is as accurate as it should be. Where the state grows "
+                "without bound or a reference leaves what the robot can reach, change these; "
+                "otherwise choose a lower accuracy",
                 run.time,
                 state,
             )

@@ -1,13 +1,17 @@
 """A closed loop as functions of CasADi's interpreter: its derivative, its steps, its record."""
 
 from collections.abc import Sequence
+from math import isfinite
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.rollout.functions import LoopFunctions
-from drake_dae.diagrams.rollout.run import Tableau, num_cores
+from drake_dae.diagrams.rollout.run import Tableau
+
+CHUNK = 64
+"""So many evaluations are one call of CasADi."""
 
 
 class Fused:
@@ -39,12 +43,15 @@ class Fused:
         rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
         valid += checks[-1] + of_motion[-1]
         options = {"cse": False}
-        self._rate = ca.Function("rate", inputs, [rate + 0.0 * valid, force], options)
+        self._rate = ca.Function("rate", inputs, [rate, force, valid], options)
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
-        self._rows = ca.Function("rows", inputs, [row, valid + of_rest[-1]], options)
+        rows = ca.Function("rows", inputs, [row, valid + of_rest[-1]], options)
+        self._rows = rows.map(CHUNK)
+        self._projection = self._project_function()
+        self._projections = self._projection.map(CHUNK)
         self._steps: dict[bytes, tuple[ca.Function, ca.Function]] = {}
         self._arrays = [np.zeros(count) for count in sizes]
-        self._results = [np.zeros(size), np.zeros(dae.num_constraints)]
+        self._results = [np.zeros(size), np.zeros(dae.num_constraints), np.zeros(1)]
         self._buffer, self._evaluate = self._rate.buffer()
         for index, array in enumerate(self._arrays):
             self._buffer.set_arg(index, array.data)
@@ -56,7 +63,10 @@ class Fused:
         for array, given in zip(self._arrays, arguments, strict=True):
             array[...] = given
         self._evaluate()
-        return self._results[0].copy()
+        values = self._results[0].copy()
+        if not isfinite(self._results[2][0]):
+            values[:] = np.nan
+        return values
 
     def sample(
         self,
@@ -89,23 +99,38 @@ class Fused:
             moments: Times, states, and what the sensor holds.
             plant, law: The parameters.
         """
-        count, columns = len(moments), zip(*moments, strict=True)
-        times, states, holds = (np.array(values).reshape(count, -1).T for values in columns)
-        shared = [np.repeat(values[:, None], count, axis=1) for values in (plant, law)]
-        rows, valid = self._rows.map(count, "thread", num_cores())(times, states, holds, *shared)
-        return np.array(rows).T, np.isfinite(np.array(valid)[0])
+        columns = [
+            np.array(values).reshape(len(moments), -1).T for values in zip(*moments, strict=True)
+        ]
+        rows, valid = _mapped(self._rows, columns, [plant, law])
+        return rows.T, np.isfinite(valid[0])
 
-    def steps(self, tableau: Tableau, count: int) -> tuple[ca.Function, ca.Function]:
+    def projections(
+        self, times: FloatArray, states: FloatArray, plant: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """States after two Newton steps to N*, shape (k, n), and the lengths of the last ones.
+
+        Args:
+            times: Their times, shape (k,).
+            states: The states, shape (k, n).
+            plant: The plant's parameters.
+        """
+        if len(times) == 1:
+            one, length = self._projection(times, states[0], plant)
+            return np.array(one).T, np.array(length)[0]
+        found, left = _mapped(self._projections, [times[None], states.T], [plant])
+        return found.T, left[0]
+
+    def steps(self, tableau: Tableau) -> tuple[ca.Function, ca.Function]:
         """A fixed step, and many of them as one function.
 
         Args:
             tableau: The method.
-            count: How many.
         """
         key = tableau.a.tobytes() + tableau.b.tobytes()
         if key not in self._steps:
             one = self._step(tableau)
-            self._steps[key] = one, one.mapaccum("steps", count, 1)
+            self._steps[key] = one, one.mapaccum("steps", CHUNK, 1)
         return self._steps[key]
 
     def _step(self, tableau: Tableau) -> ca.Function:
@@ -114,11 +139,29 @@ class Fused:
         A function of state, time, step, what is held, and parameters; it returns the state, and
         below each other what is finite if all has values, and the length of the last Newton step.
         """
-        functions, loop = self.functions, self.functions.loop
-        dae = loop.plant.dae
         time, state, hold, plant, law = (ca.MX.sym("x", each.size) for each in self._arrays)
         step = ca.MX.sym("step")
         symbols = [state, time, step, hold, plant, law]
+        state, left = self._projection(time, state, plant)
+        rates: list[ca.MX] = []
+        finite = ca.MX(0.0)
+        for row, part in zip(tableau.a, tableau.c, strict=True):
+            change = sum((w * rate for w, rate in zip(row, rates, strict=False) if w), ca.MX(0.0))
+            stage = state + step * change
+            rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
+            rates.append(rate)
+            finite += valid
+        reached = state + step * sum(w * rate for w, rate in zip(tableau.b, rates, strict=True))
+        checks = ca.vertcat(finite + ca.sum1(reached), left)
+        return ca.Function("step", symbols, [reached, checks])
+
+    def _project_function(self) -> ca.Function:
+        """(t, state, the plant's parameters) -> the state after two Newton steps, and the last."""
+        functions, loop = self.functions, self.functions.loop
+        dae = loop.plant.dae
+        sizes = [1, dae.num_states + functions.num_lags, functions.plant.sizes[-1]]
+        symbols = [ca.MX.sym("x", size) for size in sizes]
+        time, state, plant = symbols
         x, left = state[: dae.num_states], ca.MX(0.0)
         if loop.plant.projects:
             moving, own = functions.signals.function(time)[1], plant
@@ -130,11 +173,17 @@ class Fused:
                 change = functions.newton.function(x, at, own)[0]
                 x, left = x + ca.DM(dae.scale) * change, ca.norm_2(change)
         state = ca.vertcat(x, state[dae.num_states :])
-        rates: list[ca.MX] = []
-        for row, part in zip(tableau.a, tableau.c, strict=True):
-            change = sum((w * rate for w, rate in zip(row, rates, strict=False) if w), ca.MX(0.0))
-            stage = state + step * change
-            rates.append(self._rate(time + part * step, stage, hold, plant, law)[0])
-        reached = state + step * sum(w * rate for w, rate in zip(tableau.b, rates, strict=True))
-        checks = ca.vertcat(ca.sum1(reached), left)
-        return ca.Function("step", symbols, [reached, checks])
+        return ca.Function("projection", symbols, [state, left])
+
+
+def _mapped(
+    function: ca.Function, columns: Sequence[FloatArray], shared: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """A mapped function at any number of columns: the last one fills what is left."""
+    count = columns[0].shape[1]
+    parts = []
+    for first in range(0, count, CHUNK):
+        chosen = np.minimum(np.arange(first, first + CHUNK), count - 1)
+        values = function(*(values[:, chosen] for values in columns), *shared)
+        parts.append([np.array(value)[:, : count - first] for value in values])
+    return [np.hstack(values) for values in zip(*parts, strict=True)]

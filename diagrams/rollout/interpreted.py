@@ -8,13 +8,10 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.diagrams.rollout.fused import Fused
+from drake_dae.diagrams.rollout.fused import CHUNK, Fused
 from drake_dae.diagrams.rollout.run import Ending, Problem, Run, Settings, Tableau
 from drake_dae.errors import InconsistentStateError
 from drake_dae.systems.trials import SLOWEST, STEPS
-
-CHUNK = 64
-"""So many fixed steps are one call of CasADi."""
 
 REACHED = 1e-11
 """A Newton step longer than this, the second, says that N* was not reached in two."""
@@ -37,6 +34,7 @@ class _Course:
     state: FloatArray
     hold: FloatArray
     rows: list[tuple[float, FloatArray, FloatArray]] = field(default_factory=list)
+    apart: list[int] = field(default_factory=list)
     event: int = 0
     steps: int = 0
     before: float = 0.0
@@ -63,6 +61,9 @@ class _Course:
         """A state on N*."""
         if not self.fused.functions.loop.plant.projects:
             return state
+        states, left = self.fused.projections(np.array([time]), state[None], self.problem.plant)
+        if left[0] <= REACHED:
+            return states[0]
         try:
             found = self.problem.project(time, state)
         except InconsistentStateError:
@@ -101,8 +102,22 @@ class _Course:
         end, events = self.problem.times[-1], self.problem.events[self.event :]
         return float(min(end, events[0])) if events.size else float(end)
 
+    def _project_rows(self) -> None:
+        """Puts rows that an interpolant gave on N*."""
+        if not (self.apart and self.fused.functions.loop.plant.projects):
+            return
+        times = np.array([self.rows[index][0] for index in self.apart])
+        states = np.array([self.rows[index][1] for index in self.apart])
+        found, left = self.fused.projections(times, states, self.problem.plant)
+        for index, state, length in zip(self.apart, found, left, strict=True):
+            time, other, hold = self.rows[index]
+            if not length <= REACHED:
+                state = self.projected(time, other)
+            self.rows[index] = time, state, hold
+
     def finish(self, ending: Ending) -> Run:
         """What the run came to."""
+        self._project_rows()
         rows, valid = self.fused.rows(self.rows, self.problem.plant, self.problem.law)
         count = int(np.argmin(np.append(valid, False)))
         if count < len(valid):
@@ -153,6 +168,7 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
 def _control(course: _Course, settings: Settings) -> None:
     """Error control by SciPy's DOP853; rows between steps from its interpolant, on N*."""
     times, row, longer = course.problem.times, 1, None
+    apart = course.apart
     course.write(course.time, course.state)
     while course.time < times[-1]:
         course.update()
@@ -175,7 +191,8 @@ def _control(course: _Course, settings: Settings) -> None:
             between = None
             while row < times.size - 1 and times[row] < solver.t:
                 between = between or solver.dense_output()
-                course.write(times[row], course.projected(times[row], between(times[row])))
+                course.write(times[row], between(times[row]))
+                apart.append(len(course.rows) - 1)
                 row += 1
             course.accept(solver.t, solver.y)
             solver.y = course.state = course.projected(course.time, course.state)
@@ -195,7 +212,7 @@ class _Steps:
 
     def __init__(self, fused: Fused, tableau: Tableau, longest: float) -> None:
         self._tableau, self._longest = tableau, longest
-        self._one, self._many = fused.steps(tableau, CHUNK)
+        self._one, self._many = fused.steps(tableau)
 
     def run(self, course: _Course) -> None:
         """Runs to the end of the record."""

@@ -85,6 +85,7 @@ def run(code: Library, functions: LoopFunctions, problem: Problem, settings: Set
             except InconsistentStateError:
                 break
             state[: found.size] = found
+            own.pending = 2
             ending = Ending.PAUSED
     return Run(
         rows[: own.row],

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
 from typing import TypeVar
 
 import numpy as np
@@ -106,13 +107,17 @@ def rollout(
         run = interpreted.runner(fused, settings)
         return [_result(functions, problem, run(problem)) for problem in problems]
 
-    def run_one(problem: Problem) -> Rollout:
-        return _result(functions, problem, machine.run(code, functions, problem, settings))
+    def step(problem: Problem) -> Run:
+        return machine.run(code, functions, problem, settings)
 
+    # What else there is shares arrays, and so takes one thread.
     if len(problems) == 1:
-        return [run_one(problems[0])]
+        return [_result(functions, problems[0], step(problems[0]))]
     with ThreadPoolExecutor(num_cores()) as pool:
-        return list(pool.map(run_one, problems))
+        runs = pool.map(step, problems)
+        return [
+            _result(functions, problem, run) for problem, run in zip(problems, runs, strict=True)
+        ]
 
 
 @checked(ModelError)
@@ -194,14 +199,14 @@ def _problems(
     samples = Samples.of(loop, times)
     size = loop.plant.dae.num_states + functions.num_lags
     split = functions.plant.sizes[-1]
-    problems = []
+    problems, lock = [], Lock()
     for index, (start, row) in enumerate(zip(states, rows, strict=True)):
         plant, law = row[:split].copy(), row[split:].copy()
         current = functions.plant_parameters(plant)
         loop.plant.check_start(start[: loop.plant.dae.num_states], current(times[0]))
         noise = samples.noise(None if seeds is None else seeds[index])
         hold = start[size:].copy() if samples.holds else noise[0].copy()
-        project = partial(_project, loop.plant, current)
+        project = partial(_project, loop.plant, current, lock)
         problems.append(
             Problem(times, start[:size], hold, plant, law, samples.events, noise[1:], project)
         )
@@ -209,10 +214,15 @@ def _problems(
 
 
 def _project(
-    plant: DaePlant, parameters: Callable[[float], FloatArray], time: float, state: FloatArray
+    plant: DaePlant,
+    parameters: Callable[[float], FloatArray],
+    lock: Lock,
+    time: float,
+    state: FloatArray,
 ) -> FloatArray:
-    """The state on N* next to one, that of a sensor left out."""
-    return plant.structure.manifold.project(state[: plant.dae.num_states], parameters(time))
+    """The state on N* next to one, that of a sensor left out; by one thread at a time."""
+    with lock:
+        return plant.structure.manifold.project(state[: plant.dae.num_states], parameters(time))
 
 
 def _machine_code(

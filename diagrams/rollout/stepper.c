@@ -25,7 +25,7 @@ typedef struct {
   long long steps;         /* that were accepted */
   long long number, index; /* of fixed steps in this row, and which comes next */
   long long failures;      /* of trials since the accepted state */
-  long long pending;       /* whether projection and samples at this time are to come */
+  long long pending;       /* 1 where projection and samples are to come, 2 where samples are */
 } Run;
 
 /* What is computed at a moment; parameters that move are written over. */
@@ -181,7 +181,7 @@ static int project(double time, double *x, Moment *m) {
 static int update(Run *run, double *x, double *hold, Moment *m, const double *events,
                   long long num_events, const double *noise) {
   if (!run->pending) return DONE;
-  if (!project(run->time, x, m)) return OFF_MANIFOLD;
+  if (run->pending == 1 && !project(run->time, x, m)) return OFF_MANIFOLD;
   while (run->event < num_events && events[run->event] <= run->time) {
     double rate[SIZE + 1], held[NUM_FORCES + 1];
     int i;

@@ -5,18 +5,21 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from math import ceil
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
 from pydrake.systems.framework import Context
 
 import drake_dae
 from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.rollout.rollout import rollout, start_values
 from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
@@ -30,6 +33,9 @@ from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 from drake_dae.simulation.view import RobotBlock, start_meshcat
 
+ROWS = 1000
+"""So many rows has the record of a rollout under error control, after the first."""
+
 
 def run_command(options: argparse.Namespace) -> int:
     """Runs the scenario that the options name; returns the exit code."""
@@ -40,13 +46,14 @@ def run_command(options: argparse.Namespace) -> int:
     meshcat = start_meshcat() if options.meshcat else None
     began = time.perf_counter()
     loop, context = build_scenario(scenario, meshcat)
+    simulate_by = _roll if options.rollout else _step
     print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
     folder = options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     with ending_signals(end_at_once), run_folder(folder):
         save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
-        return _run(loop, context, scenario, folder)
+        return _run(loop, context, scenario, folder, simulate_by)
 
 
 def _unused(name: str) -> Path:
@@ -74,21 +81,54 @@ class _Run:
     statistics: RunStatistics | None = None
     failure: str = ""
     pictures: bool = True
+    record: Record | None = None
 
 
-def _run(loop: ClosedLoop, context: Context, scenario: Scenario, folder: Path) -> int:
+def _step(run: _Run) -> RunStatistics:
+    """Runs by Drake's Simulator."""
+    return simulate(
+        run.loop.diagram,
+        run.context,
+        run.scenario.duration,
+        run.scenario.integrator,
+        progress=True,
+        after_step=run.writer.update if run.scenario.write.record else None,
+    )
+
+
+def _roll(run: _Run) -> RunStatistics:
+    """Runs by `rollout`.
+
+    Raises:
+        SimulationError: The run cannot go on.
+    """
+    scenario, config = run.scenario, run.scenario.integrator
+    rows = ROWS
+    if not config.use_error_control:
+        rows = max(1, ceil(scenario.duration / config.max_step_size - 0.01))
+    times = config.start_time + np.linspace(0.0, scenario.duration, rows + 1)
+    seeds = [scenario.force.seed] if scenario.force.is_measured else None
+    start, parameters = start_values(run.loop, run.context)
+    began = time.perf_counter()
+    (found,) = rollout(run.loop, start, parameters, times, config=config, seeds=seeds)
+    run.record = found.record
+    if found.failure is not None:
+        raise found.failure
+    return RunStatistics(scenario.duration, time.perf_counter() - began, found.steps, None)
+
+
+def _run(
+    loop: ClosedLoop,
+    context: Context,
+    scenario: Scenario,
+    folder: Path,
+    simulate_by: Callable[[_Run], RunStatistics],
+) -> int:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     with RecordWriter(folder / PART, loop.record) as writer:
         run = _Run(loop, context, scenario, folder, writer)
         try:
-            run.statistics = simulate(
-                loop.diagram,
-                context,
-                scenario.duration,
-                scenario.integrator,
-                progress=True,
-                after_step=writer.update if scenario.write.record else None,
-            )
+            run.statistics = simulate_by(run)
         except DrakeDaeError as error:
             run.failure = str(error)
             raise
@@ -108,7 +148,7 @@ def _write(run: _Run) -> bool:
     problems: list[str] = []
     # A signal that comes now does not stop before the record is written, but before the pictures.
     with ending_signals(ending := Ending()):
-        record = loop.record(run.context)
+        record = run.record or loop.record(run.context)
         if record.time.size == 0:
             return True
         predicted = loop.predicted_error(record)

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from runs import scenario
+from scipy.integrate import DOP853
 
 from drake_dae import build_scenario, rollout, simulate, start_values
 from drake_dae.errors import MachineCodeError
@@ -69,3 +70,55 @@ def test_rollout(name, case, report):
             f"{1e3 * taken:.1f} ms, x {simulated / taken:.0f} (>{100 if compiled else 7})"
         )
     report(f"{name}: rollout, {case}", found)
+
+
+def test_many_runs(report):
+    """Random starts of the 2-link wall, 10 s each, on all cores; by the wall clock."""
+    try:
+        find_compiler()
+    except MachineCodeError as error:
+        pytest.skip(str(error))
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    manifold, random = loop.plant.structure.manifold, np.random.default_rng(0)
+    starts = [manifold.settle(start + 0.05 * random.normal(size=4)) for _ in range(1000)]
+    moments = np.linspace(0.0, 10.0, 101)
+    rollout(loop, start, parameters, moments, config=chosen.integrator, compiled=True)
+    began = time.perf_counter()
+    runs = rollout(loop, starts, parameters, moments, config=chosen.integrator, compiled=True)
+    took = time.perf_counter() - began
+    assert len(runs) == 1000
+    figures = {"runs": "1000", "wall [s]": f"{took:.2f} (<6)", "times real": f"{1e4 / took:.0f}"}
+    report("two_link_wall: many rollouts", figures)
+
+
+def test_own_stepper(report):
+    """SciPy's DOP853 on law and plant as machine code, with a projection after each step."""
+    try:
+        find_compiler()
+    except MachineCodeError as error:
+        pytest.skip(str(error))
+    chosen = scenario("seven_joint_wall", "integrator.accuracy=1e-8", "compiled=true")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    settings = {"config": chosen.integrator, "compiled": True}
+    (done,) = rollout(loop, start, parameters, [0.0, 10.0], **settings)
+    own = least(lambda: rollout(loop, start, parameters, [0.0, 10.0], **settings), 10)
+    plant, law = loop.plant, loop.controller.law.function
+    values, numbers = plant.dae.parameter_values, loop.controller.law.all_parameters()
+
+    def rate(time, state):
+        control = law.evaluate(state, loop.reference.reference(time), numbers)[0]
+        return plant.dynamics.evaluate(state, control, values)[0].copy()
+
+    def scipy():
+        solver = DOP853(rate, 0.0, start, 10.0, max_step=10.0 / done.steps)
+        for _ in range(done.steps):
+            solver.step()
+            solver.y = plant.structure.manifold.project(solver.y, values)
+            solver.f = rate(solver.t, solver.y)
+
+    taken = least(scipy, 10)
+    ratio = f"{1e3 * own:.1f} ms, x {taken / own:.1f} (>3)"
+    report("seven_joint_wall: own stepper", {"SciPy [ms]": f"{1e3 * taken:.1f}", "own": ratio})

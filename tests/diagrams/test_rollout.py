@@ -5,12 +5,26 @@ import shutil
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
+from pydrake.trajectories import PiecewisePolynomial
 from runs import run, scenario
 
 from drake_dae import (
+    ConstantReference,
+    ForceSensor,
+    RobotPlant,
+    TrajectoryReference,
     build_scenario,
+    make_closed_loop,
     rollout,
+    simulate,
     start_values,
+)
+from drake_dae.diagrams.scenario import shipped_scenarios
+from drake_dae.errors import (
+    InconsistentStateError,
+    MachineCodeWarning,
+    ModelError,
+    SimulationError,
 )
 
 with_compiler = pytest.param(
@@ -113,3 +127,146 @@ def test_error_control_agrees(name, compiled):
     for signal in ("state", "controlled_output", "constraint_force"):
         np.testing.assert_allclose(found.record[signal], wanted[signal], rtol=1e-9, atol=1e-9)
     assert np.max(np.abs(found.record["constraint_residual"])) < 1e-13
+
+
+@both
+@pytest.mark.parametrize(
+    "settings",
+    [
+        # The tool leaves what the arm can reach.
+        ("references.0.amplitudes=[3.0]", "integrator.accuracy=1e-6"),
+        ("references.0.amplitudes=[3.0]", *fixed(step=0.01)[:3]),
+        # Gains that no step of this length follows.
+        ("gains.all=[-4000]", *fixed("explicit_euler", 0.01)[:3]),
+    ],
+)
+def test_a_failure_is_that_of_the_simulation(settings, compiled):
+    """Its kind, its time, and its words up to the numbers: round-off grows before it."""
+    chosen = scenario("two_link_wall", *settings, "compiled=false", "duration=10")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    with pytest.raises(SimulationError) as raised:
+        simulate(loop.diagram, context, chosen.duration, chosen.integrator)
+    wanted = raised.value
+    (found,) = rollout(
+        loop, start, parameters, grid(10.0, 0.01), config=chosen.integrator, compiled=compiled
+    )
+    assert type(found.failure) is type(wanted)
+    tolerance = 1e-3 if chosen.integrator.use_error_control else 1e-9
+    assert found.failure.time == pytest.approx(wanted.time, abs=tolerance)
+    assert found.failure.state.shape == wanted.state.shape
+    assert f"t = {found.failure.time:.6g} s, state [" in str(found.failure)
+    assert str(found.failure)[:20] == str(wanted)[:20]
+    assert found.record.time[-1] <= found.failure.time < found.record.time[-1] + 0.02
+    assert np.isfinite(found.record["state"]).all()
+
+
+@both
+def test_many_runs_are_those_of_one_each(compiled):
+    """Exactly: each is computed alone. Parameters and starts are their own, as in Drake."""
+    chosen = scenario("two_link_wall", "duration=0.1", *fixed())
+    loop, context = build_scenario(chosen)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    times = grid(0.1, 1e-3)
+    values, records = [], []
+    for mass in (1.0, 2.0, 3.0):
+        loop.plant.set_parameter(own, "link1.mass", mass)
+        loop.plant.set_consistent_state(own, loop.plant.state(own) + 0.01)
+        values.append(start_values(loop, context))
+        other = context.Clone()
+        simulate(loop.diagram, other, 0.1, chosen.integrator)
+        records.append(loop.record(other))
+    starts, parameters = (np.array(column) for column in zip(*values, strict=True))
+    settings = {"config": chosen.integrator, "compiled": compiled}
+    found = rollout(loop, starts, parameters, times, **settings)
+    for one, wanted, (start, row) in zip(found, records, values, strict=True):
+        assert_equal_records(one.record, wanted, 1e-12)
+        (alone,) = rollout(loop, start, row, times, **settings)
+        np.testing.assert_array_equal(alone.record["state"], one.record["state"])
+    # One row of parameters serves all starts.
+    same = rollout(loop, starts, parameters[1], times, **settings)
+    np.testing.assert_array_equal(same[1].record["state"], found[1].record["state"])
+
+
+@both
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {"time_constant": 0.02},
+        {"time_constant": 0.02, "bias": 0.5, "noise_deviation": 0.1},
+        {"time_constant": 0.02, "sample_period": 0.01, "noise_deviation": 0.1},
+        {"time_constant": 0.06, "sample_period": 0.013},
+    ],
+)
+def test_sensors_measure_as_in_drake(sensor, compiled):
+    """The noise is that of Drake's RandomSource; steps of both end at each of its changes."""
+    chosen = scenario("two_link_measured_force", "duration=0.2", *fixed("runge_kutta3", 0.002))
+    built, _ = build_scenario(chosen)
+    law = built.controller.law
+    loop = make_closed_loop(
+        RobotPlant(built.plant.model, structure=law.structure),
+        law,
+        built.reference.references,
+        sensor=ForceSensor(1, **sensor),
+    )
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_seed(context, 7)
+    start, parameters = start_values(loop, context)
+    # The record of Drake has rows at the samples, too.
+    wanted = run(loop, context, 0.2, chosen.integrator)
+    (found,) = rollout(
+        loop, start, parameters, wanted.time, config=chosen.integrator, compiled=compiled, seeds=[7]
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
+def test_what_cannot_be_rolled_out_is_refused():
+    chosen = scenario("two_link_wall", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    with pytest.raises(InconsistentStateError, match="not on the constraint"):
+        rollout(loop, start + 0.1, parameters, [0.0, 0.1])
+    for arguments, told in (
+        ((start[:-1], parameters, [0.0, 0.1]), r"starts must have shape \(4,\)"),
+        ((start, parameters[:-1], [0.0, 0.1]), "parameters must have shape"),
+        ((start, parameters, [0.0]), "times must be two or more"),
+        ((start, parameters, [0.0, 0.0]), "strictly increasing"),
+        (([start] * 3, [parameters] * 2, [0.0, 0.1]), "2 rows of parameters for 3 starts"),
+    ):
+        with pytest.raises(ModelError, match=told):
+            rollout(loop, *arguments)
+    implicit = SimulatorConfig()
+    implicit.integration_scheme, implicit.use_error_control = "implicit_euler", False
+    with pytest.raises(ModelError, match="no fixed steps of implicit_euler; choose explicit_euler"):
+        rollout(loop, start, parameters, [0.0, 0.1], config=implicit)
+    path = TrajectoryReference(PiecewisePolynomial.CubicHermite([0, 1], [[0.3, 0.3]], [[0, 0]]))
+    plant = RobotPlant(loop.plant.model, structure=loop.controller.law.structure)
+    other = make_closed_loop(plant, loop.controller.law, [path, ConstantReference(10.0)])
+    with pytest.raises(ModelError, match="a TrajectoryReference is no expression of time"):
+        rollout(other, start, parameters, [0.0, 0.1])
+
+
+def test_without_a_compiler_it_warns_and_goes_on(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    chosen = scenario("two_link_wall", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    with pytest.warns(MachineCodeWarning, match="no-such-compiler"):
+        (found,) = rollout(loop, start, parameters, [0.0, 0.01], compiled=True)
+    assert found.failure is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped_scenarios())
+def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
+    """To 1e-10 of the largest value: forces of light mechanisms cancel more than those of arms."""
+    chosen = scenario(name, "duration=0.02", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    wanted = run(loop, context, 0.02, chosen.integrator)
+    arguments = (loop, start, parameters, grid(0.02, 1e-3))
+    for compiled in (False, True)[: 1 if name in LARGE or not shutil.which("cc") else 2]:
+        (found,) = rollout(*arguments, config=chosen.integrator, compiled=compiled, seeds=seeds)
+        assert found.failure is None
+        assert_equal_records(found.record, wanted, 1e-10)
