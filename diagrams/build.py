@@ -14,7 +14,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
-from drake_dae.diagrams.keys import at, each
+from drake_dae.diagrams.keys import at, each, violated
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
     index_of,
@@ -50,8 +50,7 @@ def build_scenario(
     try:
         structure = scenario_structure(model)
     except AssumptionError as error:
-        key = "constraints" if error.assumption <= 3 else "outputs"
-        raise ScenarioError((key, str(error))) from error
+        raise violated(error) from error
     return wire_scenario(scenario, model, structure, scene_graph, meshcat)
 
 
