@@ -1,6 +1,7 @@
 """What a scenario changes about the robot of its file: base, locked joints, actuators."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.robot_file.efforts import Efforts, limits_of
 from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario_parts import Base, Robot
-from drake_dae.errors import ModelError
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots.contact.plant_constraints import Coupling, couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
 
@@ -43,15 +44,24 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
         couplings = _read_couplings(robot)
-    if robot.base is not None:
-        weld_base(robot.base, plant)
-    if robot.locked:
-        lock_joints(robot.locked, plant, couplings)
-    add_free_joints(robot.free, plant)
-    if robot.actuators is not None:
-        drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
-    try:
+    with _told_by_drake():
+        if robot.base is not None:
+            weld_base(robot.base, plant)
+        if robot.locked:
+            lock_joints(robot.locked, plant, couplings)
+        add_free_joints(robot.free, plant)
+        if robot.actuators is not None:
+            drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
         plant.Finalize()
+
+
+@contextmanager
+def _told_by_drake() -> Iterator[None]:
+    """Makes errors of Drake ours, SystemExit for an assertion of its own as well."""
+    try:
+        yield
+    except DrakeDaeError:
+        raise
     except (RuntimeError, ValueError, SystemExit) as error:
         raise ModelError(str(error)) from None
 
@@ -59,10 +69,8 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
 def _read_couplings(robot: Robot) -> Sequence[Coupling]:
     """The couplings of the file, from a plant of its own: only a finalized one tells them."""
     plant, _ = read_robot(robot)
-    try:
+    with _told_by_drake():
         plant.Finalize()
-    except (RuntimeError, ValueError, SystemExit) as error:
-        raise ModelError(str(error)) from None
     return couplings_of(plant)
 
 
