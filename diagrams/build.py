@@ -18,7 +18,7 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
-from drake_dae.diagrams.keys import at, each
+from drake_dae.diagrams.keys import at, each, violated
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
     add_robot,
@@ -64,8 +64,7 @@ def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop
     try:
         structure = scenario_structure(model)
     except AssumptionError as error:
-        key = "constraints" if error.assumption <= 3 else "outputs"
-        raise ScenarioError((key, str(error))) from error
+        raise violated(error) from error
     return wire_loop(scenario, model, structure, scene_graph, meshcat)
 
 

@@ -1,10 +1,11 @@
-"""The key of the scenario before whatever goes wrong."""
+"""The key of the scenario before whatever goes wrong, and remedies that a scenario has."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.dae.structure.assumptions import Cause, Violation
+from drake_dae.errors import AssumptionError, DrakeDaeError, ScenarioError
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -28,3 +29,36 @@ def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
         with at(f"{key}.{index}"):
             results.append(make(item))
     return results
+
+
+_REMEDIES = {
+    Cause.CONSTRAINT_DEGREE: (
+        "Start elsewhere, by start.positions, or write the constraint so that its gradient does "
+        "not vanish"
+    ),
+    Cause.OUTPUT_DEGREE: "Choose another output, or start elsewhere, by start.positions",
+    Cause.EARLY_CONTROL: (
+        "The constraint then binds the control instead of the state. Take that one out of "
+        "robot.actuators, or add a stage under actuation"
+    ),
+    Cause.REDUNDANT: (
+        "The constraints are redundant at every state: how the forces split among them is not "
+        "determined. Take a redundant one out, or write compliances: {}, which has the forces "
+        "shared by least squares"
+    ),
+    Cause.CONTROL_RANK: (
+        "An output may repeat a constraint or another output; choose others. Or the robot is in a "
+        "singular configuration there, as an arm is that is stretched: give start.positions from "
+        "which it starts in another one"
+    ),
+}
+"""What to do about a violation where that is not the same as in Python."""
+
+
+def violated(error: AssumptionError) -> ScenarioError:
+    """The error of a scenario whose robot violates an assumption of the theory."""
+    key, text = "constraints" if error.assumption <= 3 else "outputs", str(error)
+    if isinstance(error.violation, Violation):
+        cause = error.violation.cause
+        text = text.replace(cause.value, _REMEDIES.get(cause, cause.value))
+    return ScenarioError((key, text))

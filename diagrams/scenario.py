@@ -107,7 +107,8 @@ class Scenario:
 
     Attributes:
         description: One line for `drake-dae list`.
-        robot: The file that the robot is read from.
+        robot: The file that the robot is read from, and what the file leaves open: what is welded,
+            free, locked, and driven.
         constraints: What it touches or holds; a form without a tag is a PointOnSurface. Those that
             the robot's file has, as mimic joints, follow them.
         outputs: Position outputs; the constraint forces follow them.

@@ -105,7 +105,8 @@ Actuators = Annotated[
 class Robot:
     """A robot that Drake's Parser reads, and what its file does not say of it.
 
-    Collision meshes that Drake cannot read, as .stl and .dae, are left out: no equation needs them.
+    Meshes that Drake cannot read, as collisions in .stl or .dae, are left out: no equation needs
+    them.
     Joints that mimic another one are constraints "<joint>_coupler".
 
     Attributes:

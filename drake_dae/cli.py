@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--rollout",
         action="store_true",
         help="run without Drake's Simulator, the whole loop as one function: some ten to a hundred "
-        f"times as fast; the record has every fixed step, or {ROWS} rows under error control",
+        "times as fast; the record has every fixed step, or 1000 rows under error control",
     )
     examine = commands.add_parser(
         "analyze",

@@ -1,6 +1,7 @@
 """What a scenario changes about the robot of its file: base, locked joints, actuators."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.robot_file.efforts import Efforts, limits_of
 from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario_parts import Base, Robot
-from drake_dae.errors import ModelError
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots.contact.plant_constraints import Coupling, couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
 
@@ -42,13 +43,14 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
     couplings: Sequence[Coupling] = ()
     if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
         couplings = _read_couplings(robot)
-    if robot.base is not None:
-        weld_base(robot.base, plant)
-    if robot.locked:
-        lock_joints(robot.locked, plant, couplings)
-    add_free_joints(robot.free, plant)
-    if robot.actuators is not None:
-        drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
+    with _told_by_drake():
+        if robot.base is not None:
+            weld_base(robot.base, plant)
+        if robot.locked:
+            lock_joints(robot.locked, plant, couplings)
+        add_free_joints(robot.free, plant)
+        if robot.actuators is not None:
+            drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
 
 
 def finalize(plant: MultibodyPlant) -> None:
@@ -57,8 +59,17 @@ def finalize(plant: MultibodyPlant) -> None:
     Raises:
         ModelError: Drake refuses to.
     """
-    try:
+    with _told_by_drake():
         plant.Finalize()
+
+
+@contextmanager
+def _told_by_drake() -> Iterator[None]:
+    """Makes errors of Drake ours, SystemExit for an assertion of its own as well."""
+    try:
+        yield
+    except DrakeDaeError:
+        raise
     except (RuntimeError, ValueError, SystemExit) as error:
         raise ModelError(str(error)) from None
 

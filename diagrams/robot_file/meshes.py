@@ -1,11 +1,12 @@
-"""Collision meshes that Drake cannot read, left out of a robot's files.
+"""Meshes that Drake cannot read, left out of a robot's files.
 
-Vendors write them in .stl or .dae, which MultibodyPlant refuses as soon as it has a SceneGraph. The
-equations need none, and no picture shows them: what remains of the robot is read and drawn.
+Vendors write collisions in .stl or .dae, which MultibodyPlant refuses as soon as it has a
+SceneGraph, and MJCF has .stl for all. The equations need none: what remains is read and drawn.
 """
 
 import re
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from pydrake.geometry import Mesh
@@ -16,6 +17,8 @@ from pydrake.multibody.parsing import (
     Parser,
     ProcessModelDirectives,
 )
+
+from drake_dae.diagrams.robot_file.mjcf import without_assets
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _COLLISION = re.compile(r"<collision\b[^<]*?(?:/>|>.*?</collision\s*>)", re.DOTALL)
@@ -28,7 +31,7 @@ _FILE = {
 
 @dataclass(frozen=True)
 class Copies:
-    """Files without the collision meshes that Drake cannot read.
+    """Files without the meshes that Drake cannot read.
 
     Attributes:
         originals: A copy -> the file that it is a copy of, with the same lines.
@@ -46,7 +49,7 @@ class Copies:
 
 
 def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict[str, Path]:
-    """Adds the models of a file to a plant, without the collision meshes that Drake cannot read.
+    """Adds the models of a file to a plant, without the meshes that Drake cannot read.
 
     Args:
         file: A file that Drake's Parser reads.
@@ -58,11 +61,14 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
         The file of each model instance of directives, or the file itself under "".
 
     Raises:
+        ModelError: A body has its mass from a mesh that Drake cannot read.
         RuntimeError: Drake refuses the files; the message names copies.
     """
-    packages, has_geometry = parser.package_map(), parser.plant().geometry_source_is_registered()
+    packages = parser.package_map()
+    # Of MJCF Drake reads the meshes also where they are not registered.
+    has_geometry = parser.plant().geometry_source_is_registered()
     if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
-        own = _readable(file, packages, folder, copies) if has_geometry else file
+        own = _readable(file, packages, folder, copies) if has_geometry or _is_mjcf(file) else file
         parser.AddModels(str(own))
         return {"": file}
     directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
@@ -71,7 +77,8 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
         if directive.add_model is not None:
             model = Path(packages.ResolveUrl(directive.add_model.file))
             models[directive.add_model.name] = model
-            own = _readable(model, packages, folder, copies) if has_geometry else model
+            needed = has_geometry or _is_mjcf(model)
+            own = _readable(model, packages, folder, copies) if needed else model
             if own != model:
                 directive.add_model.file = own.as_uri()
     if copies.left_out:
@@ -82,35 +89,39 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
 
 
 def _readable(file: Path, packages: PackageMap, folder: Path, copies: Copies) -> Path:
-    """The file, or a copy without the collision meshes that Drake cannot read."""
-    name = _FILE.get(file.suffix)
-    if name is None or not file.is_file():
+    """The file, or a copy without the meshes that Drake cannot read."""
+    if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
         return file
     text = _COMMENT.sub(_blank, file.read_text("utf-8", errors="replace"))
-    left_out: list[Path] = []
-
-    def kept(collision: re.Match[str]) -> str:
-        refused = [
-            mesh
-            for mesh in (
-                _resolved(found[2], file, packages) for found in name.finditer(collision[0])
-            )
-            if mesh is not None and _is_refused(mesh)
-        ]
-        left_out.extend(refused)
-        return _blank(collision) if refused else collision[0]
-
-    text = _COLLISION.sub(kept, text)
+    change = without_assets if _is_mjcf(file) else partial(_without_collisions, packages=packages)
+    text, left_out = change(text, file)
     if not left_out:
         return file
     copies.left_out.extend(left_out)
-    # The copy lies elsewhere: relative names would lead nowhere.
-    text = name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text)
     copy = folder / str(len(copies.originals)) / file.name
     copy.parent.mkdir()
     copy.write_text(text, "utf-8")
     copies.originals[copy] = file
     return copy
+
+
+def _is_mjcf(file: Path) -> bool:
+    return file.suffix == ".xml"
+
+
+def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[str, list[Path]]:
+    """A URDF or SDFormat file without the collision meshes that Drake cannot read, and these."""
+    name, left_out = _FILE[file.suffix], []
+
+    def kept(collision: re.Match[str]) -> str:
+        meshes = [_resolved(found[2], file, packages) for found in name.finditer(collision[0])]
+        refused = [mesh for mesh in meshes if mesh is not None and _is_refused(mesh)]
+        left_out.extend(refused)
+        return _blank(collision) if refused else collision[0]
+
+    text = _COLLISION.sub(kept, text)
+    # A copy lies elsewhere: relative names would lead nowhere.
+    return name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text), left_out
 
 
 def _blank(found: re.Match[str]) -> str:

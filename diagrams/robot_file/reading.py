@@ -99,12 +99,11 @@ def _is_answered(warning: str, robot: Robot) -> bool:
     return "friction" in warning and "joint_friction" in robot.leave_out
 
 
-def _tell_what_is_left_out(collisions: list[Path], scene_graph: SceneGraph) -> None:
+def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
     """Names the geometry that is not read, or not drawn, in one line each."""
-    if collisions:
+    if unread:
         warnings.warn(
-            f"collision geometry that Drake cannot read is left out: {_listed(collisions)}; no "
-            "equation needs it",
+            f"geometry that Drake cannot read is left out: {_listed(unread)}; no equation needs it",
             GeometryWarning,
             stacklevel=2,
         )

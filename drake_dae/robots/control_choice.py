@@ -59,6 +59,8 @@ def check_outputs(
     if count + forces and count + forces != nu:  # A robot that is only simulated needs none.
         names = ", ".join(signal.name for signal in positions) or "none"
         fewer = ". For fewer, control_weights choose the control" if count + forces < nu else ""
+        if forces and count + forces > nu:
+            fewer = ". Name in `forces` those that shall be steered; [] is none"
         raise ModelError(
             f"{name}: {nu} actuators can steer {nu} outputs. The {forces} constraint forces "
             f"are outputs already, so {nu - forces} position outputs are needed; given are "

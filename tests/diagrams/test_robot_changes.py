@@ -367,3 +367,17 @@ def test_a_transmission_without_effort_needs_actuators(tmp_path):
     np.testing.assert_array_equal(links.effort_limits, [np.inf])
     with pytest.raises(ScenarioError, match=r"robot\.file: .*joint 'j'.* under robot\.actuators"):
         scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))
+
+
+def test_what_drake_refuses_to_change_is_told(tmp_path):
+    """An actuator of the file has the name that the one of another joint would get."""
+    drive = (
+        "<transmission><type>transmission_interface/SimpleTransmission</type>"
+        '<joint name="j"/><actuator name="k"/></transmission>'
+    )
+    bodies = [link(name, 1) for name in ("base", "arm", "hand")]
+    joints = [joint("j", "base", "arm", "0 1 0"), joint("k", "arm", "hand", "0 1 0")]
+    (tmp_path / "arm.urdf").write_text(robot("arm", *bodies, *joints, drive))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*'k'"):
+        scenario_model(load_scenario(tmp_path / "arm.yaml"))

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydrake.geometry import Role, SceneGraph
+from runs import run_scenario
 from vendors import COLLADA, binary_stl, write_panda, write_ur5
 
 from drake_dae import build_scenario, load_scenario
@@ -167,3 +169,58 @@ def test_what_a_left_out_robot_names_outside_of_its_folder_is_refused(tmp_path: 
         build_scenario(load_scenario(tmp_path / "ur5.yaml"))
     assert "outside of the model's package or folder" in str(caught.value)
     assert "robot.packages" in str(caught.value)
+
+
+MJCF = """<mujoco model="arm"><compiler angle="radian" meshdir="assets"/>
+<asset><mesh name="upper" file="upper.stl"/><mesh file="lower.obj"/>
+<!-- <mesh name="old" file="old.stl"/> --></asset>
+<worldbody><body name="a"><inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>
+<joint name="j1" type="hinge" axis="0 1 0"/><geom type="mesh" mesh="upper"/>
+<body name="b" pos="0 0 0.4"><inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.2 0.1"/>
+<joint name="j2" type="hinge" axis="0 1 0"/><geom type="mesh" mesh="lower"/></body></body>
+</worldbody>
+<actuator><motor joint="j1"/><motor joint="j2"/></actuator></mujoco>"""
+
+ARM = """
+robot: {file: arm.xml}
+outputs: [!JointPositions {joints: [j1, j2]}]
+gains: !Poles {all: [-3.0]}
+references: [!Constant {values: [0.2, 0.3]}]
+start: {errors: {j1: 0.1}}
+duration: 0.5
+"""
+
+
+def write_mjcf(folder: Path, text: str = MJCF) -> Path:
+    (folder / "assets").mkdir()
+    (folder / "assets" / "upper.stl").write_bytes(binary_stl())
+    (folder / "assets" / "lower.obj").write_text(OBJ)
+    (folder / "arm.xml").write_text(text)
+    (folder / "arm.yaml").write_text(ARM)
+    return folder / "arm.yaml"
+
+
+def test_an_mjcf_robot_runs_without_the_meshes_that_drake_cannot_read(tmp_path: Path):
+    """Its masses are those of the file; the accuracy of a step, 1e-6, is in the prediction."""
+    path = write_mjcf(tmp_path)
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning, match=r"left out: 'upper\.stl'; no equation"):
+        plant = read(tmp_path / "arm.xml", scene_graph)
+    assert [plant.GetBodyByName(name).default_mass() for name in "ab"] == [1.0, 2.0]
+    assert count(scene_graph, Role.kProximity) == 1
+    with pytest.warns(GeometryWarning):
+        loop, _, record = run_scenario(load_scenario(path))
+    predicted = loop.predicted_error(record)
+    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-5)
+
+
+@pytest.mark.parametrize("head", ['meshdir="assets"', 'meshdir="assets" inertiafromgeom="true"'])
+def test_an_mjcf_body_that_weighs_what_its_mesh_does_is_refused(head: str, tmp_path: Path):
+    text = MJCF.replace('meshdir="assets"', head)
+    if "inertiafromgeom" not in head:
+        text = text.replace('<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>', "")
+    path = write_mjcf(tmp_path, text)
+    with pytest.raises(
+        ScenarioError, match=r"robot\.file: body 'a' has its mass from .*upper\.stl"
+    ):
+        build_scenario(load_scenario(path))
