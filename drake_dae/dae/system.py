@@ -370,13 +370,16 @@ class DaeSystem:
         """How far states are drawn from the nominal one where nobody says, shape (n,)."""
         return self.usual_spread(self.nominal_state)
 
-    def usual_spread(self, state: FloatArray) -> FloatArray:
+    def usual_spread(self, state: ArrayLike) -> FloatArray:
         """How far states are drawn from one where nobody says, shape (n,): 0.1 of their scale.
 
         It is a hundredth of a value that is above 10 of them, and a tenth of one that is below
         1e-3 and not round-off.
+
+        Raises:
+            ModelError: The state has a wrong shape, or a number is not finite.
         """
-        size = np.abs(state) / self.scale
+        size = np.abs(self.state_vector(state)) / self.scale
         small = (size < 1e-3) & (size > 1e-12 * size.max())
         return self.scale * np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
 

@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arrays import FloatArray, show, unknown_name
 from drake_dae.dae.contacts import jam
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.passage import Passage
@@ -242,8 +242,21 @@ class DaePlant(ParameterizedSystem):
         Args:
             port: The port's name.
             given: "state", "parameters" and "control" at each moment, one row for each.
+
+        Raises:
+            ModelError: There is no such port, or something is not given, or of another size.
         """
+        if port not in self.functions:
+            raise ModelError(f"{self.dae.name}: {unknown_name('port', port, self.functions)}")
         function = self.functions[port]
+        sizes = {
+            "state": self.dae.num_states,
+            "control": self.dae.num_controls,
+            "parameters": self.dae.parameter_symbol.numel(),
+        }
+        for name in function.input_names:
+            if name not in given or np.shape(given[name])[1:] != (sizes[name],):
+                raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
         return function_along(
             function, given, lambda at: self._otherwise(function, at[0], at[1:-1], at[-1])
         )
