@@ -101,8 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument(
         "--rollout",
         action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function: some ten to a hundred "
-        f"times as fast; the record has every fixed step, or {ROWS} rows under error control",
+        help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
+        f"fast as machine code, twice without; the record has every fixed step, or {ROWS} rows under error control",
     )
     examine = commands.add_parser(
         "analyze",
