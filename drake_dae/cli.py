@@ -102,7 +102,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--rollout",
         action="store_true",
         help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
-        f"fast as machine code, twice without; the record has every fixed step, or {ROWS} rows under error control",
+        "fast where it is machine code, twice as fast where not; the record has every fixed "
+        f"step, or {ROWS} rows under error control",
     )
     examine = commands.add_parser(
         "analyze",
