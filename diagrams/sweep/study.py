@@ -14,7 +14,6 @@ from drake_dae.analysis.tables import Part, Table, count_of, to_text
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.diagrams.sweep.runs import Outcome, RunResult
-from drake_dae.diagrams.sweep.study_plots import save_study_plots
 from drake_dae.diagrams.sweep.variations import Variation
 from drake_dae.errors import ModelError
 
@@ -93,6 +92,8 @@ class Study:
         Args:
             folder: The folder to write to; it is made.
         """
+        from drake_dae.diagrams.sweep.study_plots import save_study_plots
+
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         table, summary = place / FILES[0], place / FILES[1]

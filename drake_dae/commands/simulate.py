@@ -19,7 +19,6 @@ from pydrake.systems.framework import Context
 import drake_dae
 from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.rollout.rollout import rollout, start_values
 from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
@@ -102,6 +101,8 @@ def _roll(run: _Run) -> RunStatistics:
     Raises:
         SimulationError: The run cannot go on.
     """
+    from drake_dae.diagrams.rollout.rollout import rollout, start_values
+
     scenario, config = run.scenario, run.scenario.integrator
     rows = ROWS
     if not config.use_error_control:

@@ -16,6 +16,7 @@ from drake_dae import build_scenario, load_scenario, simulate
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.shipped import FOLDER, shipped_scenarios
 from drake_dae.diagrams.typed_yaml import dump_yaml, load_yaml
+from drake_dae.systems.plant import DaePlant
 
 URDFS = {"two_link_arm": "two_link_wall", "five_bar": "five_bar"}
 """Model -> the scenario that reads it as a file."""
@@ -97,7 +98,9 @@ def attempt(seed: int, folder: Path) -> Outcome:
         simulate(loop.diagram, context, duration, scenario.integrator)
         record = loop.record(context)
         exact = _is_exact(scenario) and bad.excuse != LOST
-        outcome.figures(record, loop.predicted_error(record) if exact else None)
+        is_ideal = isinstance(loop.plant, DaePlant)
+        predicted = loop.predicted_error(record) if exact and is_ideal else None
+        outcome.figures(record, predicted, is_ideal)
         outcome.accepted(bad.excuse)
     return outcome
 

