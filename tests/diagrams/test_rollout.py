@@ -33,7 +33,7 @@ with_compiler = pytest.param(
 both = pytest.mark.parametrize("compiled", [False, with_compiler])
 
 COMPILED = {"boom", "planar_4rrr", "seven_joint_moving_plate", "two_link_hydraulics"}
-"""They take the compiler long."""
+"""Those that are also made machine code; others take the compiler longer."""
 
 
 def fixed(scheme: str = "runge_kutta3", step: float = 1e-3) -> list[str]:
