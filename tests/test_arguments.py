@@ -483,7 +483,7 @@ WRONG = st.one_of(
     st.lists(st.floats(-2.0, 2.0), max_size=5),
     st.text(max_size=5),
 )
-EXAMPLES = 12
+EXAMPLES = 8
 """Of each name in a run of the tests; all of them, one argument at a time, are 20,000 calls."""
 
 EVERY = tuple(labels())

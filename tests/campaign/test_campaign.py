@@ -8,8 +8,8 @@ import pytest
 from campaign import bad_inputs, random_robots
 from campaign.outcomes import BAD, REFUSED, RESULT
 
-FEW, MANY = range(40), range(40, 300)
-FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 64)
+FEW, MANY = range(40), range(40, 180)
+FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 56)
 
 
 def each(few, many):
