@@ -69,10 +69,11 @@ def newton(
     def length_of(step: FloatArray) -> float:
         return norm(step / unit)
 
+    regular, size = False, np.inf
     for _ in range(ITERATIONS):
         linearization = linearize(x)
         if linearization is None:
-            break
+            return x, False
         step_from, regular, measure = linearization
         step = step_from(x)
         size = length_of(step)
@@ -94,7 +95,8 @@ def newton(
         else:
             return x, regular and bool(size <= CONVERGED)
         x = trial
-    return x, False
+    # Steps that go round in what is round-off do not get smaller either.
+    return x, regular and bool(size <= CONVERGED)
 
 
 def _polished(
