@@ -25,7 +25,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
 help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
-	@echo 'make check       lint, types and the quick tests: the daily round, below 90 s'
+	@echo 'make check       lint, types and the quick tests: the daily round, some two minutes'
 	@echo 'make test        lint, types and all tests'
 	@echo 'make benchmark   speed, with ratios'
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'

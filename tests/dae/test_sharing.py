@@ -314,6 +314,7 @@ def test_the_analysis_says_what_is_not_determined():
     assert "pin1.fx" in found["undetermined_forces"]
 
 
+@pytest.mark.slow
 def test_a_mechanism_is_told_that_it_is_redundant():
     """Though next to its motion the pins are independent, and lead to the cranks laid flat."""
     dae = RobotModel.from_multibody(platform(), pins(), [], 0.8 * PARALLEL, forces=[]).dae

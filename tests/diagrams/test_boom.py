@@ -83,6 +83,7 @@ def test_the_actuator_pushes_as_lagrange_says_and_the_prediction_is_kept():
     assert np.abs(record["constraint_residual"]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_limits_of_the_actuator_are_told_before_it_runs():
     report = find_feasibility(scenario(NAME, "constraints.0.upper=1.05", "duration=6"))
     assert any("actuator.travel goes from" in problem for problem in report.problems)

@@ -133,6 +133,7 @@ def test_force_tends_to_that_of_the_ideal_constraint():
     assert differences[-1] < 2e-3
 
 
+@pytest.mark.slow
 def test_shipped_wall_is_tracked():
     """The circle at 0.1 m/s with 20 + 5 sin 2t N: 0.01 mm and 0.02 N rms after 2 s, at 1 kHz.
 
@@ -176,6 +177,7 @@ def test_wall_may_stand_elsewhere_than_the_law_believes():
     assert np.abs(record["constraint_residual"][:, 0]).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_analysis_and_pictures_stay(tmp_path):
     found = two_link(ONE_LATE, "duration=0.1")
     assert not find_feasibility(found).problems

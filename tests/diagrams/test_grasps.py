@@ -125,6 +125,7 @@ def test_squeezes_lie_in_the_null_space_of_the_grasp_map():
         assert np.linalg.matrix_rank(S) == 9 - np.linalg.matrix_rank(G) == 3
 
 
+@pytest.mark.slow
 def test_forces_and_squeezes_of_the_fingers_are_those_of_drake():
     """Round-off of systems of 24 equations, with forces of some N and 1e3 rad/s^2 for each N."""
     _, _, record = run("three_fingers", *FINE)
@@ -201,6 +202,7 @@ def test_forces_of_the_biped_are_those_of_drake():
         assert_allclose(jacobian @ v, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_biped_follows_with_the_error_by_hand():
     """Degrees 4, 4, 4 and 2; steps of 4 ms leave less than 1e-9."""
     loop, _, record = run("biped", "duration=2")

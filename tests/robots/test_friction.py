@@ -212,6 +212,7 @@ def particle(mass=2.0):
     return LinkExpressions(q, v, mass * ca.SX.eye(2), weight, frames={"bob": place})
 
 
+@pytest.mark.slow
 def test_energy_only_falls_and_by_the_power_of_friction():
     """A block on a floor: x'' = -mu g s - d x' / m; E falls at each step."""
     floor = PointOnSurface(

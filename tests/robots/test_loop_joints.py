@@ -303,6 +303,7 @@ def test_the_law_steers_through_a_motor_in_the_loop_and_limits_are_told_alike():
     assert "loop.angle goes" in told[0]
 
 
+@pytest.mark.slow
 def test_the_angle_can_be_an_output():
     model = ring(3)
     loop = model.constraints[0]
