@@ -18,6 +18,10 @@ AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
 
 
+FAR = 1e8
+"""A search that comes so far beyond the states that are known, relative to their sizes, has found
+nothing: beside a state so large any rate looks like rest."""
+
 APART = 1e-6
 """States at rest that are nearer than this, relative to their sizes, are the same."""
 
@@ -131,7 +135,9 @@ class Equilibria:
         z, converged = newton(start / scale, linearize)
         state = scale * z
         point = pinned.point(state, reference, parameters)
-        unrest = self.unrest(point, reference, parameters)
+        unrest: Unrest | str | None = self.unrest(point, reference, parameters)
+        if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
+            unrest = "it runs away from all states that are known"
         if converged and not unrest:
             return state
         raise InconsistentStateError(
