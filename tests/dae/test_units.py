@@ -10,6 +10,8 @@ import pytest
 from problems import PROBLEMS, in_other_units
 
 from drake_dae.analysis.analyze import analyze
+from drake_dae.dae.structure.redundancy import drop_constraints
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 
@@ -106,3 +108,21 @@ def test_a_scale_that_is_none_is_refused(scale):
         DaeSystem.from_functions(
             2, f=lambda x: x, h=lambda x: [0, 1], l=lambda x: x[0], state_scale=scale
         )
+
+
+def test_redundant_constraints_are_left_out_in_any_units():
+    """A bead on a wire that two equal rods hold: one follows from the other, whatever the units."""
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], 0, -9.81],
+        g=lambda x: [[0, 0], [0, 0], [x[0], 3 * x[0]], [x[1], 3 * x[1]]],
+        h=lambda x: [0, 0, 1, 0],
+        k=lambda x: [x[0] ** 2 + x[1] ** 2 - 1, 3 * (x[0] ** 2 + x[1] ** 2 - 1)],
+        l=lambda x: x[0],
+        m=lambda x: [[0, 0]],
+        nominal_state=[0.6, -0.8, 0.0, 0.0],
+    )
+    for _, other in other_units(system):
+        kept = drop_constraints(other)
+        assert kept.num_constraints == 1
+        assert find_structure(kept).constraint_degrees == (2,)

@@ -91,23 +91,24 @@ class _Redundant(Manifold):
         parameters: ArrayLike | None = None,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        x = self.system.state_vector(state)
-        gradients = self.gradients(x, parameters)
+        scale = self.system.scale
+        z = self.system.state_vector(state) / scale
+        gradients = self.gradients(scale * z, parameters) * scale
         length = positive(np.linalg.norm(gradients, axis=1))
-        left = self.residual(x, parameters) / length
+        left = self.residual(scale * z, parameters) / length
         damping = 1.0
         for _ in range(SEARCH):
             size = float(np.linalg.norm(left))
             u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
             step = (u.T @ left) * s / positive(s * s + damping * size) @ v
-            following = self.residual(x - step, parameters) / length
+            following = self.residual(scale * (z - step), parameters) / length
             if not np.linalg.norm(following) < size:
-                if size <= ROUND_OFF * (1.0 + np.linalg.norm(x)):
-                    return x
+                if size <= ROUND_OFF * (1.0 + np.linalg.norm(z)):
+                    return np.asarray(scale * z)
                 damping *= 4.0
                 continue
-            x, left, damping = x - step, following, 1.0
-            gradients = self.gradients(x, parameters)
+            z, left, damping = z - step, following, 1.0
+            gradients = self.gradients(scale * z, parameters) * scale
         raise InconsistentStateError(
             f"{self.system.name}: no state found near the given one at which all constraints hold",
             left * length,
