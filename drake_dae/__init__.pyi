@@ -80,6 +80,7 @@ from .robots.outputs import JointPositions as JointPositions
 from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
 from .simulation.animation import make_animation as make_animation
+from .simulation.film import save_film as save_film
 from .simulation.record import Record as Record
 from .simulation.record_writer import RecordWriter as RecordWriter
 from .simulation.simulate import simulate as simulate

@@ -94,6 +94,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "folder compiles it and compares it with Python.",
     )
     written.add_argument("--out", type=Path, help="folder for the files (default: <scenario>_c99)")
+    film = commands.add_parser(
+        "film",
+        help="film a run, into a GIF or a strip of pictures",
+        description="Renders what a run left in its folder, with the paths and the forces of its "
+        "contacts. It takes no screen, and no browser.",
+    )
+    film.add_argument("folder", type=Path, help="the folder of a run, as runs/seven_joint_wall")
+    film.add_argument(
+        "--out",
+        type=Path,
+        help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
+    )
     kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
     kept.add_argument("--clear", action="store_true", help="remove it all")
     options = parser.parse_args(arguments)
@@ -115,11 +127,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ignored.append(NonMinimumPhaseWarning)  # The report tells it.
         elif options.command == "export":
             from drake_dae.commands.export import run_command
+        elif options.command == "film":
+            from drake_dae.commands.film import run_command
         elif options.command == "sweep":
             from drake_dae.commands.sweep import run_command
         else:
             from drake_dae.commands.simulate import run_command
-        if options.command != "cache" and options.compiled is not None:
+        if getattr(options, "compiled", None) is not None:
             options.settings.append(f"compiled={options.compiled}")
         # Drake tells where each Meshcat listens, also the one that only records.
         logging.getLogger("drake").setLevel(logging.WARNING)

@@ -21,6 +21,9 @@ PART = "record.part"
 FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, "animation.html")
 """What a run leaves in its folder."""
 
+FILM = "film.gif"
+"""What `drake-dae film` adds to them."""
+
 MARK = "# Scenario as run by drake-dae"
 """Begins the scenario in a run's folder: only such a folder is written to again."""
 
@@ -82,7 +85,7 @@ def _prepare(folder: Path) -> int:
 
 
 def _present(folder: Path) -> list[Path]:
-    return [folder / name for name in (*FILES, PART) if os.path.lexists(folder / name)]
+    return [folder / name for name in (*FILES, PART, FILM) if os.path.lexists(folder / name)]
 
 
 def _check(folder: Path, text: str | None) -> None:

@@ -1,0 +1,26 @@
+"""`drake-dae film`: renders what a run left in its folder."""
+
+import argparse
+
+from drake_dae.diagrams.build import build_scenario
+from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.errors import ModelError
+from drake_dae.simulation.film import save_film
+from drake_dae.simulation.record import Record
+from drake_dae.simulation.run_folder import FILM, PART, SCENARIO, stage
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """Films the run in the folder that the options name; returns the exit code."""
+    folder = options.folder
+    found = [name for name in ("record.npz", PART) if (folder / name).is_file()]
+    if not found or not (folder / SCENARIO).is_file():
+        raise ModelError(
+            f"'{folder}' is no folder of a run: a film takes its {SCENARIO} and record.npz"
+        )
+    loop, context = build_scenario(load_scenario(folder / SCENARIO, []))
+    path = options.out or folder / FILM
+    with stage(path.parent, path.name) as place:
+        save_film(loop, Record.load(folder / found[0]), context, place / path.name)
+    print(f"written to {path}")
+    return 0
