@@ -5,7 +5,7 @@ from pathlib import Path
 
 from drake_dae.arrays import unknown_name
 from drake_dae.diagrams.typed_yaml import load_yaml
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import ModelError, ScenarioError
 
 FOLDER = Path(__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
@@ -32,6 +32,19 @@ def find_scenario(name: str) -> Path:
     except (OSError, ValueError):
         pass  # Such as a null byte.
     raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
+
+
+def shipped_model(name: str) -> Path:
+    """A robot's file that comes with drake_dae, as "two_link_arm.urdf".
+
+    Raises:
+        ModelError: There is no such file.
+    """
+    files = sorted((FOLDER / "models").iterdir())
+    shipped = {file.name: file for file in files if file.suffix in (".urdf", ".yaml")}
+    if str(name) not in shipped:
+        raise ModelError(unknown_name("model", str(name), shipped))
+    return shipped[str(name)]
 
 
 def description(path: Path) -> str:

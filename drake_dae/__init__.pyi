@@ -40,6 +40,7 @@ from .diagrams.rollout.rollout import rollout as rollout
 from .diagrams.rollout.rollout import start_values as start_values
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
+from .diagrams.shipped import shipped_model as shipped_model
 from .diagrams.sweep.study import Study as Study
 from .diagrams.sweep.sweep import sweep as sweep
 from .diagrams.sweep.variations import grid_variations as grid_variations

@@ -21,7 +21,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.shipped import FOLDER
 
 SPRINGS = dd.FlexibleJoints(stiffness=8000.0, inertia=1.0)
 MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
@@ -38,7 +37,7 @@ ACTUATIONS = {
 def run(actuation: list) -> tuple[dd.Record, np.ndarray]:
     """The record of one actuation, and the predicted errors."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
+    Parser(multibody).AddModels(str(dd.shipped_model("two_link_arm.urdf")))
     multibody.Finalize()
     model = dd.RobotModel.from_multibody(
         multibody,

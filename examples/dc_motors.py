@@ -21,7 +21,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.shipped import FOLDER
 
 MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 
@@ -29,7 +28,7 @@ MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_
 def run(mass_factor: float, measured_force: bool) -> tuple[dd.Record, np.ndarray]:
     """The record of a move to another height, and the predicted errors."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
+    Parser(multibody).AddModels(str(dd.shipped_model("two_link_arm.urdf")))
     multibody.Finalize()
     model = dd.RobotModel.from_multibody(
         multibody,

@@ -35,9 +35,9 @@ from drake_dae import (
     find_structure,
     make_closed_loop,
     poles,
+    shipped_model,
 )
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.diagrams.shipped import FOLDER
 
 LOW, HIGH = 0.0, 0.6
 """Heights of the tip, m."""
@@ -51,7 +51,7 @@ DURATION, SAMPLES = 1.0, 21
 def main(folder: Path) -> tuple[float, float]:
     """Returns how far off the poles (1/s) and the goal (m) are."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
+    Parser(multibody).AddModels(str(shipped_model("two_link_arm.urdf")))
     multibody.Finalize()
     model = RobotModel.from_multibody(
         multibody,

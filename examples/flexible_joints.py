@@ -19,13 +19,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.shipped import FOLDER
 
 
 def main(folder: Path) -> float:
     """Returns the largest distance of an error from its prediction, in m, rad and N."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
+    Parser(multibody).AddModels(str(dd.shipped_model("seven_joint_arm.urdf")))
     multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
     model = dd.RobotModel.from_multibody(

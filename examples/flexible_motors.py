@@ -21,7 +21,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.shipped import FOLDER
 
 SPRINGS = dd.FlexibleJoints(stiffness=[2e4, 2e4, 1e4, 1e4, 5e3, 2e3, 2e3])
 MOTORS = dd.DcMotors(torque_constant=0.1, inductance=2e-3, resistance=0.5)
@@ -30,7 +29,7 @@ MOTORS = dd.DcMotors(torque_constant=0.1, inductance=2e-3, resistance=0.5)
 def main(folder: Path) -> tuple[float, float]:
     """Returns the largest distances from the prediction: of a position, and of the force in N."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
+    Parser(multibody).AddModels(str(dd.shipped_model("seven_joint_arm.urdf")))
     multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
     model = dd.RobotModel.from_multibody(

@@ -20,7 +20,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.shipped import FOLDER
 
 SERVOS = dd.ElectrohydraulicServos(
     stiffness=1e6, leakage=1e-6, geometry=lambda q: ca.diag(0.05 + 0.02 * ca.sin(q))
@@ -30,7 +29,7 @@ SERVOS = dd.ElectrohydraulicServos(
 def main(folder: Path) -> float:
     """Returns the largest distance of an error from its prediction, in m and N."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
+    Parser(multibody).AddModels(str(dd.shipped_model("two_link_arm.urdf")))
     multibody.Finalize()
     model = dd.RobotModel.from_multibody(
         multibody,

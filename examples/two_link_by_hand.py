@@ -29,15 +29,15 @@ from drake_dae import (
     TrackingController,
     TrackingLaw,
     poles,
+    shipped_model,
 )
-from drake_dae.diagrams.shipped import FOLDER
 
 
 def main(folder: Path) -> tuple[float, float]:
     """Returns the largest distance of position (m) and force (N) from what theory predicts."""
     # The robot: links from a URDF, the tip on the wall x = 1.2.
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "two_link_arm.urdf"))
+    Parser(multibody).AddModels(str(shipped_model("two_link_arm.urdf")))
     multibody.Finalize()
     model = RobotModel.from_multibody(
         multibody,

@@ -17,13 +17,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
-from drake_dae.diagrams.shipped import FOLDER
 
 
 def main(folder: Path) -> tuple[float, float]:
     """Returns the final position error in m and the largest force error in N."""
     multibody = MultibodyPlant(0.0)
-    Parser(multibody).AddModels(str(FOLDER / "models" / "seven_joint_arm.urdf"))
+    Parser(multibody).AddModels(str(dd.shipped_model("seven_joint_arm.urdf")))
     multibody.WeldFrames(multibody.world_frame(), multibody.GetFrameByName("base"))
     multibody.Finalize()
     wall = dd.PointOnSurface("tool", dd.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")
