@@ -311,12 +311,11 @@ def stack_references(
 def _at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
     """An expression of the time alone as a function that is called with a float."""
     function = TracedFunction("reference", {"time": time}, {"R": rows})
-    moment = np.zeros(1)
+    (moment,), (value,) = function.arguments, function.outputs
 
     def evaluate(time: float) -> FloatArray:
         moment[0] = time
-        value = function.evaluate(moment)[0]
-        if not function.is_finite:
+        if not function.run():
             raise _not_finite(time, value)
         return value
 

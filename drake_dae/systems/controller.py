@@ -99,6 +99,7 @@ class TrackingController(ParameterizedSystem):
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         if law.integral.outputs:
             sources = self._add_integrals(integral_limits, sample_period)
+        self._takes_state_and_reference = len(self._evaluators) == 2 and self._exogenous is None
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
@@ -202,8 +203,18 @@ class TrackingController(ParameterizedSystem):
         output.SetFromVector(self._evaluate(context)[1])
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
+        function = self.law.function
+        if self._takes_state_and_reference:  # The same without a call more, where it has values.
+            of_state, of_reference = self._evaluators
+            state, reference = of_state(context), of_reference(context)
+            x, r, parameters = function.arguments
+            x[...] = state
+            r[...] = reference
+            parameters[...] = context.get_numeric_parameter(0).value()
+            if function.run():
+                return function.outputs
         inputs = [evaluate(context) for evaluate in self._evaluators]
-        return self._checked(self.law.function, context, *inputs)
+        return self._checked(function, context, *inputs)
 
     def _integrals(self, context: Context) -> FloatArray:
         if self.sample_period:

@@ -206,7 +206,18 @@ class DaePlant(ParameterizedSystem):
         return state
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        derivatives.SetFromVector(self._evaluate(self.dynamics, context, self._is_controlled))
+        # What an integrator calls most: without a call more where the values are of use.
+        dynamics = self.dynamics
+        if self._is_controlled and self._exogenous is None:
+            control = self._control_port.Eval(context)
+            x, u, parameters = dynamics.arguments
+            x[...] = context.get_continuous_state_vector().value()
+            u[...] = control
+            parameters[...] = context.get_numeric_parameter(0).value()
+            if dynamics.run():
+                derivatives.SetFromVector(dynamics.outputs[0])
+                return
+        derivatives.SetFromVector(self._evaluate(dynamics, context, self._is_controlled))
 
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool

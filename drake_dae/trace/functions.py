@@ -72,6 +72,8 @@ class TracedFunction:
             enough, for a caller that may know better ones; see `is_regular`.
 
     Attributes:
+        arguments: The arrays that a call reads, for `run`.
+        outputs: The arrays that a call writes.
         num_operations: How many scalar operations one call takes.
         is_machine_code: Whether calls run machine code by now.
     """
@@ -109,8 +111,8 @@ class TracedFunction:
             {"cse": False},
         )
         self.num_operations = int(self._function.n_instructions())
-        self._inputs = tuple(np.zeros(symbol.numel()) for symbol in inputs.values())
-        self._num_inputs = len(self._inputs)
+        self.arguments = tuple(np.zeros(symbol.numel()) for symbol in inputs.values())
+        self._num_inputs = len(self.arguments)
         self._results = results = [np.zeros(e.shape, order="F") for e in expressions]
         self._bind(self._function)
         self._compiled = compiled
@@ -118,7 +120,7 @@ class TracedFunction:
         self._calls_left = self._attempts[0].calls if self._attempts else 0
         results, checks = results[: len(dense)], results[len(dense) :]
         self._pivot, self._finite, self._valid = (checks[i].reshape(-1) for i in (0, 1, -1))
-        self._outputs = tuple(
+        self.outputs = tuple(
             array.reshape(-1, order="F") if array.shape[1] == 1 else array for array in results
         )
 
@@ -126,7 +128,7 @@ class TracedFunction:
         """Makes a function the one that is called, on the same arrays."""
         self.is_machine_code = function is not self._function
         self._buffer, self._evaluate = function.buffer()
-        for index, array in enumerate(self._inputs):
+        for index, array in enumerate(self.arguments):
             self._buffer.set_arg(index, array.data)
         for index, array in enumerate(self._results):
             self._buffer.set_res(index, array.reshape(-1, order="F").data)
@@ -155,25 +157,33 @@ class TracedFunction:
         if len(arguments) != self._num_inputs:
             raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
         # zip(..., strict=True) and [:] would take as long as the function.
-        inputs, index = self._inputs, 0
+        inputs, index = self.arguments, 0
         for given in arguments:
             inputs[index][...] = given
             index += 1  # noqa: SIM113 - enumerate takes longer.
+        self.run()
+        return self.outputs
+
+    def run(self) -> bool:
+        """Calls the function on its `arguments`; returns whether its `outputs` are of use.
+
+        That is the call with the least around it, for who writes the arguments in place.
+        """
         if self._calls_left:
             self._calls_left -= 1
             if not self._calls_left:
                 self._seek()
         self._evaluate()
-        return self._outputs
+        return isfinite(self._valid[0])
 
     def nowhere(self) -> tuple[FloatArray, ...]:
         """What stands for the outputs where the function has no value: fresh arrays of nan."""
-        return tuple(np.full_like(output, np.nan) for output in self._outputs)
+        return tuple(np.full_like(output, np.nan) for output in self.outputs)
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """How many entries each input has."""
-        return tuple(array.size for array in self._inputs)
+        return tuple(array.size for array in self.arguments)
 
     @property
     def function(self) -> ca.Function:
@@ -208,7 +218,7 @@ class TracedFunction:
         for fault, limit in ((Fault.INPUT, np.inf), (Fault.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
-                for name, given in zip(self.input_names, self._inputs, strict=True)
+                for name, given in zip(self.input_names, self.arguments, strict=True)
                 if not np.all(np.abs(given) < limit)
             }
             if bad:
@@ -238,16 +248,16 @@ class TracedFunction:
         Raises:
             ModelError: The number of arguments is wrong, or one has a wrong shape or no numbers.
         """
-        if len(arguments) != len(self._inputs):
+        if len(arguments) != len(self.arguments):
             raise ModelError(
-                f"{self.name} takes {len(self._inputs)} arguments "
+                f"{self.name} takes {len(self.arguments)} arguments "
                 f"({', '.join(self.input_names)}), got {len(arguments)}"
             )
         arrays = [
             numbers(f"{self.name}: '{label}'", argument)
             for label, argument in zip(self.input_names, arguments, strict=True)
         ]
-        for label, own, given in zip(self.input_names, self._inputs, arrays, strict=True):
+        for label, own, given in zip(self.input_names, self.arguments, arrays, strict=True):
             if own.size != given.size:
                 raise ModelError(f"{self.name}: '{label}' has size {given.size}, not {own.size}")
             if given.ndim > 1 and given.shape != (own.size, 1):
