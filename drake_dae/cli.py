@@ -208,6 +208,12 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
     )
     study.add_argument("--seed", type=int, default=0, help="of the random values (default: 0)")
     study.add_argument(
+        "--rollout",
+        action="store_true",
+        help="run without Drake's Simulator, the whole loop as one function, as `simulate "
+        "--rollout` does: many times as fast",
+    )
+    study.add_argument(
         "--workers", type=int, metavar="COUNT", help="how many processes (default: one per core)"
     )
     study.add_argument(

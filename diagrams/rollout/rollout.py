@@ -91,16 +91,40 @@ def rollout(
     Warns:
         MachineCodeWarning: Machine code should be made and cannot be.
     """
+    return run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
+
+
+def run_loop(
+    loop: ClosedLoop,
+    starts: ArrayLike,
+    parameters: ArrayLike | None,
+    times: ArrayLike,
+    *,
+    config: SimulatorConfig | None = None,
+    compiled: Compiled | None = None,
+    seeds: Sequence[int] | None = None,
+    lasting: float | None = None,
+) -> list[Rollout]:
+    """`rollout`, where these runs may be some of many.
+
+    Args:
+        lasting: How long all of them last together, in s. Then this alone decides on machine code,
+            not what the cache has: the numbers are the same whenever they are computed. None if
+            these are all.
+    """
     config = config or SimulatorConfig()
     check_config(config)
     choice: Compiled = loop.plant.dae.compiled if compiled is None else compiled
     check_choice("rollout", choice)
     moments = _times(times)
-    functions = _kept(loop, "functions", lambda: loop_functions(loop))
+    functions = functions_of(loop)
     scale = np.concatenate([loop.plant.dae.scale, np.ones(functions.num_lags)])
     settings = Settings.of(config, scale)
     problems = _problems(functions, starts, parameters, moments, seeds)
-    code = _machine_code(functions, choice, settings, len(problems) * np.ptp(moments))
+    if lasting is None:
+        code = _machine_code(functions, choice, settings, len(problems) * np.ptp(moments))
+    else:
+        code = _machine_code(functions, choice, settings, lasting, look=False)
     # Machine code lets go of Python's lock: threads are enough for all cores.
     if code is None:
         fused = _kept(loop, "fused", lambda: Fused(functions))
@@ -144,6 +168,15 @@ def start_values(loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatA
     law = controller.GetMyContextFromRoot(context)
     values = [block.get_numeric_parameter(0).value() for block in (own, law)]
     return np.concatenate(parts), np.concatenate(values)
+
+
+def functions_of(loop: ClosedLoop) -> LoopFunctions:
+    """The functions of a closed loop, traced once.
+
+    Raises:
+        ModelError: The loop has what no rollout has.
+    """
+    return _kept(loop, "functions", lambda: loop_functions(loop))
 
 
 def _kept(loop: ClosedLoop, name: str, make: Callable[[], T]) -> T:
@@ -226,9 +259,16 @@ def _project(
 
 
 def _machine_code(
-    functions: LoopFunctions, compiled: Compiled, settings: Settings, seconds: float
+    functions: LoopFunctions,
+    compiled: Compiled,
+    settings: Settings,
+    seconds: float,
+    look: bool = True,
 ) -> machine.Library | None:
-    """The closed loop as machine code, by the choice and by what its runs take without."""
+    """The closed loop as machine code, by the choice and by what its runs take without.
+
+    Where it does not pay to make it, the cache is looked into if `look` says so.
+    """
     if compiled is False:
         return None
     kept: machine.Library | None = functions.loop.memory.get("library")
@@ -241,6 +281,8 @@ def _machine_code(
             stages = int(len(settings.tableau.b) / settings.longest)
         pays = attempts("auto", functions.num_operations)
         make = any(each.make and stages * seconds >= each.calls for each in pays)
+        if not (make or look):
+            return None
     found = machine.load(functions, compiled, make)
     if found is not None:
         functions.loop.memory["library"] = found

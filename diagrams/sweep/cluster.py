@@ -1,7 +1,7 @@
 """A Dask cluster that simulates the runs of a study."""
 
 import json
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import CancelledError
 from typing import Any
 
@@ -44,16 +44,20 @@ class Cluster:
             raise ModelError(f"the Dask cluster at {address} has no workers; start some")
 
     def run(
-        self, base: Mapping[str, Any], batches: Sequence[Batch]
+        self, settings: Sequence[Any], batches: Sequence[Batch]
     ) -> Generator[list[RunResult], None, None]:
         """The results of all runs, as their batches come.
 
         A batch whose worker dies is given out again; where several die of it, its runs one by one.
 
+        Args:
+            settings: The arguments of `Runner`, as plain data.
+            batches: The runs.
+
         Raises:
             ModelError: The scheduler is gone, or a worker has another version of the library.
         """
-        text = json.dumps(base)
+        text = json.dumps(settings)
 
         def submit(batch: Batch) -> Any:
             future = self._client.submit(run_batch, text, list(batch), pure=False)

@@ -23,12 +23,16 @@ FORMAT = 1
 
 
 def study_head(
-    version: str, scenario: Mapping[str, Any], variations: Sequence[Variation]
+    version: str,
+    scenario: Mapping[str, Any],
+    variations: Sequence[Variation],
+    rollout: bool = False,
 ) -> dict[str, Any]:
     """The first line of a study's file: equal for equal studies."""
     return {
         "study": FORMAT,
         "drake_dae": version,
+        **({"rollout": True} if rollout else {}),
         "scenario": dict(scenario),
         "variations": list(variations),
     }
@@ -55,8 +59,7 @@ class Journal:
         """
         found = list(results)
         try:
-            for result in found:
-                _write(self._file, _line(result.to_dict()))
+            _write(self._file, b"".join(_line(result.to_dict()) for result in found))
             os.fsync(self._file)
         except OSError as error:
             raise ModelError(
@@ -165,9 +168,9 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     """What two heads of studies have different, a few of it, in words."""
-    told = []
-    for key in ("drake_dae", "scenario"):
-        told += list(_different(key if key == "drake_dae" else "", there.get(key), here.get(key)))
+    told = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
+    told += list(_different("rollout", there.get("rollout", False), here.get("rollout", False)))
+    told += list(_different("", there.get("scenario"), here.get("scenario")))
     old, new = there.get("variations", []), here["variations"]
     if len(old) != len(new):
         told.append(f"{len(old)} runs there, {len(new)} here")

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections import deque
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import suppress
@@ -23,6 +24,9 @@ from drake_dae.simulation.interruption import ENDING_SIGNALS
 
 BUILDS = 200
 """A process that has built so many loops is replaced: Drake does not free all of each."""
+
+PERIOD = 0.02
+"""Results are told this often, in s: those of short runs are synced to the disk together."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -38,12 +42,12 @@ def cores() -> int:
 
 
 def run_in_processes(
-    base: Mapping[str, Any], batches: Sequence[Batch], workers: int
+    settings: Sequence[Any], batches: Sequence[Batch], workers: int
 ) -> Generator[list[RunResult], None, None]:
     """The results of all runs, as they come, whoever is first.
 
     Args:
-        base: The plain data of the study's scenario.
+        settings: The arguments of `Runner`, as plain data.
         batches: The runs.
         workers: How many processes.
 
@@ -52,15 +56,17 @@ def run_in_processes(
     """
     waiting, workers = deque(batches), min(workers, len(batches))
     running: list[_Worker] = []
+    found: list[RunResult] = []
+    told = -PERIOD
     with selectors.DefaultSelector() as selector:
         try:
             while waiting or running:
                 while waiting and len(running) < workers:
-                    worker = _Worker(base)
+                    worker = _Worker(settings)
                     running.append(worker)
                     selector.register(worker.output, selectors.EVENT_READ, worker)
-                found = []
-                for key, _ in selector.select():
+                due = told + PERIOD - time.monotonic()
+                for key, _ in selector.select(max(0.0, due) if found else None):
                     worker = key.data
                     is_open = worker.read()
                     found += worker.take()
@@ -75,8 +81,10 @@ def run_in_processes(
                         worker.give(waiting.popleft())
                     elif worker.is_idle:
                         worker.dismiss()
-                if found:
+                if found and (time.monotonic() >= told + PERIOD or not (waiting or running)):
+                    told = time.monotonic()
                     yield found
+                    found = []
         finally:
             for worker in running:
                 worker.kill()
@@ -92,7 +100,7 @@ class _Worker:
         builds: How many loops it has built.
     """
 
-    def __init__(self, base: Mapping[str, Any]) -> None:
+    def __init__(self, settings: Sequence[Any]) -> None:
         code = (
             f"import sys; sys.path[:] = {sys.path!r}; "
             f"from {__name__} import serve; sys.exit(serve())"
@@ -113,7 +121,7 @@ class _Worker:
         self._is_ready = False
         self._text = b""
         self._results: list[RunResult] = []
-        self._send(base)
+        self._send(settings)
 
     def give(self, batch: Batch) -> None:
         """Gives it runs."""
@@ -199,7 +207,7 @@ def serve() -> int:
         results.flush()
 
     try:
-        runner = Runner(json.loads(sys.stdin.buffer.readline()))
+        runner = Runner(*json.loads(sys.stdin.buffer.readline()))
         tell({"builds": 0})
         for line in sys.stdin.buffer:
             for result in runner.run_all(json.loads(line)):

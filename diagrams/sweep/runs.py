@@ -10,6 +10,8 @@ from functools import lru_cache
 from threading import Lock
 from typing import Any, Self, cast
 
+from pydrake.systems.framework import Context
+
 from drake_dae.arrays import brief
 from drake_dae.diagrams.build import build_loop, start_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
@@ -20,10 +22,12 @@ from drake_dae.errors import (
     AssumptionError,
     DrakeDaeError,
     InconsistentStateError,
+    ModelError,
     ScenarioError,
     SimulationError,
 )
 from drake_dae.simulation.figures import exceeded, run_figures
+from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.systems.robot_plant import RobotPlant
@@ -121,10 +125,13 @@ class Runner:
 
     Args:
         base: The plain data of the study's scenario.
+        lasting: How long runs of one structure last together, in s, if they are rollouts; None if
+            Drake's Simulator runs them.
     """
 
-    def __init__(self, base: Mapping[str, Any]) -> None:
+    def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
         self._base = base
+        self._lasting = lasting
         self._key = ""
         self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
@@ -156,11 +163,19 @@ class Runner:
         """
         try:
             data = varied_data(self._base, variation)
-            start_scenario(read_scenario(data), self.loop(data))
+            loop = self.loop(data)
+            start_scenario(read_scenario(data), loop)
         except ScenarioError as error:
             return None if _is_about_states(error) else error
         except DrakeDaeError:
             return None
+        if self._lasting is not None:
+            from drake_dae.diagrams.rollout.rollout import functions_of
+
+            try:
+                functions_of(loop)
+            except ModelError as error:
+                return ScenarioError(("", str(error)))
         return None
 
     def run_all(self, batch: Batch) -> Iterator[RunResult]:
@@ -183,7 +198,7 @@ class Runner:
                 loop = self.loop(data)
         except DrakeDaeError as error:
             return RunResult(number, Outcome.REFUSED, str(error))
-        return _simulated(number, scenario, loop)
+        return _simulated(number, scenario, loop, self._lasting)
 
 
 def _is_about_states(error: BaseException | None) -> bool:
@@ -195,30 +210,44 @@ def _is_about_states(error: BaseException | None) -> bool:
     return False
 
 
-def _simulated(number: int, scenario: Scenario, loop: ClosedLoop) -> RunResult:
+def _simulated(
+    number: int, scenario: Scenario, loop: ClosedLoop, lasting: float | None
+) -> RunResult:
     """What a run comes to, from a new context of the loop."""
-    outcome, reason = Outcome.FINISHED, ""
     try:
         context = start_scenario(scenario, loop)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if lasting is None:
+                record, steps, failure = _stepped(scenario, loop, context)
+            else:
+                from drake_dae.diagrams.rollout.scenario_run import roll_scenario
+
+                found = roll_scenario(scenario, loop, context, lasting)
+                record, steps, failure = found.record, found.steps, found.failure
     except DrakeDaeError as error:
         outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
         return RunResult(number, outcome, str(error))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-        except InconsistentStateError as error:
-            return RunResult(number, Outcome.NO_START, str(error))
-        except SimulationError as error:
-            outcome, reason = Outcome.FAILED, str(error)
-        else:
-            if run.interrupted:
-                raise KeyboardInterrupt(run.interrupted)
-    record, limits = loop.record(context), Limits.of(cast(RobotPlant, loop.plant).model)
-    figures = run_figures(record, limits)
-    if outcome is Outcome.FINISHED:
-        figures["steps"] = float(run.steps)
-    return RunResult(number, outcome, reason, figures, tuple(exceeded(record, limits)))
+    limits = Limits.of(cast(RobotPlant, loop.plant).model)
+    figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
+    if failure is not None:
+        return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
+    return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)
+
+
+def _stepped(
+    scenario: Scenario, loop: ClosedLoop, context: Context
+) -> tuple[Record, int, SimulationError | None]:
+    """What Drake's Simulator makes of a run: its record, how many steps it took, why it failed."""
+    steps, failure = 0, None
+    try:
+        run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+        steps = run.steps
+        if run.interrupted:
+            raise KeyboardInterrupt(run.interrupted)
+    except SimulationError as error:
+        failure = error
+    return loop.record(context), steps, failure
 
 
 _ALONE = Lock()
@@ -229,7 +258,7 @@ def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
     """Simulates runs in this process, for a cluster's workers.
 
     Args:
-        base: The scenario's plain data as JSON.
+        base: The arguments of `Runner` as JSON.
         batch: The runs.
     """
     with _ALONE:
@@ -238,7 +267,22 @@ def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
 
 @lru_cache(maxsize=1)
 def _runner(base: str) -> Runner:
-    return Runner(json.loads(base))
+    return Runner(*json.loads(base))
+
+
+def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
+    """How long the runs of one structure last together on average, in s of their time.
+
+    Args:
+        base: The plain data of the study's scenario.
+        variations: All runs of the study.
+    """
+    total, keys = 0.0, set()
+    for variation in variations:
+        data = varied_data(base, variation)
+        total += data["duration"]
+        keys.add(structure_key(data, base))
+    return total / len(keys)
 
 
 def batches(

@@ -9,11 +9,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
-from math import ceil
 from pathlib import Path
 from typing import TextIO
 
-import numpy as np
 from pydrake.systems.framework import Context
 
 import drake_dae
@@ -31,9 +29,6 @@ from drake_dae.simulation.run_folder import FILES, MARK, PART, SCENARIO, run_fol
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 from drake_dae.simulation.view import RobotBlock, start_meshcat
-
-ROWS = 1000
-"""So many rows has the record of a rollout under error control, after the first."""
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -101,21 +96,14 @@ def _roll(run: _Run) -> RunStatistics:
     Raises:
         SimulationError: The run cannot go on.
     """
-    from drake_dae.diagrams.rollout.rollout import rollout, start_values
+    from drake_dae.diagrams.rollout.scenario_run import roll_scenario
 
-    scenario, config = run.scenario, run.scenario.integrator
-    rows = ROWS
-    if not config.use_error_control:
-        rows = max(1, ceil(scenario.duration / config.max_step_size - 0.01))
-    times = config.start_time + np.linspace(0.0, scenario.duration, rows + 1)
-    seeds = [scenario.force.seed] if scenario.force.is_measured else None
-    start, parameters = start_values(run.loop, run.context)
     began = time.perf_counter()
-    (found,) = rollout(run.loop, start, parameters, times, config=config, seeds=seeds)
+    found = roll_scenario(run.scenario, run.loop, run.context)
     run.record = found.record
     if found.failure is not None:
         raise found.failure
-    return RunStatistics(scenario.duration, time.perf_counter() - began, found.steps, None)
+    return RunStatistics(run.scenario.duration, time.perf_counter() - began, found.steps, None)
 
 
 def _run(

@@ -34,6 +34,7 @@ def run_command(options: argparse.Namespace) -> int:
             workers=options.workers,
             cluster=options.cluster,
             progress=True,
+            rollout=options.rollout,
         )
     except KeyboardInterrupt:
         print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)

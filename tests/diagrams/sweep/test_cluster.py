@@ -16,9 +16,9 @@ VARIATIONS = dd.grid_variations(
 
 @pytest.mark.slow
 def test_two_workers_give_the_table_of_processes(tmp_path):
+    """Whoever runs them; and what processes began, a cluster ends."""
     distributed = pytest.importorskip("distributed")
     chosen = scenario("two_link_wall", "duration=0.5", "compiled=false")
-    here = dd.sweep(chosen, VARIATIONS, tmp_path / "here.jsonl", workers=2)
     with distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
@@ -27,13 +27,16 @@ def test_two_workers_give_the_table_of_processes(tmp_path):
         scheduler_kwargs={"dashboard": False},
     ) as cluster:
         address = cluster.scheduler_address
-        there = dd.sweep(chosen, VARIATIONS, tmp_path / "there.jsonl", cluster=address)
-        # And what processes began, a cluster ends.
-        lines = (tmp_path / "here.jsonl").read_bytes().splitlines(keepends=True)
-        (tmp_path / "part.jsonl").write_bytes(b"".join(lines[:4]))
-        both = dd.sweep(chosen, VARIATIONS, tmp_path / "part.jsonl", cluster=address)
-    assert there.table() == here.table() == both.table()
-    assert there.table()["outcome"] == ["finished"] * 6 + ["no start"] * 2
+        for rollout in (False, True):
+            folder = tmp_path / f"{rollout}"
+            here = dd.sweep(chosen, VARIATIONS, folder / "here.jsonl", workers=2, rollout=rollout)
+            lines = (folder / "here.jsonl").read_bytes().splitlines(keepends=True)
+            (folder / "part.jsonl").write_bytes(b"".join(lines[:4]))
+            for name in ("there", "part"):
+                file = folder / f"{name}.jsonl"
+                there = dd.sweep(chosen, VARIATIONS, file, cluster=address, rollout=rollout)
+                assert there.table() == here.table()
+            assert there.table()["outcome"] == ["finished"] * 6 + ["no start"] * 2
 
 
 @pytest.mark.parametrize("address", ["", "nowhere", "127.0.0.1:1", "tcp://127.0.0.1:1", "x://y"])

@@ -5,7 +5,14 @@ import pytest
 from runs import run_scenario, scenario
 
 from drake_dae.diagrams.scenario import read_scenario, scenario_data, varied_data
-from drake_dae.diagrams.sweep.runs import Outcome, Runner, RunResult, batches, structure_key
+from drake_dae.diagrams.sweep.runs import (
+    Outcome,
+    Runner,
+    RunResult,
+    batches,
+    lasting,
+    structure_key,
+)
 from drake_dae.simulation.figures import run_figures
 from drake_dae.simulation.summary import Limits
 
@@ -95,7 +102,9 @@ def test_another_structure_is_built():
 
 
 @pytest.mark.slow
-def test_what_goes_wrong_is_an_outcome_with_its_reason():
+@pytest.mark.parametrize("total", [None, 1.0])
+def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
+    """By Drake's Simulator, and by rollouts."""
     base = scenario_data(scenario("two_link_wall", *SHORT))
     far = {"references.0.offset": 1.0, "references.0.amplitudes": [0.9], "duration": 2.0}
     cases = [
@@ -110,7 +119,7 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason():
         (far, Outcome.FAILED, "the simulation cannot go on at t = "),
         ({}, Outcome.FINISHED, ""),
     ]
-    runner = Runner(base)
+    runner = Runner(base, total)
     results = list(runner.run_all([(i, changes) for i, (changes, _, _) in enumerate(cases)]))
     assert runner.builds == 6  # A structure that is refused twice was sought once.
     for (_, outcome, words), result in zip(cases, results, strict=True):
@@ -120,6 +129,19 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason():
         assert RunResult.from_dict(result.to_dict()) == result
         if outcome is Outcome.FAILED:
             assert 0.0 < result.figures["end [s]"] < 2.0
+
+
+def test_what_no_rollout_has_is_told_with_a_remedy():
+    base = scenario_data(scenario("two_link_wall", *SHORT, "sampling={period: 0.001}"))
+    assert Runner(base).why_not({}) is None
+    assert "run the loop by simulate" in str(Runner(base, 1.0).why_not({}))
+
+
+def test_how_long_runs_of_one_structure_last():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    walls = [{"constraints.0.surface.point": [x, 0.0, 0.0]} for x in (1.2, 1.25)]
+    starts = [{"start.errors.tool.z": z, "duration": 0.6} for z in (0.0, 0.01)]
+    assert lasting(base, [*starts, *walls]) == pytest.approx((2 * 0.6 + 2 * 0.3) / 2)
 
 
 def test_batches_have_one_structure_and_all_runs():

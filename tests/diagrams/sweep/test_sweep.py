@@ -36,6 +36,28 @@ def study(tmp_path_factory):
     return dd.sweep(chosen(), VARIATIONS, tmp_path_factory.mktemp("one") / "runs.jsonl", workers=1)
 
 
+@pytest.fixture(scope="module")
+def rolled(tmp_path_factory):
+    """The same by rollouts."""
+    file = tmp_path_factory.mktemp("rolled") / "runs.jsonl"
+    return dd.sweep(chosen(), VARIATIONS, file, workers=1, rollout=True)
+
+
+@pytest.mark.slow
+def test_rollouts_give_the_figures_of_drake(study, rolled):
+    """To what an accuracy of 1e-8 leaves; largest values to what lies between rows, 1/1000 apart.
+
+    Residuals of Drake are those before a projection; how many steps there are is its own affair.
+    """
+    assert rolled.figures == study.figures
+    assert rolled.table()["outcome"] == study.table()["outcome"]
+    for name in set(study.figures) - {"steps", "largest residual"}:
+        found, wanted = rolled.values(name), study.values(name)
+        unit = max(1.0, np.max(np.abs(wanted)))
+        tolerance = 1e-7 if name.startswith(("final", "end")) else 1e-3
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=tolerance * unit, err_msg=name)
+
+
 @pytest.mark.slow
 def test_the_number_of_processes_changes_nothing(study, tmp_path):
     other = dd.sweep(chosen(), VARIATIONS, tmp_path / "runs.jsonl", workers=3)
@@ -75,10 +97,17 @@ def command(folder, *more, keys=KEYS):
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_it_continues_there_to_the_same_table(study, tmp_path):
+@pytest.mark.parametrize(
+    ("kills", "options"), [pytest.param((2, 7, 13), (), id="drake"), ((9,), ("--rollout",))]
+)
+def test_killed_in_the_middle_it_continues_there_to_the_same_table(
+    kills, options, request, tmp_path
+):
+    study = request.getfixturevalue("rolled" if options else "study")
     folder, file = tmp_path / "study", tmp_path / "study" / "runs.jsonl"
-    for wanted in (2, 7, 13):
-        process = subprocess.Popen(command(folder), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    call = command(folder, *options)
+    for wanted in kills:
+        process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         wait_for(wanted, file, process)
         process.send_signal(signal.SIGKILL)
         process.communicate()
@@ -86,13 +115,15 @@ def test_killed_in_the_middle_it_continues_there_to_the_same_table(study, tmp_pa
         with open(file, "ab") as broken:
             broken.write(b'{"run":3,"outcome":"fini')
     before = file.read_bytes().removesuffix(b'{"run":3,"outcome":"fini')
-    assert 13 <= before.count(b"\n") - 1 < COUNT
-    done = subprocess.run(command(folder), check=True, capture_output=True, text=True)
+    assert kills[-1] <= before.count(b"\n") - 1 < COUNT
+    done = subprocess.run(call, check=True, capture_output=True, text=True)
     assert file.read_bytes().startswith(before)
     assert lines(file) == COUNT
     assert done.stdout.startswith(f"{COUNT} runs: {COUNT} finished\n")
-    again = dd.sweep(chosen(), VARIATIONS, file)
+    again = dd.sweep(chosen(), VARIATIONS, file, rollout=bool(options))
     assert again.table() == study.table()
+    with pytest.raises(ModelError, match="another study: rollout = "):
+        dd.sweep(chosen(), VARIATIONS, file, rollout=not options)
     with open(folder / "runs.csv", newline="", encoding="utf-8") as table:
         head, *rows = csv.reader(table)
     assert head == list(study.table())
