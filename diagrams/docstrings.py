@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
 
 
@@ -14,8 +14,7 @@ def introduction(docstring: str) -> str:
     ].strip()
 
 
-@cache
-def attribute_texts(source: type) -> Mapping[str, str]:
+def attribute_texts(source: type) -> dict[str, str]:
     """Name of an attribute -> what the docstring of the class, or of one of its bases, says."""
     return {
         name: text

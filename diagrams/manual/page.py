@@ -1,5 +1,6 @@
 """The page of all keys of a scenario, in Markdown."""
 
+import re
 from typing import Any
 
 from drake_dae.diagrams.manual.entries import NOTHING, Entry, Key, entries
@@ -33,7 +34,8 @@ def _section(entry: Entry) -> str:
     paragraphs = entry.text.split("\n\n")
     # What is told by a formula is for readers of the code.
     end = next((i for i, one in enumerate(paragraphs) if one.endswith((":", ","))), None)
-    text = " ".join(" ".join(paragraphs[:end]).split())
+    text = _one_line(" ".join(paragraphs if end is None else paragraphs[: max(end, 1)]))
+    text = text.rstrip(":,.") + "."
     if not entry.keys:
         return f"## {entry.title}\n\n{where}{text} It has no keys.\n"
     rows = ["| Key | Takes | Unit | Default | Meaning |", "|---|---|---|---|---|"]
@@ -43,7 +45,7 @@ def _section(entry: Entry) -> str:
 
 
 def _row(key: Key) -> str:
-    text = " ".join(key.text.split("\n\n")[0].split())
+    text = _one_line(key.text.split("\n\n")[0])
     cells = f"`{key.name}`", key.takes, key.unit, _default(key.default), text
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
@@ -55,3 +57,8 @@ def _default(value: Any) -> str:
         return "nothing"
     text = dump_yaml(value, on_one_line=True).removesuffix("...\n")
     return f"`{text.strip()}`"
+
+
+def _one_line(text: str) -> str:
+    """A text of a docstring on one line, in the words of YAML."""
+    return re.sub(r"\bNone\b", "nothing", " ".join(text.split()))
