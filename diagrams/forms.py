@@ -16,6 +16,7 @@ import pydantic
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drake_dae.arrays import brief
+from drake_dae.diagrams.docstrings import attribute_texts, introduction
 from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import ScenarioError
 
@@ -34,19 +35,30 @@ class Form:
         defaults: Name of a field -> value where data leave it out, if not that of the class.
         tag: The tag by which data choose the class, "!Sphere"; empty if there is no choice.
         needs_tag: Whether data without a tag mean another class.
+        texts: Name of a field -> what it means, where the docstring of the class does not say it.
     """
 
     written: Mapping[Any, Any] = field(default_factory=dict)
     defaults: Mapping[str, Any] = field(default_factory=dict)
     tag: str = ""
     needs_tag: bool = False
+    texts: Mapping[str, str] = field(default_factory=dict)
+
+    def __get_pydantic_json_schema__(
+        self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        schema = handler(source)
+        return {**schema, "description": introduction(schema.get("description", ""))}
 
     def __get_pydantic_core_schema__(
         self, source: type[Any], handler: pydantic.GetCoreSchemaHandler
     ) -> CoreSchema:
+        texts = {**attribute_texts(source), **self.texts}
         entries = {
             name: core_schema.typed_dict_field(
-                handler.generate_schema(self._type_in_data(hint)),
+                handler.generate_schema(
+                    Annotated[self._type_in_data(hint), _Explained(texts.get(name, ""))]
+                ),
                 required=required and name not in self.defaults,
             )
             for name, hint, required in _fields_of(source)
@@ -85,6 +97,20 @@ class Form:
                 return form | None if type(None) in members else form
         # In data a tuple is a list.
         return Annotated[hint, pydantic.Strict(False)] if get_origin(hint) is tuple else hint
+
+
+@dataclass(frozen=True)
+class _Explained:
+    """Puts what a field means before what the JSON Schema says of its type."""
+
+    text: str
+
+    def __get_pydantic_json_schema__(
+        self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        schema = dict(handler(source))
+        told = "\n\n".join(filter(None, (self.text, schema.get("description"))))
+        return {**schema, "description": told} if told else schema
 
 
 def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, bool]]:

@@ -99,6 +99,18 @@ def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
 
 
 _INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
+_INTEGRATOR_TEXTS = {
+    "integration_scheme": "One of Drake's: runge_kutta5, runge_kutta3, implicit_euler, radau3, ...",
+    "max_step_size": "The longest step, in s; with fixed steps the step.",
+    "accuracy": "The relative error of a step that error control allows.",
+    "use_error_control": "Whether the steps have the length that the accuracy needs, or all "
+    "max_step_size.",
+    "start_time": "When the run begins, in s.",
+    "target_realtime_rate": "How many seconds pass in the run per second of the clock; 0 is as "
+    "fast as it goes.",
+    "publish_every_time_step": "Of Drake, which is about to remove it; the record has every step "
+    "without it.",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +181,9 @@ class Scenario:
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
     integrator: Annotated[
-        SimulatorConfig, Form(defaults=_INTEGRATOR), AfterValidator(_checked(check_config))
+        SimulatorConfig,
+        Form(defaults=_INTEGRATOR, texts=_INTEGRATOR_TEXTS),
+        AfterValidator(_checked(check_config)),
     ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
     write: parts.Write = field(default_factory=parts.Write)
     compiled: Compiled = "auto"

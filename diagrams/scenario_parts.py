@@ -42,7 +42,12 @@ def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
 
 @dataclass(frozen=True)
 class Pose:
-    """A position in m, and roll, pitch and yaw in degrees, as in Drake's model directives."""
+    """Where a frame stands in another one, as in Drake's model directives.
+
+    Attributes:
+        translation: Its origin, m.
+        rpy_deg: Roll, pitch and yaw, in degrees.
+    """
 
     translation: Triple = (0.0, 0.0, 0.0)
     rpy_deg: Triple = (0.0, 0.0, 0.0)
@@ -140,7 +145,14 @@ class Robot:
 
 @dataclass(frozen=True)
 class WeldedFrames(Written[contact.Constraint]):
-    """`robots.contact.WeldedFrames`, its pose by angles."""
+    """Frame B keeps a pose in frame A: `robots.contact.WeldedFrames`, its pose by angles.
+
+    Attributes:
+        frame_a: Name of frame A; "world" holds B in place.
+        frame_b: Name of frame B, on another body.
+        pose: The pose of B in A; by default the frames coincide.
+        name: The name of the constraint, before those of its forces and its parameter.
+    """
 
     frame_a: str
     frame_b: str
@@ -155,7 +167,11 @@ class WeldedFrames(Written[contact.Constraint]):
 
 @dataclass(frozen=True)
 class SurfaceCoordinates(Written[outputs.PositionOutput]):
-    """`robots.outputs.SurfaceCoordinates` of the constraint with a name."""
+    """The coordinates along a constraint: `robots.outputs.SurfaceCoordinates`.
+
+    Attributes:
+        constraint: The name of a constraint with coordinates, as a PointOnSurface on a !Plane.
+    """
 
     constraint: str
 
@@ -186,8 +202,8 @@ class MeasuredForce:
     Attributes:
         time_constant: The time constant of the sensor's lag, in s; 0 for none.
         sample_period: The time between samples, in s; 0 for none.
-        bias: A constant error in N (N m for a moment), one number for all forces or one each.
-        noise_deviation: The standard deviation of the noise, likewise.
+        bias: A constant error in N or N m, one number for all forces or one each.
+        noise_deviation: The standard deviation of the noise in N or N m, likewise.
         seed: The seed of the noise.
         gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
     """
@@ -218,7 +234,12 @@ class IdealConstraints:
 
 @dataclass(frozen=True)
 class PerOutput:
-    """Numbers for all outputs, or per output name ("*" for all others)."""
+    """Numbers for all outputs, or for each.
+
+    Attributes:
+        all: For every output alike.
+        outputs: Output name -> its numbers; "*" is all others. Not beside `all`.
+    """
 
     all: list[float] = field(default_factory=list)
     outputs: dict[str, list[float]] = field(default_factory=dict)
@@ -230,7 +251,12 @@ class PerOutput:
 
 @dataclass(frozen=True)
 class Poles(PerOutput):
-    """`dae.gains.poles`; complex ones are written as Coefficients."""
+    """Real poles of the errors, a number or mu_i of them; complex ones are Coefficients.
+
+    Attributes:
+        all: The poles of every output, in 1/s.
+        outputs: Output name -> its poles, in 1/s; "*" is all others. Not beside `all`.
+    """
 
     def design(self) -> GainDesign:
         """The design of the gains."""
@@ -239,7 +265,13 @@ class Poles(PerOutput):
 
 @dataclass(frozen=True)
 class Coefficients(PerOutput):
-    """`dae.gains.gain_coefficients`: K_i1, ..., K_i mu_i."""
+    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s.
+
+    Attributes:
+        all: The gains of every output, in 1/s^mu_i, ..., 1/s.
+        outputs: Output name -> its gains, in 1/s^mu_i, ..., 1/s; "*" is all
+            others. Not beside `all`.
+    """
 
     def design(self) -> GainDesign:
         """The design of the gains."""
@@ -248,7 +280,12 @@ class Coefficients(PerOutput):
 
 @dataclass(frozen=True)
 class Matrices:
-    """`dae.gains.gain_matrices`: for each degree, highest first, its Lambda_1, Lambda_2, ..."""
+    """Gains that couple outputs of one degree: `dae.gains.gain_matrices`.
+
+    Attributes:
+        groups: For each degree mu, highest first, its Lambda_1, ..., Lambda_mu, each row by row,
+            in 1/s^mu, ..., 1/s.
+    """
 
     groups: list[list[list[list[float]]]]
 
@@ -271,8 +308,8 @@ class Start:
     Attributes:
         positions: Joint name -> position near which the robot starts, in rad or m; the robot's
             default where not given.
-        errors: Output name -> z - r at the start; 0 where not given. Forces can start off their
-            references where actuators have dynamics.
+        errors: Output name -> z - r at the start, in the output's unit; 0 where not given. Forces
+            can start off their references where actuators have dynamics.
     """
 
     positions: dict[str, float] = field(default_factory=dict)
@@ -281,7 +318,13 @@ class Start:
 
 @dataclass(frozen=True)
 class Write:
-    """What a run leaves in its folder, beside the scenario and the summary."""
+    """What a run leaves in its folder, beside the scenario and the summary.
+
+    Attributes:
+        record: Whether it leaves record.npz, all signals at all times.
+        plots: Whether it leaves plots.
+        animation: Whether it leaves animation.html, which plays in a browser.
+    """
 
     record: bool = True
     plots: bool = True

@@ -132,10 +132,12 @@ def load_yaml(text: str, name: str) -> Any:
         raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
 
 
-def dump_yaml(data: Any) -> str:
+def dump_yaml(data: Any, on_one_line: bool = False) -> str:
     """The text of plain data, which `load_yaml` reads back equal."""
-    text = yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=None, width=100)
-    return str(text)
+    width, flow = (float("inf"), True) if on_one_line else (100, None)
+    return str(
+        yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=width)
+    )
 
 
 def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:

@@ -35,7 +35,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=drake_dae.__version__)
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("list", help="show the shipped scenarios")
+    commands.add_parser("list", help="name the shipped scenarios")
+    shown = commands.add_parser("show", help="print a scenario, to begin one with")
+    shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
+    shown.add_argument("--path", action="store_true", help="print where its file is instead")
+    commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
+    commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
     named = argparse.ArgumentParser(add_help=False)
     named.add_argument(
         "scenario",
@@ -119,7 +124,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _list()
         # What a command needs is loaded with it: Drake alone takes a second.
         ignored: list[type[Warning]] = []
-        if options.command == "cache":
+        if options.command == "show":
+            from drake_dae.commands.show import run_command
+        elif options.command in ("keys", "schema"):
+            from drake_dae.commands.keys import run_command
+        elif options.command == "cache":
             from drake_dae.commands.cache import run_command
         elif options.command == "analyze":
             from drake_dae.commands.analyze import run_command

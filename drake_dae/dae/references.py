@@ -161,7 +161,7 @@ class PointToPointReference(_Expression):
 
     Attributes:
         start: The values before, in the outputs' units, shape (k,), or one number for all.
-        end: The values after, likewise.
+        end: The values after, in the outputs' units, likewise.
         start_time: When the move begins, in s.
         end_time: When the move ends, in s.
         order: How many derivatives are continuous, from 0 to 30; at least mu of the outputs.

@@ -43,9 +43,12 @@ class LoopJoint(Constraint):
         frame_a: Name of frame A, of the parent; "world" is one.
         frame_b: Name of frame B, of the child, on another body.
         axis: The joint's axis, an axis of F and M.
-        point_a, rpy_a: Where F stands in A, m, and by which roll, pitch and yaw it is turned, rad.
-        point_b, rpy_b: The same of M in B.
-        damping: In N m s/rad (N s/m), not negative; the parameter "<name>.damping" if not zero.
+        point_a: Where F stands in A, m, shape (3,).
+        rpy_a: Roll, pitch and yaw by which F is turned in A, rad, shape (3,).
+        point_b: Where M stands in B, m, shape (3,).
+        rpy_b: Roll, pitch and yaw by which M is turned in B, rad, shape (3,).
+        damping: Of the joint, in N m s/rad (N s/m), not negative; the parameter "<name>.damping" if
+            not zero.
         stiffness: Of a spring, in N m/rad (N/m), not negative; the parameter "<name>.stiffness".
         rest: Where the spring is slack, rad (m).
         lower, upper: The limits of c, rad (m); none if None.
