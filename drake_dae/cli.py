@@ -64,12 +64,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
     )
     run.add_argument(
+        "--open", action="store_true", help="open the animation in a browser at the end"
+    )
+    run.add_argument(
         "--rollout",
         action="store_true",
         help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
         "fast where it is machine code, twice as fast where not; the record has every fixed "
         "step, or 1000 rows under error control",
     )
+    shown = commands.add_parser("view", help="open the animation of a run in the browser")
+    shown.add_argument("folder", type=Path, help="the folder of the run")
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -107,7 +112,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _list()
         # What a command needs is loaded with it: Drake alone takes a second.
         ignored: list[type[Warning]] = []
-        if options.command == "cache":
+        if options.command == "view":
+            from drake_dae.commands.view import run_command
+        elif options.command == "cache":
             from drake_dae.commands.cache import run_command
         elif options.command == "analyze":
             from drake_dae.commands.analyze import run_command
@@ -119,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from drake_dae.commands.sweep import run_command
         else:
             from drake_dae.commands.simulate import run_command
-        if options.command != "cache" and options.compiled is not None:
+        if getattr(options, "compiled", None) is not None:
             options.settings.append(f"compiled={options.compiled}")
         # Drake tells where each Meshcat listens, also the one that only records.
         logging.getLogger("drake").setLevel(logging.WARNING)
