@@ -71,10 +71,12 @@ WHOLE := @$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(PYTHON)" -m venv 
 
 $(VENV)/installed: pyproject.toml | $(BIN)/python
 	$(WHOLE)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@echo 'Installing drake_dae and Drake into $(VENV): the first time this takes minutes.'
+	$(BIN)/python -m pip install --disable-pip-version-check --editable .
 	touch $@
 
 $(VENV)/installed-dev: pyproject.toml | $(BIN)/python
 	$(WHOLE)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@echo 'Installing drake_dae and its tools into $(VENV): the first time this takes minutes.'
+	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
 	touch $(VENV)/installed $@

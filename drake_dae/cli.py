@@ -69,12 +69,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
     )
     run.add_argument(
+        "--open", action="store_true", help="open the animation in a browser at the end"
+    )
+    run.add_argument(
         "--rollout",
         action="store_true",
         help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
         "fast where it is machine code, twice as fast where not; the record has every fixed "
         "step, or 1000 rows under error control",
     )
+    shown = commands.add_parser("view", help="open the animation of a run in the browser")
+    shown.add_argument("folder", type=Path, help="the folder of the run")
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -128,6 +133,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from drake_dae.commands.show import run_command
         elif options.command in ("keys", "schema"):
             from drake_dae.commands.keys import run_command
+        elif options.command == "view":
+            from drake_dae.commands.view import run_command
         elif options.command == "cache":
             from drake_dae.commands.cache import run_command
         elif options.command == "analyze":

@@ -5,6 +5,7 @@ base64: set_object, set_transform, set_property, and set_animation for the recor
 """
 
 import base64
+import json
 import re
 import struct
 from dataclasses import dataclass
@@ -58,6 +59,17 @@ def vertices(thing):
     """Of a line, m, shape (k, 3)."""
     array = thing["geometries"][0]["data"]["attributes"]["position"]["array"]
     return np.asarray(array, dtype=float).reshape(-1, 3)
+
+
+def middles(thing, sides=6):
+    """Of a tube, the points of its line, m, shape (k, 3)."""
+    return vertices(thing).reshape(-1, sides, 3).mean(axis=1)
+
+
+def overlay(page):
+    """What the page says besides Meshcat's own words."""
+    (text,) = re.findall(r"const run = (.*);\n", page)
+    return json.loads(text)
 
 
 def unpack(data):

@@ -50,7 +50,7 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
-from drake_dae.simulation.animation import Loop
+from drake_dae.simulation.course import Loop
 from drake_dae.simulation.record import Recorded
 
 FOLDER = Path(__file__).parent / "made"

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import warnings
+import webbrowser
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from drake_dae.commands import analyze, simulate
 from drake_dae.diagrams.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation import view
-from drake_dae.simulation.plots import PLOTS
+from drake_dae.simulation.plots import PATHS, PLOTS
 from drake_dae.simulation.run_folder import FILES
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
@@ -75,7 +76,10 @@ def test_it_prints_the_summary(demo):
     text = (folder / "summary.txt").read_text()
     assert text in out
     assert out.splitlines()[0].startswith(f"{DEFAULT_SCENARIO}: built in ")
-    assert out.splitlines()[-1] == f"written to {folder}/: {', '.join(FILES)}"
+    written, watch = out.splitlines()[-2:]
+    assert written == f"written to {folder}/: {', '.join(FILES)}"
+    assert watch == f"watch it: drake-dae view {folder}"
+    assert "Tracked as predicted: errors stay within" in text
     assert re.search(r"simulated +2 s in \d+ steps, [\d.]+ s, [\d.]+ times real time", text)
     for name in ("tool.y", "tool.z", "joint7", "wall.force", "joint1_motor"):
         assert name in text
@@ -112,7 +116,8 @@ def test_the_page_holds_the_animation(demo):
 def test_a_closed_loop_of_links(name, link, force, tmp_path, capsys):
     """Without a surface there is none to draw, but the force that closes the loop is."""
     assert main(["simulate", name, "--out", str(tmp_path), "--set", "duration=0.5"]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(FILES)
+    files = sorted(path.name for path in tmp_path.iterdir())
+    assert files == sorted({*FILES} - {PATHS})  # Nothing moves on a surface.
     tracks = animation((tmp_path / "animation.html").read_text())
     assert np.ptp(tracks[f"/drake/visualizer/{link}", "position"].values) > 0.01
     assert (f"/contact/{force.split('.')[0]}/force", "position") in tracks
@@ -160,6 +165,53 @@ def test_without_out_each_run_gets_a_new_folder_below_runs(tmp_path, monkeypatch
     assert len(folders) == 3
     assert all(re.fullmatch(r"two_link_wall-\d{8}-\d{6}(-\d)?", name) for name in folders)
     capsys.readouterr()
+
+
+def test_view_opens_the_animation(demo, monkeypatch, capsys):
+    folder, _, _ = demo
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: not opened.append(address))
+    assert main(["view", str(folder)]) == 0
+    assert opened == [(folder / "animation.html").resolve().as_uri()]
+    assert capsys.readouterr().out == f"opened {opened[0]}\n"
+    monkeypatch.setattr(webbrowser, "open", lambda _: False)
+    assert main(["view", str(folder)]) == 1
+    assert error_line(capsys) == f"error: found no browser here; open {opened[0]} in one"
+
+
+def test_view_says_what_is_missing(demo, tmp_path, capsys):
+    folder, _, _ = demo
+    run = tmp_path / "run"
+    run.mkdir()
+    for path, text in (
+        (folder.parent / "runn", f"no folder '.*runn'; there is {folder}$"),
+        (tmp_path / "none", r"no folder '.*none'$"),
+        (folder / "summary.txt", "is a file; name the folder of a run"),
+        (run, "'.*run' is no folder of a run: `drake-dae simulate --out FOLDER` makes one"),
+    ):
+        assert main(["view", str(path)]) == 1
+        assert re.search(text, error_line(capsys))
+    for name in ("scenario.yaml", "outputs.png"):
+        (run / name).touch()
+    assert main(["view", str(run)]) == 1
+    assert "has no animation.html; it has the pictures outputs.png. A run" in error_line(capsys)
+
+
+def test_open_shows_the_animation_at_the_end(tmp_path, monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: not opened.append(address))
+    short = ["simulate", "two_link_wall", "--set", "duration=0.05", "--set", "write.plots=false"]
+    assert main([*short, "--out", str(tmp_path), "--open"]) == 0
+    assert opened == [(tmp_path / "animation.html").as_uri()]
+    page = (tmp_path / "animation.html").read_text()
+    described = load_scenario(find_scenario("two_link_wall")).description
+    assert f"<title>two_link_wall: {described}</title>" in page
+    capsys.readouterr()
+    assert main([*short, *QUICK, "--out", str(tmp_path), "--open"]) == 1
+    assert error_line(capsys) == (
+        "error: write.animation: --open shows the animation: leave it true"
+    )
+    assert len(opened) == 1
 
 
 # Folders that are there already.
@@ -288,7 +340,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     monkeypatch.setattr(os, "pwrite", write)
     monkeypatch.setattr(np, "savez_compressed", fill)
     monkeypatch.setattr(Figure, "savefig", fill)
-    monkeypatch.setattr(simulate, "make_animation", fill)
+    monkeypatch.setattr(simulate, "animate", fill)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
     assert main(arguments) == 1
     out, err = capsys.readouterr()

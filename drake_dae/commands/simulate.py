@@ -3,6 +3,7 @@
 import argparse
 import gc
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,17 +16,28 @@ from typing import TextIO
 from pydrake.systems.framework import Context
 
 import drake_dae
+from drake_dae.commands.view import show
 from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
 from drake_dae.diagrams.shipped import find_scenario
-from drake_dae.errors import DrakeDaeError, ModelError, describe_os_error
-from drake_dae.simulation.animation import make_animation
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
+from drake_dae.simulation.animation import animate
+from drake_dae.simulation.course import Course, contact_paths, follow
 from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
-from drake_dae.simulation.plots import PLOTS, save_plots
+from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
-from drake_dae.simulation.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
+from drake_dae.simulation.run_folder import (
+    ANIMATION,
+    FILES,
+    MARK,
+    PART,
+    SCENARIO,
+    run_folder,
+    stage,
+)
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 from drake_dae.simulation.view import RobotBlock, start_meshcat
@@ -35,6 +47,8 @@ def run_command(options: argparse.Namespace) -> int:
     """Runs the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
+    if options.open and not scenario.write.animation:
+        raise ScenarioError(("write.animation", "--open shows the animation: leave it true"))
     if options.meshcat:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
@@ -47,7 +61,11 @@ def run_command(options: argparse.Namespace) -> int:
         save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
-        return _run(loop, context, scenario, folder, simulate_by)
+        title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
+        code = _run(loop, context, scenario, folder, simulate_by, title)
+    if options.open:
+        show(folder)
+    return code
 
 
 def _unused(name: str) -> Path:
@@ -72,6 +90,7 @@ class _Run:
     scenario: Scenario
     folder: Path
     writer: RecordWriter
+    title: str
     statistics: RunStatistics | None = None
     failure: str = ""
     pictures: bool = True
@@ -112,10 +131,11 @@ def _run(
     scenario: Scenario,
     folder: Path,
     simulate_by: Callable[[_Run], RunStatistics],
+    title: str,
 ) -> int:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     with RecordWriter(folder / PART, loop.record) as writer:
-        run = _Run(loop, context, scenario, folder, writer)
+        run = _Run(loop, context, scenario, folder, writer, title)
         try:
             run.statistics = simulate_by(run)
         except DrakeDaeError as error:
@@ -142,7 +162,10 @@ def _write(run: _Run) -> bool:
             return True
         predicted = loop.predicted_error(record)
         limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
-        text = summary(record, predicted, limits, run.statistics, run.failure)
+        config = run.scenario.integrator
+        accuracy = config.accuracy if config.use_error_control else None
+        reasons = _reasons(run.scenario, record)
+        text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if write.record:
             with _collected(problems):
                 _write_record(record, run)
@@ -151,20 +174,43 @@ def _write(run: _Run) -> bool:
     try:
         if ending.signal is not None:
             end_at_once(ending.signal)
+        course: Course | None = None
+        if run.pictures and (write.plots or write.animation) and isinstance(loop.plant, RobotBlock):
+            course = follow(loop, record, run.context)
         if write.plots and run.pictures:
-            with _collected(problems), stage(folder, *PLOTS) as place, _frozen():
-                save_plots(record, predicted, limits.control, place)
-        if write.animation and run.pictures:
-            with _collected(problems), stage(folder, "animation.html") as place:
-                page = make_animation(loop, record, run.context)
-                (place / "animation.html").write_text(page, encoding="utf-8")
+            paths = contact_paths(course) if course is not None else []
+            plots = [name for name in PLOTS if paths or name != PATHS]
+            with _collected(problems), stage(folder, *plots) as place, _frozen():
+                save_plots(record, predicted, limits.control, place, paths, accuracy)
+        if write.animation and course is not None:
+            with _collected(problems), stage(folder, ANIMATION) as place:
+                page = animate(course, loop.scene_graph, run.title)
+                (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PART) if (folder / name).exists()]
         with _collected(problems):
             _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
+            if ANIMATION in files:
+                _print(f"watch it: drake-dae view {shlex.quote(str(folder))}", sys.stdout)
         with suppress(OSError):
             _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
     return not problems
+
+
+def _reasons(scenario: Scenario, record: Record) -> list[str]:
+    """Why a run may be off what theory predicts for an ideal one."""
+    reasons = {
+        "the drives were cut off at their limits": np.any(record["excess"])
+        if "excess" in record.signals
+        else False,
+        "the plant has numbers that the law does not know (plant_parameters)": bool(
+            scenario.plant_parameters
+        ),
+        "Drake's own contact gives way": isinstance(scenario.plant, ContactMaterial),
+        "the force is measured by a sensor": scenario.force.is_measured,
+        "the law is sampled": scenario.sampling is not None,
+    }
+    return [reason for reason, holds in reasons.items() if holds]
 
 
 def _write_record(record: Record, run: _Run) -> None:

@@ -1,93 +1,102 @@
 """A run of a robot, replayed in Meshcat as one HTML page."""
 
-from typing import Protocol
+import html
+import json
+import re
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Meshcat, Rgba, SceneGraph
-from pydrake.systems.framework import Context, System
+from pydrake.geometry import Meshcat, MeshcatAnimation, Rgba, SceneGraph
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.model import RobotModel
-from drake_dae.simulation.constraint_forces import ConstraintLoads
+from drake_dae.errors import ModelError
+from drake_dae.robots.contact.surface import tangents
+from drake_dae.simulation.constraint_forces import ConstraintLoads, path_of
+from drake_dae.simulation.course import Course, Loop, follow
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import (
     FRAME_RATE,
-    RobotBlock,
     draw_scene,
     draw_surroundings,
+    scene_extent,
     start_meshcat,
     view_of_links,
 )
 
 _DESIRED, _ACTUAL = Rgba(0.1, 0.6, 0.2, 1.0), Rgba(0.1, 0.2, 0.8, 1.0)
 
+_FOREVER = 2**31 - 1
+"""How often the animation is repeated."""
 
-class Loop(Protocol):
-    """A diagram with a plant and its geometry, as a `ClosedLoop`."""
+_SIDES = 6
+"""Of a line that is drawn as a tube: those of a browser are one pixel wide."""
 
-    @property
-    def plant(self) -> System:
-        """What was simulated."""
+_OVERLAY = Path(__file__).with_name("overlay.html")
 
-    @property
-    def scene_graph(self) -> SceneGraph | None:
-        """The geometry of a robot, or None."""
+
+class AnimationPage(str):
+    """The HTML page of an animation, as text; a notebook shows it in its place."""
+
+    def _repr_html_(self) -> str:
+        page = html.escape(str(self), quote=True)
+        return (
+            f'<iframe srcdoc="{page}" style="width: 100%; height: 500px; border: 0" '
+            'sandbox="allow-scripts"></iframe>'
+        )
 
 
 @checked(ModelError)
-def make_animation(loop: Loop, record: Record, context: Context) -> str:
+def make_animation(loop: Loop, record: Record, context: Context, title: str = "") -> AnimationPage:
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
+
+    The page shows the clock and the size of each constraint force at its arrow, draws the path that
+    the robot took as it takes it, over the one that was wanted, and begins again at the end.
 
     Args:
         loop: A loop of a `RobotPlant`.
         record: The record of a run of this loop.
         context: The context of its diagram, for the parameters; not changed.
+        title: The title of the page; the robot's name if empty.
 
     Returns:
-        One HTML page that holds the scene and the animation.
+        One HTML page that holds the scene and the animation, as text. In a notebook it shows
+        itself.
 
     Raises:
         ModelError: There is no robot.
     """
-    plant = loop.plant
-    if not isinstance(plant, RobotBlock):
-        raise ModelError("an animation needs a closed loop of a RobotPlant")
-    # A server of its own, made only now: a run that nobody watches opens no port.
-    meshcat, model = start_meshcat(), plant.model
-    arrows = draw_scene(plant, meshcat)
-    links = view_of_links(plant, loop.scene_graph, meshcat)
-    parameters = plant.parameters(plant.GetMyContextFromRoot(context))
-    loads = ConstraintLoads(model, parameters)
+    return animate(follow(loop, record, context), loop.scene_graph, title)
 
-    times = frame_times(record.time[-1] - record.time[0])
-    states = _interpolated(record, "state", times)
-    forces = _interpolated(record, "constraint_force", times)
-    desired = _interpolated(record, "desired_output", times)
-    values = np.tile(parameters, (len(times), 1))
-    if "exogenous" in record.signals:
-        values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
-    course = [
-        loads(state, force, own) for state, force, own in zip(states, forces, values, strict=True)
-    ]
-    arrows.measure(course)
+
+def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> AnimationPage:
+    """The page of `make_animation`.
+
+    Args:
+        course: Where the robot was.
+        scene_graph: The geometry of the robot, or None.
+        title: The title of the page; the robot's name if empty.
+    """
+    # A server of its own, made only now: a run that nobody watches opens no port.
+    plant, acting, meshcat = course.plant, course.acting, start_meshcat()
+    model = plant.model
+    arrows = draw_scene(plant, meshcat)
+    links = view_of_links(plant, scene_graph, meshcat)
+    arrows.measure(course.loads)
 
     # What stands still: what it touches, where it went, and where the reference wanted it.
-    draw_surroundings(meshcat, model, loads, states[0], parameters)
-    _draw_paths(meshcat, loads, np.array([load.points for load in course]), "actual")
-    wanted = _desired_states(model, states, desired, values)
-    if wanted:
-        none = np.zeros(len(model.dae.force_signals))
-        points = np.array(
-            [loads(x, none, own).points for x, own in zip(wanted, values, strict=False)]
-        )
-        _draw_paths(meshcat, loads, points, "desired")
+    draw_surroundings(meshcat, model, acting, course.states[0], course.parameters[0])
+    _, size = scene_extent(model, acting, course.states[0])
+    _draw_paths(meshcat, acting, course.points, "actual", _ACTUAL, 0.003 * size)
+    _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
 
     # What moves: the links and the arrows, frame by frame.
     replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    for time, state, load, own in zip(times, states, course, values, strict=True):
+    rows = zip(course.times, course.states, course.loads, course.parameters, strict=True)
+    for time, state, load, own in rows:
         if links is not None and replay is not None:
             replay.SetTime(time)
             link_state = links.get_input_port()
@@ -96,46 +105,85 @@ def make_animation(loop: Loop, record: Record, context: Context) -> str:
         arrows.draw(load, time)
         arrows.place(own, time)
     meshcat.StopRecording()
+    recording = meshcat.get_mutable_recording()
+    recording.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
+    recording.set_repetitions(_FOREVER)
     meshcat.PublishRecording()
-    return meshcat.StaticHtml()
+    return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, title or model.dae.name))
 
 
-def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
-    """The moments to show, in s after the start; the last one is the end or the next after it."""
-    return np.arange(int(np.ceil(duration * rate - 1e-9)) + 1) / rate
-
-
-def _interpolated(record: Record, name: str, times: FloatArray) -> FloatArray:
-    """A signal at times after the start, shape (k, size): straight lines between the steps."""
-    moments = record.time - record.time[0]
-    rows = [np.interp(times, moments, column) for column in record[name].T]
-    return np.array(rows).reshape(-1, len(times)).T
-
-
-def _desired_states(
-    model: RobotModel, states: FloatArray, desired: FloatArray, values: FloatArray
-) -> list[FloatArray]:
-    """Link states at rest with the desired outputs, as long as they are within reach.
-
-    Args:
-        model: The robot.
-        states, desired, values: x, z and the parameters at each moment, one row each.
-    """
-    nq, nv = model.links.q.numel(), model.links.v.numel()
-    guess, found = states[0, :nq], []
-    try:
-        wanted = desired[:, : len(model.position_signals)]
-        for row, own in zip(wanted, values, strict=True):
-            guess = model.configuration(row, guess, own)
-            found.append(np.concatenate([guess, np.zeros(nv)]))
-    except InconsistentStateError:
-        pass  # The reference leaves what the robot can reach: its path ends there.
-    return found
-
-
-def _draw_paths(meshcat: Meshcat, loads: ConstraintLoads, points: FloatArray, kind: str) -> None:
+def _draw_paths(
+    meshcat: Meshcat,
+    loads: ConstraintLoads,
+    points: FloatArray,
+    kind: str,
+    color: Rgba,
+    radius: float,
+) -> None:
     """A line through the points of each constraint, m, shape (frames, constraints, 3)."""
-    color, width = {"actual": (_ACTUAL, 4.0), "desired": (_DESIRED, 2.0)}[kind]
     for number, constraint in enumerate(loads.constraints):
-        line = np.asfortranarray(points[:, number].T)
-        meshcat.SetLine(f"/paths/{constraint.name}/{kind}", line, width, color)
+        line = points[:, number]
+        if len(line) > 1:
+            vertices, faces = _tube(line, radius)
+            meshcat.SetTriangleMesh(
+                f"/paths/{constraint.name}/{kind}",
+                np.asfortranarray(vertices.T),
+                np.asfortranarray(faces.T),
+                color,
+            )
+
+
+def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
+    """A thin tube around a line through points, m, shape (k, 3).
+
+    Returns:
+        Its vertices, a ring of `_SIDES` around each point after the other, and its triangles, all
+        of a piece of the line before those of the next.
+    """
+    along = np.gradient(points, axis=0)
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), [0.0, 0.0, 1.0])
+    turn = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    rings = [
+        point + radius * (np.outer(np.cos(turn), first) + np.outer(np.sin(turn), second))
+        for point, (first, second) in zip(points, map(tangents, along), strict=True)
+    ]
+    near = np.arange(_SIDES)
+    far = np.roll(near, -1)
+    piece = np.vstack(
+        [
+            np.column_stack([near, far, near + _SIDES]),
+            np.column_stack([far, far + _SIDES, near + _SIDES]),
+        ]
+    )
+    faces = [piece + _SIDES * start for start, _ in pairwise(range(len(points)))]
+    return np.vstack(rings), np.vstack(faces)
+
+
+def _with_overlay(page: str, course: Course, title: str) -> str:
+    """Meshcat's page with a title, the clock, the sizes of the forces, and paths that grow."""
+    constraints = course.acting.constraints
+    sizes = np.linalg.norm([load.forces for load in course.loads], axis=2)
+    data = {
+        "title": title,
+        "rate": FRAME_RATE,
+        "start": course.start_time,
+        "end": course.start_time + float(course.times[-1]),
+        "indices": 6 * _SIDES,
+        "forces": [
+            {
+                "name": constraint.name,
+                "path": path_of(constraint, "force").strip("/").split("/"),
+                "values": [float(f"{value:.4g}") for value in sizes[:, row]],
+            }
+            for row, constraint in enumerate(constraints)
+        ],
+        "paths": [["paths", constraint.name, "actual"] for constraint in constraints],
+    }
+    # A name may hold what ends a script.
+    text = json.dumps(data).replace("<", "\\u003c")
+    overlay = _OVERLAY.read_text("utf-8").replace('"DATA"', text)
+    name = html.escape(title)
+    page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{name}</title>", page, count=1)
+    head, end, tail = page.rpartition("</body>")
+    return f"{head}{overlay}{end}{tail}" if end else page + overlay

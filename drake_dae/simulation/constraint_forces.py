@@ -98,10 +98,11 @@ class ConstraintLoads:
 
 
 class ForceArrows:
-    """Draws what each constraint does to a robot: an arrow that ends where its force acts.
+    """Draws what each constraint does to a robot: an arrow that begins where its force acts.
 
-    It points as the constraint pushes. A moment has an arrow of its own, with two heads, along its
-    axis. An arrow is as long as its force is large beside the largest one drawn so far.
+    It points as the constraint pushes, from a surface to its free side. A moment has an arrow of
+    its own, with two heads, along its axis. An arrow is as long as its force is large beside the
+    largest one drawn so far.
 
     Args:
         meshcat: Where to draw.
@@ -228,17 +229,17 @@ def path_of(constraint: Constraint, what: str) -> str:
 
 
 def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
-    """An arrow along z that ends at the origin, with one head behind the other."""
-    # A MeshcatCone stands on its tip: turned over, it points along +z, at the origin.
+    """An arrow along z that begins at the origin, with one head behind the other."""
+    # A MeshcatCone stands on its tip: turned over, it points along +z.
     turned = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
     head, names = 0.2 * length, ["head", "second_head"][:heads]
     for number, name in enumerate(names):
         cone = f"{path}/arrow/{name}"
         meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
-        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, -number * head]))
+        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, length - number * head]))
     shaft = length - heads * head
     meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
-    middle = np.array([0.0, 0.0, -heads * head - shaft / 2])
+    middle = np.array([0.0, 0.0, shaft / 2])
     meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
     # Drawn last and over everything: the force in a joint acts inside of bodies.
     for part in (*names, "shaft"):

@@ -18,7 +18,9 @@ SCENARIO = "scenario.yaml"
 PART = "record.part"
 """The record while the run goes on, and what is left of it where the run was killed."""
 
-FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, "animation.html")
+ANIMATION = "animation.html"
+
+FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, ANIMATION)
 """What a run leaves in its folder."""
 
 FILM = "film.gif"

@@ -1,6 +1,8 @@
 """The figures of a run as a table."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Self
 
 import numpy as np
@@ -11,8 +13,12 @@ from drake_dae.dae.signals import Signal
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, output_sizes, sizes
 
 _PROJECTED = "before each step's projection"
+
+_WIDTH = 100
+"""The width of a paragraph, in characters."""
 
 SLACK = 1e-9
 """How far a value must be beyond a joint limit to count, in its unit: a start may be on it."""
@@ -62,16 +68,22 @@ def summary(
     limits: Limits | None = None,
     run: RunStatistics | None = None,
     failure: str = "",
+    accuracy: float | None = None,
+    reasons: Sequence[str] = (),
 ) -> str:
-    """What a run did, in plain text.
+    """What a run did, in plain text, and whether that is as theory predicts.
+
+    Numbers that are round-off beside others with their unit are 0.
 
     Args:
-        record: A record with state, tracking_error, constraint_residual, constraint_force and
-            control.
+        record: A record with state, desired_output, tracking_error, constraint_residual,
+            constraint_force and control.
         predicted: The tracking error by theory, shape (k, p).
         limits: What the robot can take.
         run: What it took; None for a run that failed.
         failure: Why it failed.
+        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        reasons: Why a run may be off its prediction, such as "the law is sampled".
     """
     limits = limits or Limits()
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
@@ -80,6 +92,7 @@ def summary(
     kind = "in contact that gives way" if "contact_force" in record.signals else _PROJECTED
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
+    ended = ""
     if run is not None:
         notes.append(
             f"simulated            {run.simulated_time:g} s in {run.steps} steps, "
@@ -87,49 +100,64 @@ def summary(
         )
         if run.interrupted:
             notes.append("interrupted          the record ends there")
+            ended = f"Interrupted at {record.time[-1]:.4g} s"
     if failure:
         notes.append(f"failed               the record ends at {record.time[-1]:.6g} s: {failure}")
-    return "\n\n".join("\n".join(lines) for lines in [*sections, notes] if lines)
+        ended = f"The run ended early, at {record.time[-1]:.4g} s"
+    words = in_words(judge(record, predicted, accuracy), accuracy, reasons, ended)
+    beware = _beware(record, limits)
+    verdict = [fill(f"{words} But {'; '.join(beware)}." if beware else words, _WIDTH)]
+    return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
 
 
 def _errors(record: Record, predicted: FloatArray) -> list[str]:
     signals = record.signals["tracking_error"].signals
-    return Table(
-        ["tracking error", "unit", "start", "largest", "final", "off prediction by"],
-        [
+    if not signals:
+        return []
+    columns = zip(
+        signals,
+        record["tracking_error"].T,
+        predicted.T,
+        output_sizes(record, predicted),
+        strict=True,
+    )
+    return [
+        *Table(
+            ["tracking error", "unit", "start", "largest", "final", "off prediction by"],
             [
-                signal.name,
-                signal.unit or "1",
-                f"{error[0]:.3g}",
-                f"{np.max(np.abs(error)):.3g}",
-                f"{error[-1]:.3g}",
-                f"{np.max(np.abs(error - theory)):.2g}",
-            ]
-            for signal, error, theory in zip(
-                signals, record["tracking_error"].T, predicted.T, strict=True
-            )
-        ],
-        left=2,
-    ).lines()
+                [
+                    signal.name,
+                    signal.unit or "1",
+                    _number(error[0], size, 3),
+                    _number(np.max(np.abs(error)), size, 3),
+                    _number(error[-1], size, 3),
+                    _number(np.max(np.abs(error - theory)), size, 2),
+                ]
+                for signal, error, theory, size in columns
+            ],
+            left=2,
+        ).lines(),
+        "off prediction by: the largest distance from the error that theory predicts, which decays",
+        "from its start by the gains alone",
+    ]
 
 
 def _forces(record: Record, limits: Limits) -> list[str]:
     forces = record.signals["constraint_force"]
     if not forces.signals:
         return []
+    scales = sizes(forces.signals, forces.values)
     return Table(
         ["constraint force", "unit", "least", "largest", ""],
         [
             [
                 signal.name,
                 signal.unit or "1",
-                f"{np.min(values):.4g}",
-                f"{np.max(values):.4g}",
-                "pulls: a real contact would open"
-                if np.min(values) < 0.0 and not limits.can_pull(signal)
-                else "",
+                _number(np.min(values), size, 4),
+                _number(np.max(values), size, 4),
+                "pulls: a real contact would open" if _pulls(signal, values, limits) else "",
             ]
-            for signal, values in zip(forces.signals, forces.values.T, strict=True)
+            for signal, values, size in zip(forces.signals, forces.values.T, scales, strict=True)
         ],
         left=2,
     ).lines()
@@ -137,18 +165,22 @@ def _forces(record: Record, limits: Limits) -> list[str]:
 
 def _controls(record: Record, limits: Limits) -> list[str]:
     controls = record.signals["control"]
-    largest = np.full(len(controls.signals), np.inf) if limits.control is None else limits.control
+    if not controls.signals:
+        return []
+    scales = sizes(controls.signals, controls.values)
+    largest = _largest_controls(record, limits)
     # A sample tells of the step that it ends.
     excess = record["excess"] if "excess" in record.signals else np.zeros_like(controls.values)
     cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
+    columns = zip(controls.signals, controls.values.T, scales, largest, cut_off, strict=True)
     return Table(
         ["control", "unit", "least", "largest", "limit", ""],
         [
             [
                 signal.name,
                 signal.unit or "1",
-                f"{np.min(values):.4g}",
-                f"{np.max(values):.4g}",
+                _number(np.min(values), size, 4),
+                _number(np.max(values), size, 4),
                 f"{limit:.4g}" if np.isfinite(limit) else "none",
                 f"cut off for {time:.3g} s"
                 if time
@@ -156,12 +188,44 @@ def _controls(record: Record, limits: Limits) -> list[str]:
                 if np.max(np.abs(values)) > limit
                 else "",
             ]
-            for signal, values, limit, time in zip(
-                controls.signals, controls.values.T, largest, cut_off, strict=True
-            )
+            for signal, values, size, limit, time in columns
         ],
         left=2,
     ).lines()
+
+
+def _number(value: float, size: float, digits: int) -> str:
+    """A number, which is 0 where it is but round-off of numbers of some size."""
+    return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
+
+
+def _largest_controls(record: Record, limits: Limits) -> FloatArray:
+    count = len(record.signals["control"].signals)
+    return np.full(count, np.inf) if limits.control is None else limits.control
+
+
+def _pulls(signal: Signal, values: FloatArray, limits: Limits) -> bool:
+    return bool(np.min(values) < 0.0) and not limits.can_pull(signal)
+
+
+def _beware(record: Record, limits: Limits) -> list[str]:
+    """What a robot would not do that tracks as well as this."""
+    forces, controls = record.signals["constraint_force"], record.signals["control"]
+    pulling = [
+        signal.name
+        for signal, values in zip(forces.signals, forces.values.T, strict=True)
+        if _pulls(signal, values, limits)
+    ]
+    over = np.max(np.abs(controls.values), axis=0, initial=0.0) > _largest_controls(record, limits)
+    beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
+    found = []
+    if pulling:
+        found.append(f"{', '.join(pulling)} would have to pull, and a contact cannot")
+    if beyond:
+        found.append(f"{', '.join(beyond)} would have to give more than the limit")
+    if joints := _beyond(record, limits):
+        found.append(f"joint limits are left ({'; '.join(joints)})")
+    return found
 
 
 def _beyond(record: Record, limits: Limits) -> list[str]:

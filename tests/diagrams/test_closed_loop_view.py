@@ -11,7 +11,7 @@ from members import Mirror, Saddle
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
-from recordings import animation, objects, transforms, vertices
+from recordings import animation, commands, middles, objects, overlay, transforms, vertices
 from two_arms import two_arms
 
 from drake_dae import (
@@ -37,8 +37,9 @@ from drake_dae import (
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact import surfaces
-from drake_dae.simulation.animation import frame_times
+from drake_dae.robots.contact.surface import tangents
 from drake_dae.simulation.constraint_forces import ConstraintLoads, ForceArrows
+from drake_dae.simulation.course import contact_paths, follow, frame_times
 from drake_dae.simulation.record import Recorded
 from drake_dae.simulation.view import FRAME_RATE, draw_scene, scene_extent
 
@@ -123,7 +124,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
         np.testing.assert_allclose(rotation(quaternion)[:, 2], normal, atol=1e-3)
     for values in scale.values.T:
         np.testing.assert_allclose(values, force / np.max(force), rtol=1e-6)
-    # The longest arrow is a fifth of the scene, all of it on the far side of the contact.
+    # The longest arrow is a fifth of the scene, all of it on the free side, from the contact on.
     things, places = objects(page), transforms(page)
     shaft = things[f"{path}/arrow/shaft"]["geometries"][0]
     head = things[f"{path}/arrow/head"]["geometries"][0]
@@ -132,7 +133,9 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     _, size = scene_extent(model, ConstraintLoads(model), nominal)
     assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
-    assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
+    assert middle - shaft["height"] / 2 == pytest.approx(0.0, abs=1e-9)
+    tip = places[f"{path}/arrow/head"][2, 3]
+    assert tip == pytest.approx(shaft["height"] + head["height"], rel=1e-6)
 
 
 @pytest.mark.slow
@@ -158,11 +161,66 @@ def test_paths_of_the_contact_point(shown):
     times = np.arange(33) / 32
     axes = ["xyz".index(axis) for axis in loop.plant.model.positions[0].axes]
     for name, signal in (("actual", "controlled_output"), ("desired", "desired_output")):
-        path = vertices(lines[f"/paths/{contact.name}/{name}"])
+        path = middles(lines[f"/paths/{contact.name}/{name}"])
         assert path.shape == (33, 3)
         wanted = at(record, signal, times)[:, : len(axes)]
         # Where the joints, not the outputs, go along a straight line from step to step.
         np.testing.assert_allclose(path[:, axes], wanted, atol=1e-3)
+
+
+def test_what_the_page_says(shown):
+    """Its title, the clock's ends, and the force at each arrow: that of the record."""
+    loop, record, page = shown
+    said = overlay(page)
+    assert f"<title>{loop.plant.dae.name}</title>" in page
+    assert (said["title"], said["rate"]) == (loop.plant.dae.name, 32.0)
+    assert (said["start"], said["end"]) == (0.0, 1.0)
+    (force,) = said["forces"]
+    assert "/" + "/".join(force["path"]) + "/arrow/head" in objects(page)
+    wanted = at(record, "constraint_force", np.arange(33) / 32)[:, 0]
+    np.testing.assert_allclose(force["values"], wanted, rtol=1e-3)
+    (path,) = said["paths"]
+    drawn = objects(page)["/" + "/".join(path)]["geometries"][0]["data"]
+    # Six sides of two triangles for each of the 32 pieces, one after the other.
+    triangles = np.asarray(drawn["index"]["array"]).reshape(-1, 3)
+    assert said["indices"] * 32 == triangles.size
+    np.testing.assert_array_equal(triangles.reshape(32, -1).max(axis=1), 6 * np.arange(2, 34) - 1)
+
+
+def test_the_animation_begins_again(shown):
+    (command,) = [c for c in commands(shown[2]) if c["type"] == "set_animation"]
+    assert command["options"]["repetitions"] > 1e6
+    assert command["options"]["loopMode"] == 2201  # LoopRepeat of three.js.
+
+
+def test_a_title_is_text(shown):
+    loop, record, _ = shown
+    title = '</script><b>wall & "dome"</b>'
+    page = make_animation(loop, record, loop.diagram.CreateDefaultContext(), title)
+    assert overlay(page)["title"] == title
+    assert "<title>&lt;/script&gt;&lt;b&gt;wall &amp; &quot;dome&quot;&lt;/b&gt;</title>" in page
+    assert title not in page
+
+
+def test_paths_on_a_surface(shown):
+    """On a plane in its own coordinates; on a sphere in the tangent plane below the mean normal."""
+    loop, record, _ = shown
+    course = follow(loop, record, loop.diagram.CreateDefaultContext())
+    (path,) = contact_paths(course)
+    contact = loop.plant.model.constraints[0]
+    assert path.name == contact.name
+    assert path.actual.shape == path.desired.shape == (33, 2)
+    points = course.points[:, 0] - contact.surface.position
+    if isinstance(contact.surface, surfaces.Plane):
+        first, second = tangents(np.array(contact.surface.normal))
+    else:
+        normal = np.mean(points, axis=0)
+        first, second = tangents(normal / np.linalg.norm(normal))
+    wanted = np.column_stack([points @ first, points @ second])
+    np.testing.assert_allclose(path.actual, wanted, atol=1e-4)
+    # What is left of the error after a second.
+    far, near = (np.linalg.norm(path.actual[k] - path.desired[k]) for k in (0, 32))
+    assert near < far
 
 
 def test_the_desired_path_ends_where_it_leaves_the_reach():
@@ -171,8 +229,8 @@ def test_the_desired_path_ends_where_it_leaves_the_reach():
     record["desired_output"][:, 0] = 0.3 + 2.0 * record.time
     context = loop.diagram.CreateDefaultContext()
     lines = objects(make_animation(loop, record, context))
-    assert len(vertices(lines["/paths/wall/actual"])) == 33
-    path = vertices(lines["/paths/wall/desired"])
+    assert len(middles(lines["/paths/wall/actual"])) == 33
+    path = middles(lines["/paths/wall/desired"])
     assert 1.5 < np.max(path[:, 2]) < 1.61
     assert len(path) < 33
 

@@ -6,11 +6,13 @@ from matplotlib.colors import to_hex
 
 from drake_dae import Record
 from drake_dae.dae.signals import Signal
+from drake_dae.simulation.course import ContactPath
 from drake_dae.simulation.plots import (
     PLOTS,
     plot_controls,
     plot_errors,
     plot_outputs,
+    plot_paths,
     plot_residual,
     save_plots,
 )
@@ -54,12 +56,19 @@ def curves(axis):
     return {line.get_label(): line for line in axis.get_lines()}
 
 
+def words(figure):
+    """What stands below the axes, on one line."""
+    return " ".join(" ".join(text.get_text() for text in figure.texts).split())
+
+
 def test_outputs_with_their_references():
-    run, _ = record()
-    figure = plot_outputs(run)
-    assert texts(figure) == ["z0", "z1 [m]", "z2 [m]"]
+    """The one that is held at a constant is a line of text, not a panel of noise."""
+    run, predicted = record()
+    figure = plot_outputs(run, predicted)
+    assert texts(figure) == ["z0", "z1 [m]"]
     assert figure.get_supxlabel() == "time [s]"
     assert legend(figure) == ["actual", "reference"]
+    assert "held: z2 = 15 m (within 1e-9)" in words(figure)
     for i, axis in enumerate(figure.axes):
         lines = curves(axis)
         for label, name in (("actual", "controlled_output"), ("reference", "desired_output")):
@@ -68,14 +77,52 @@ def test_outputs_with_their_references():
         assert lines["reference"].get_linestyle() == "--"
 
 
-def test_a_constant_with_noise_is_a_flat_line():
-    figure = plot_outputs(record()[0])
-    low, high = figure.axes[2].get_ylim()
-    assert low < 14.5
-    assert high > 15.5
-    # What moves fills its axes.
-    low, high = figure.axes[0].get_ylim()
-    assert 1.0 < high - low < 2.5
+def test_a_constant_that_is_not_held_has_its_panel():
+    run, predicted = record()
+    run["controlled_output"][:, 2] += 0.01
+    assert texts(plot_outputs(run, predicted)) == ["z0", "z1 [m]", "z2 [m]"]
+
+
+def test_outputs_that_are_all_held_are_text_alone():
+    run, predicted = record(1)
+    figure = plot_outputs(run, predicted)
+    assert (texts(figure), figure.legends) == ([], [])
+    # A pure number; what is off by less than round-off is not told.
+    assert words(figure) == "held: z0 = 15 (within 1e-9)"
+
+
+def test_errors_below_the_accuracy_are_grey_and_none_is_drawn_alone():
+    """z0 and z1 decay through it; z2 stays below 1e-6 of its 15 m all the time."""
+    run, predicted = record()
+    figure = plot_errors(run, predicted, accuracy=1e-6)
+    assert texts(figure) == ["|error of z0|", "|error of z1| [m]"]
+    assert legend(figure) == ["predicted", "actual", "below the integrator's accuracy"]
+    assert "below the integrator's accuracy of 1e-6 all the time: z2 (1e-9 m)" in words(figure)
+    # Beside numbers of size one, and beside the largest of those in metres.
+    for axis, top in zip(figure.axes, (1e-6, 15e-6), strict=True):
+        (band,) = axis.patches
+        corners = band.get_extents().transformed(axis.transData.inverted())
+        assert corners.y1 == pytest.approx(top, rel=1e-6)
+
+
+def test_paths_are_drawn_to_scale():
+    turn = np.linspace(0.0, 2.0 * np.pi, 50)
+    eight = np.column_stack([0.15 * np.sin(turn), 0.6 + 0.08 * np.sin(2.0 * turn)])
+    line = np.column_stack([np.zeros(50), 0.3 * turn])
+    paths = [ContactPath("wall", eight + 0.01, eight), ContactPath("line", line, line[:20])]
+    figure = plot_paths(paths)
+    assert texts(figure) == ["path on wall", "path on line"]
+    assert legend(figure) == ["desired", "actual", "start"]
+    figure.draw_without_rendering()
+    for axis, path in zip(figure.axes, paths, strict=True):
+        drawn = curves(axis)
+        np.testing.assert_array_equal(drawn["actual"].get_xydata(), path.actual)
+        np.testing.assert_array_equal(drawn["desired"].get_xydata(), path.desired)
+        np.testing.assert_array_equal(drawn["start"].get_xydata(), path.actual[:1])
+        assert axis.get_xlabel().endswith("[m]")
+        box = axis.get_window_extent()
+        scale = np.ptp(axis.get_xlim()) / box.width, np.ptp(axis.get_ylim()) / box.height
+        assert scale[0] == pytest.approx(scale[1], rel=1e-6)
 
 
 def test_errors_over_the_predicted_ones():
@@ -148,7 +195,7 @@ def test_controls_with_limits_that_are_in_sight():
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 7])
 def test_no_cell_is_empty_and_nothing_overlaps(count):
-    figure = plot_outputs(record(count)[0])
+    figure = plot_errors(*record(count))
     figure.draw_without_rendering()
     assert len(figure.axes) == count
     boxes = [axis.get_tightbbox() for axis in figure.axes] + [figure.legends[0].get_tightbbox()]
@@ -169,7 +216,8 @@ def test_no_cell_is_empty_and_nothing_overlaps(count):
 @pytest.mark.slow
 def test_saved_as_png(tmp_path):
     run, predicted = record()
-    paths = save_plots(run, predicted, None, tmp_path)
+    line = np.column_stack([TIME, TIME])
+    paths = save_plots(run, predicted, None, tmp_path, [ContactPath("wall", line, line)], 1e-8)
     assert [path.name for path in paths] == list(PLOTS)
     for path in paths:
         assert path.read_bytes().startswith(b"\x89PNG")
@@ -183,4 +231,5 @@ def test_a_single_moment_can_be_drawn(tmp_path):
     start = Record(
         run.time[:1], {k: Recorded(r.values[:1], r.signals) for k, r in run.signals.items()}
     )
-    save_plots(start, predicted[:1], None, tmp_path)
+    line = np.zeros((1, 2))
+    save_plots(start, predicted[:1], None, tmp_path, [ContactPath("wall", line, line)], 1e-8)

@@ -1,0 +1,144 @@
+"""Whether a run went as theory predicts, as a value and in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
+from drake_dae.simulation.record import Record
+
+ROUND_OFF = 1e-13
+"""Beside the size of what it is a part of, a smaller number is round-off."""
+
+CLOSE, NEAR = 1e-5, 1e-2
+"""Errors that are off their prediction by less than these shares of their outputs' sizes are as
+predicted, and nearly as predicted."""
+
+SLACK = 100.0
+"""How many times the accuracy of a step a whole run may be off."""
+
+
+class Tracking(Enum):
+    """How the errors of a run compare with the predicted ones; the values begin the sentence."""
+
+    AS_PREDICTED = "Tracked as predicted"
+    NEARLY = "Tracked nearly as predicted"
+    OFF = "Not tracked as predicted"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a run compares with theory.
+
+    Attributes:
+        tracking: How good it was.
+        worst: The output that is farthest off, beside its size; None where there are no outputs.
+        off: By how much its error is off the predicted one, at most, in its unit.
+        time: When, in s.
+        share: The same beside the output's size.
+    """
+
+    tracking: Tracking
+    worst: Signal | None = None
+    off: float = 0.0
+    time: float = 0.0
+    share: float = 0.0
+
+
+def sizes(signals: Sequence[Signal], *courses: FloatArray) -> FloatArray:
+    """How large the numbers of each signal are: the largest value of all that have its unit.
+
+    Angles and pure numbers are of size one at least. So an output that is held at zero is compared
+    with those that move, in any unit.
+
+    Args:
+        signals: Names and units, p of them.
+        courses: Values over time, shape (k, p) each.
+
+    Returns:
+        The sizes, shape (p,), zero where all with a unit are zero.
+    """
+    largest = np.zeros(len(signals))
+    for values in courses:
+        largest = np.maximum(largest, np.max(np.abs(values), axis=0, initial=0.0))
+    units = [signal.unit for signal in signals]
+    least = {"": 1.0, "rad": 1.0}
+    found = {
+        unit: max(least.get(unit, 0.0), *largest[[u == unit for u in units]])
+        for unit in dict.fromkeys(units)
+    }
+    return np.array([found[unit] for unit in units])
+
+
+def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
+    """The sizes of the outputs of a run: of their references and of the predicted errors, (p,)."""
+    signals = record.signals["desired_output"].signals
+    return sizes(signals, record["desired_output"], predicted)
+
+
+def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> Verdict:
+    """How a run compares with theory.
+
+    Args:
+        record: A record with desired_output and tracking_error.
+        predicted: The tracking error by theory, shape (k, p).
+        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+    """
+    error = record["tracking_error"]
+    if not error.size:
+        return Verdict(Tracking.AS_PREDICTED)
+    signals = record.signals["tracking_error"].signals
+    size = np.maximum(output_sizes(record, predicted), np.finfo(float).tiny)
+    shares = np.abs(error - predicted) / size
+    row, column = np.unravel_index(np.argmax(shares), shares.shape)
+    share = float(shares[row, column])
+    tracking = Tracking.OFF
+    if share <= max(CLOSE, SLACK * (accuracy or 0.0)):
+        tracking = Tracking.AS_PREDICTED
+    elif share <= NEAR:
+        tracking = Tracking.NEARLY
+    off = float(np.abs(error - predicted)[row, column])
+    return Verdict(tracking, signals[column], off, float(record.time[row]), share)
+
+
+def in_words(
+    verdict: Verdict,
+    accuracy: float | None = None,
+    reasons: Sequence[str] = (),
+    ended: str = "",
+) -> str:
+    """A verdict as sentences.
+
+    Args:
+        verdict: The verdict.
+        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+        reasons: Why a run is not as predicted, such as "the drives were cut off".
+        ended: How the run ended, such as "The run failed at 2.1 s"; empty where it is complete.
+    """
+    head = f"{ended}; up to there: " if ended else ""
+    if verdict.worst is None:
+        return f"{head}There are no outputs to track." if ended else "There is no output to track."
+    step = (
+        f"the integrator's accuracy is {accuracy:g}"
+        if accuracy is not None
+        else "the steps are fixed"
+    )
+    unit = f" {verdict.worst.unit}".rstrip()
+    off, name = f"{verdict.off:.2g}{unit}", verdict.worst.name
+    if verdict.tracking is Tracking.AS_PREDICTED:
+        return (
+            f"{head}{verdict.tracking.value}: errors stay within {off} of the predicted ones "
+            f"({name} is the farthest off); {step}."
+        )
+    text = (
+        f"{head}{verdict.tracking.value}: at {verdict.time:.3g} s the error of {name} is off the "
+        f"predicted one by {off}, {100.0 * verdict.share:.2g} % of its size"
+    )
+    if reasons:
+        return f"{text}. Likely because {', and '.join(reasons)}."
+    if verdict.tracking is Tracking.NEARLY:
+        return f"{text}; {step}, and a finer one would tell whether that is why."
+    return f"{text}; {step}. If a finer one changes nothing, plant and law differ."
