@@ -200,7 +200,7 @@ def _write(run: _Run) -> bool:
 def _reasons(scenario: Scenario, record: Record) -> list[str]:
     """Why a run may be off what theory predicts for an ideal one."""
     reasons = {
-        "the drives were cut off at their limits": np.any(record["excess"])
+        "the drives were cut off at their limits": record["excess"].any()
         if "excess" in record.signals
         else False,
         "the plant has numbers that the law does not know (plant_parameters)": bool(

@@ -34,7 +34,7 @@ class Loop(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A run of a robot at k moments, `FRAME_RATE` times a second.
+    """A run of a robot at k moments, equally far apart.
 
     Attributes:
         plant: The robot.
@@ -86,13 +86,14 @@ class ContactPath:
     desired: FloatArray
 
 
-def follow(loop: Loop, record: Record, context: Context) -> Course:
+def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
     """The course of a run of a robot.
 
     Args:
         loop: A loop of a `RobotPlant`.
         record: The record of a run of this loop.
         context: The context of its diagram, for the parameters; not changed.
+        rate: Moments per second.
 
     Raises:
         ModelError: There is no robot.
@@ -102,7 +103,7 @@ def follow(loop: Loop, record: Record, context: Context) -> Course:
         raise ModelError("an animation needs a closed loop of a RobotPlant")
     parameters = plant.parameters(plant.GetMyContextFromRoot(context))
     acting = ConstraintLoads(plant.model, parameters)
-    times = frame_times(record.time[-1] - record.time[0])
+    times = frame_times(record.time[-1] - record.time[0], rate)
     states = _interpolated(record, "state", times)
     forces = _interpolated(record, "constraint_force", times)
     desired = _interpolated(record, "desired_output", times)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,10 +35,10 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.simulation.animation import Loop, frame_times
-from drake_dae.simulation.constraint_forces import ConstraintLoads, Loads, own_values
+from drake_dae.simulation.constraint_forces import own_values
+from drake_dae.simulation.course import Course, Loop, follow
 from drake_dae.simulation.record import Record
-from drake_dae.simulation.view import RobotBlock, scene_extent
+from drake_dae.simulation.view import scene_extent
 
 if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.axes import Axes
@@ -55,12 +54,17 @@ _WIDTH, _HEIGHT = 480, 400
 _ANGLE = 0.62  # Of view, upwards, in rad.
 _LEAST_FORCE = 0.02  # No arrow for what is less, beside the largest force of the run.
 
+ACTUAL, DESIRED, FORCE = "#1f3fbf", "#2e9d4a", "#d12b1f"
+"""Colors of the path so far, of the one that is wanted, and of forces."""
+
 Pixels = NDArray[np.uint8]
 
 
 @checked(ModelError)
 def save_film(loop: Loop, record: Record, context: Context, path: str | Path) -> None:
     """Films a record of a robot with the paths and the forces of its contacts.
+
+    The path so far is blue, the one that the reference wants green.
 
     Args:
         loop: A loop of a `RobotPlant` whose links have geometry.
@@ -72,13 +76,11 @@ def save_film(loop: Loop, record: Record, context: Context, path: str | Path) ->
         ModelError: There is no robot, nothing of it can be seen, or the file has another suffix.
         OSError: The file cannot be written.
     """
-    kind, duration = Path(path).suffix, float(record.time[-1] - record.time[0])
+    kind = Path(path).suffix
     if kind not in (".gif", ".png"):
         raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{path}'")
-    if not isinstance(loop.plant, RobotBlock):
-        raise ModelError("a film needs a closed loop of a RobotPlant")
-    replay = _Replay.of(loop.plant, record, context, frame_times(duration, RATE))
-    scene, last = _Scene(loop.plant, loop.scene_graph, replay), len(replay.times) - 1
+    course = follow(loop, record, context, RATE)
+    scene, last = _Scene(course, loop.scene_graph), len(course.times) - 1
     if kind == ".gif":
         from matplotlib.animation import PillowWriter
 
@@ -87,12 +89,12 @@ def save_film(loop: Loop, record: Record, context: Context, path: str | Path) ->
         with writer.saving(figure, str(path), dpi=100):
             for number in range(last + 1):
                 axis.clear()
-                scene.draw(axis, replay, number)
+                scene.draw(axis, number)
                 writer.grab_frame()
     else:
         figure, axes = _screen(STRIP)
         for place, axis in enumerate(axes):
-            scene.draw(axis, replay, round(last * place / (STRIP - 1)))
+            scene.draw(axis, round(last * place / (STRIP - 1)))
         figure.savefig(path)
 
 
@@ -103,47 +105,6 @@ def _screen(columns: int) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(columns * _WIDTH / 100, _HEIGHT / 100), dpi=100)
     places = [(column / columns, 0.0, 1.0 / columns, 1.0) for column in range(columns)]
     return figure, [figure.add_axes(place) for place in places]
-
-
-@dataclass(frozen=True, eq=False)
-class _Replay:
-    """A run at some moments.
-
-    Attributes:
-        times: The moments, s, shape (k,).
-        states: x, shape (k, n).
-        values: All parameters, one row each.
-        course: What the constraints do, at each.
-        parameters: Those that do not move.
-        loads: What finds the course.
-    """
-
-    times: FloatArray
-    states: FloatArray
-    values: FloatArray
-    course: list[Loads]
-    parameters: FloatArray
-    loads: ConstraintLoads
-
-    @classmethod
-    def of(cls, plant: RobotBlock, record: Record, context: Context, times: FloatArray) -> _Replay:
-        """Between the rows of a record lie straight lines."""
-        moments = record.time - record.time[0]
-
-        def at(name: str) -> FloatArray:
-            return np.column_stack([np.interp(times, moments, column) for column in record[name].T])
-
-        parameters = plant.parameters(plant.GetMyContextFromRoot(context))
-        loads = ConstraintLoads(plant.model, parameters)
-        values = np.tile(parameters, (len(times), 1))
-        if "exogenous" in record.signals:
-            values[:, plant.exogenous_places] = at("exogenous")
-        states = at("state")
-        course = [
-            loads(x, force, own)
-            for x, force, own in zip(states, at("constraint_force"), values, strict=True)
-        ]
-        return cls(times + record.time[0], states, values, course, parameters, loads)
 
 
 class _Camera:
@@ -174,14 +135,14 @@ class _Camera:
 class _Scene:
     """The links and what they touch, before a camera."""
 
-    def __init__(self, plant: RobotBlock, scene_graph: SceneGraph | None, replay: _Replay) -> None:
-        model, links = plant.model, plant.model.links.plant
+    def __init__(self, course: Course, scene_graph: SceneGraph | None) -> None:
+        model, links = course.plant.model, course.plant.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")
-        middle, self._size = scene_extent(model, replay.loads, replay.states[0])
+        middle, self._size = scene_extent(model, course.acting, course.states[0])
         eye = middle + self._size * np.array([-1.55, -1.1, 0.8])
         self._camera = _Camera(eye, middle, 10.0 * self._size)
-        self._model = model
+        self._course, self._points, self._wanted = course, course.points, course.wanted_points
         builder = DiagramBuilder()
         scene = builder.AddSystem(scene_graph.Clone())
         lights = [
@@ -195,9 +156,9 @@ class _Scene:
         builder.Connect(pose.get_output_port(), scene.get_source_pose_port(links.get_source_id()))
         self._frames = {}
         source = scene.RegisterSource("surroundings")
-        points = replay.course[0].points
-        for constraint, point in zip(replay.loads.constraints, points, strict=True):
-            own = own_values(constraint, model.dae, replay.parameters)
+        points = course.points[0]
+        for constraint, point in zip(course.acting.constraints, points, strict=True):
+            own = own_values(constraint, model.dae, course.parameters[0])
             picture = constraint.picture(own, point, self._size)
             if picture is None:
                 continue
@@ -217,45 +178,42 @@ class _Scene:
         self._context = self._diagram.CreateDefaultContext()
         self._world = scene.world_frame_id()
         self._largest = max(
-            float(np.linalg.norm(load.forces, axis=1).max(initial=0.0)) for load in replay.course
+            float(np.linalg.norm(load.forces, axis=1).max(initial=0.0)) for load in course.loads
         )
 
-    def draw(self, axis: Axes, replay: _Replay, number: int) -> None:
+    def draw(self, axis: Axes, number: int) -> None:
         """Draws the moment of that number, with the paths up to it."""
-        axis.imshow(self._render(replay, number), interpolation="nearest")
+        course = self._course
+        axis.imshow(self._render(number), interpolation="nearest")
         axis.set_axis_off()
-        load = replay.course[number]
-        for row, _ in enumerate(replay.loads.constraints):
-            path = np.array([earlier.points[row] for earlier in replay.course[: number + 1]])
-            axis.plot(*self._camera.project(path).T, color="#1f3fbf", linewidth=1.6)
-            force = load.forces[row]
+        load = course.loads[number]
+        for row, force in enumerate(load.forces):
+            for points, color in ((self._wanted, DESIRED), (self._points[: number + 1], ACTUAL)):
+                axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
             size = float(np.linalg.norm(force))
             if size > _LEAST_FORCE * self._largest:
-                ends = np.array([load.points[row], load.points[row]])
-                ends[0] -= 0.25 * self._size * force / self._largest
-                tail, head = self._camera.project(ends)
+                tail = load.points[row] - 0.25 * self._size * force / self._largest
+                head, tail = self._camera.project(np.array([load.points[row], tail]))
+                shape = {"color": FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
                 axis.annotate(
-                    f"{size:.1f} N",
-                    head,
-                    tail,
-                    color="#d12b1f",
-                    fontsize=11,
-                    arrowprops={"color": "#d12b1f", "width": 2.5, "headwidth": 9, "headlength": 9},
+                    f"{size:.1f} N", head, tail, color=FORCE, fontsize=11, arrowprops=shape
                 )
-        axis.text(12, 24, f"t = {replay.times[number]:.1f} s", fontsize=11, color="0.25")
+        time = course.start_time + course.times[number]
+        axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")
         axis.set_xlim(-0.5, _WIDTH - 0.5)
         axis.set_ylim(_HEIGHT - 0.5, -0.5)
 
-    def _render(self, replay: _Replay, number: int) -> Pixels:
-        link_state = self._diagram.GetInputPort("link_state")
-        link_state.FixValue(self._context, replay.states[number][: link_state.size()])
+    def _render(self, number: int) -> Pixels:
+        course, diagram, context = self._course, self._diagram, self._context
+        link_state = diagram.GetInputPort("link_state")
+        link_state.FixValue(context, course.states[number][: link_state.size()])
         if self._frames:
             poses = FramePoseVector()
             for constraint, frame in self._frames.items():
-                own = own_values(constraint, self._model.dae, replay.values[number])
+                own = own_values(constraint, course.plant.model.dae, course.parameters[number])
                 poses.set_value(frame, constraint.placement(own))
-            self._diagram.GetInputPort("surroundings").FixValue(self._context, poses)
-        query = self._diagram.GetOutputPort("query").Eval(self._context)
+            diagram.GetInputPort("surroundings").FixValue(context, poses)
+        query = diagram.GetOutputPort("query").Eval(context)
         image = query.RenderColorImage(self._camera.color, self._world, self._camera.pose)
         return np.array(image.data[:, :, :3])
 

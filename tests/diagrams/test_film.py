@@ -9,7 +9,7 @@ from drake_dae import build_scenario, load_scenario, save_film, simulate
 from drake_dae.cli import main
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
-from drake_dae.simulation.film import _Camera
+from drake_dae.simulation.film import ACTUAL, FORCE, _Camera
 
 
 def recorded(name, *settings):
@@ -38,8 +38,8 @@ def test_path_grows_and_arrow_is_there(tmp_path):
     save_film(loop, record, context, tmp_path / "film.gif")
     shown = list(frames(tmp_path / "film.gif"))
     assert len(shown) == 16
-    assert all(near(picture, "#d12b1f") > 150 for picture in shown)
-    lengths = [near(picture, "#1f3fbf") for picture in shown]
+    assert all(near(picture, FORCE) > 150 for picture in shown)
+    lengths = [near(picture, ACTUAL) for picture in shown]
     assert lengths[0] == 0
     assert lengths[-1] > lengths[5] > 10
     save_film(loop, record, context, tmp_path / "strip.png")
