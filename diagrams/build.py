@@ -15,7 +15,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.diagrams.closed_loop import ClosedLoop, make_closed_loop
+from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_closed_loop
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at, each, violated
@@ -144,7 +144,9 @@ def wire_loop(
     exogenous = exogenous_references(scenario, law)
 
     # The diagram.
-    plant = _plant(scenario, model, structure)
+    limits = _limits(scenario, model)
+    feedback = can_be_fed_back(law, scenario.sampling, limits)
+    plant = _plant(scenario, model, structure, feedback)
     with at("force" if force.is_measured else "start.positions"):
         return make_closed_loop(
             plant,
@@ -153,7 +155,7 @@ def wire_loop(
             exogenous=exogenous,
             sensor=sensor,
             sampling=scenario.sampling,
-            control_limits=_limits(scenario, model),
+            control_limits=limits,
             scene_graph=scene_graph,
             meshcat=meshcat,
             start_time=scenario.integrator.start_time,
@@ -161,12 +163,12 @@ def wire_loop(
 
 
 def _plant(
-    scenario: Scenario, model: RobotModel, structure: Structure
+    scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
 ) -> RobotPlant | ContactPlant:
     """What is simulated."""
     material = scenario.plant
     if not isinstance(material, ContactMaterial):
-        return RobotPlant(model, structure=structure)
+        return RobotPlant(model, structure=structure, feedback=feedback)
     with at("plant or plant_parameters"):
         return ContactPlant(
             model,

@@ -90,8 +90,8 @@ class ClosedLoop:
             after: Only what was logged later than this time, in s; None for all.
 
         Raises:
-            WiringError: An input port of the controller has a fixed value in this context, of which
-                nobody knows since when.
+            WiringError: An input port of plant or controller has a fixed value in this context, of
+                which nobody knows since when.
         """
         logged = Record.from_logs(self.loggers, context, after)
         if isinstance(self.plant, DaePlant):
@@ -137,16 +137,19 @@ class ClosedLoop:
             (plant, "state", "estimated_state"),
             (self.reference, "reference", "reference"),
         ):
+            port = taker.GetInputPort(name)
+            if not port.HasValue(own):
+                continue  # The law knows its references, and is fed back.
             try:
                 given = giver.GetOutputPort(source).Eval(giver.GetMyContextFromRoot(context))
             except DrakeDaeError:
                 continue  # Where a run failed.
-            if not np.array_equal(given, taker.GetInputPort(name).Eval(own), equal_nan=True):
-                raise WiringError(
-                    f"the port '{name}' of {taker.get_name()} has a fixed value in this context, "
-                    "so that its control does not follow from the state; wire plant and controller "
-                    "in a diagram of your own, with a LogVectorOutput"
-                )
+            if not np.array_equal(given, port.Eval(own), equal_nan=True):
+                raise _fixed(name, taker)
+        if plant.HasInputPort("feedback"):
+            at_plant, port = plant.GetMyContextFromRoot(context), plant.GetInputPort("control")
+            if plant.GetInputPort("feedback").HasValue(at_plant) and port.HasValue(at_plant):
+                raise _fixed("control", plant)
 
     def _parameters_along(
         self, block: DaePlant | TrackingController, context: Context, times: FloatArray
@@ -169,6 +172,27 @@ class ClosedLoop:
         time = record.time - record.time[0]
         start = record["state"][0], record["reference"][0]
         return law.predicted_error(time, *start, parameters, integral)
+
+
+def _fixed(port: str, block: DaePlant | TrackingController) -> WiringError:
+    return WiringError(
+        f"the port '{port}' of {block.get_name()} has a fixed value in this context, so that its "
+        "control does not follow from the state; wire plant and controller in a diagram of your "
+        "own, with a LogVectorOutput"
+    )
+
+
+def can_be_fed_back(
+    law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
+) -> bool:
+    """Whether a plant can take a law itself, in place of its control: see `DaePlant.feedback`.
+
+    So it is where the law acts continuously, through no drive with limits, and takes the state and
+    references alone; the arguments are those of `make_closed_loop`.
+    """
+    takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
+    is_direct = sampling is None and control_limits is None
+    return is_direct and law.system.num_controls > 0 and not takes_more
 
 
 @checked(WiringError)
@@ -229,12 +253,18 @@ def make_closed_loop(
     except DrakeDaeError:
         outputs = None  # A trajectory that begins later.
     period = plant.time_step if sampling is None else sampling.period
-    controller = builder.AddSystem(TrackingController(law, outputs, sample_period=period))
+    is_fed_back = plant.HasInputPort("feedback") and can_be_fed_back(law, sampling, control_limits)
+    own = reference if is_fed_back else None
+    controller = TrackingController(law, outputs, sample_period=period, references=own)
+    builder.AddSystem(controller)
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     held = None if sampling is None else _hold_before(plant, sampling)
     control, limits = add_drives(builder, controller, held, control_limits)
-    builder.Connect(control, plant.GetInputPort("control"))
+    if is_fed_back:
+        builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
+    else:
+        builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
+        builder.Connect(control, plant.GetInputPort("control"))
 
     moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
 

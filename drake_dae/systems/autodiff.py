@@ -11,15 +11,18 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector_,
     Context,
     ContinuousState,
     LeafSystem,
     LeafSystem_,
+    PortDataType,
 )
 
 from drake_dae.errors import ModelError
+from drake_dae.systems.feedback import Immutable, nothing
 from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 
@@ -31,12 +34,17 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         original: The block.
         formulas: Name of an output port -> what it computes; "derivative" -> the time derivative.
         places: Where parameters stand that come from an input port `exogenous`.
+        references: What the input port `reference` has where it has no wire; None if it needs one.
     """
 
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
-        self, original: LeafSystem, formulas: Mapping[str, Formula], places: Sequence[int] = ()
+        self,
+        original: LeafSystem,
+        formulas: Mapping[str, Formula],
+        places: Sequence[int] = (),
+        references: Formula | None = None,
     ) -> None:
         super().__init__()
         self.set_name(original.get_name())
@@ -48,19 +56,37 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             state = context.get_continuous_state_vector().CopyToVector()
             self.DeclareContinuousState(BasicVector_[AutoDiffXd](state))
             self._rate = formulas["derivative"]
-        self._places = list(places)
+        self._places, self._references = list(places), references
         tickets = {
-            "time": self.time_ticket(),
-            "state": self.xc_ticket(),
-            "parameters": self.all_parameters_ticket(),
+            "time": {self.time_ticket()},
+            "state": {self.xc_ticket()},
+            "parameters": {self.all_parameters_ticket()},
         }
         for i in range(original.num_input_ports()):
             port = original.get_input_port(i)
-            self.DeclareVectorInputPort(port.get_name(), port.size())
-            tickets[port.get_name()] = self.input_port_ticket(port.get_index())
+            name = port.get_name()
+            if port.get_data_type() == PortDataType.kAbstractValued:
+                self.DeclareAbstractInputPort(name, nothing())
+            else:
+                self.DeclareVectorInputPort(name, port.size())
+            tickets[name] = {self.input_port_ticket(port.get_index())}
+        of_reference = set(tickets.get("reference", ()))
+        if references is not None:
+            tickets["reference"] |= tickets["time"]
+        if "feedback" in tickets:
+            tickets["control"] |= tickets["feedback"] | tickets["time"] | tickets["state"]
         for i in range(original.num_output_ports()):
             port = original.get_output_port(i)
             name = port.get_name()
+            if port.get_data_type() == PortDataType.kAbstractValued:
+                self._law = formulas["control"]
+                self.DeclareAbstractOutputPort(
+                    name,
+                    nothing,
+                    weakly(self._calc_feedback),
+                    tickets["parameters"] | of_reference,
+                )
+                continue
             if name not in formulas:
                 raise ModelError(
                     f"{original.get_name()} does not convert to AutoDiffXd: nothing tells how to "
@@ -70,7 +96,7 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
                 name,
                 port.size(),
                 weakly(self._calc_output, formulas[name]),
-                {tickets[source] for source in _read(formulas[name].sources, self._places)},
+                set().union(*(tickets[s] for s in _read(formulas[name].sources, self._places))),
             )
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
@@ -90,21 +116,64 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             if self._places and self.GetInputPort("exogenous").HasValue(context):
                 values[self._places] = self.GetInputPort("exogenous").Eval(context)
             return values
-        return self.GetInputPort(name).Eval(context)
+        port, time = self.GetInputPort(name), context.get_time()
+        if name == "reference" and self._references is not None and not port.HasValue(context):
+            return _chained(self._references, time, [np.array([time])])
+        if name == "control" and self.HasInputPort("feedback") and not port.HasValue(context):
+            feedback = self.GetInputPort("feedback").Eval(context)
+            return feedback.control(time, self._source("state", context))
+        return port.Eval(context)
 
     def _evaluate(self, formula: Formula, context: Context) -> Any:
-        """The value with its gradient, by the chain rule; an array of AutoDiffXd."""
+        """The value with its gradient, an array of AutoDiffXd."""
         given = [self._source(name, context) for name in formula.sources]
-        time = context.get_time().value()
-        arguments = [ExtractValue(values).reshape(-1) for values in given]
-        gradients = [ExtractGradient(values) for values in given]
-        value = formula.value(time, *arguments)
-        moving = tuple(i for i, gradient in enumerate(gradients) if gradient.size)
-        total = np.zeros((value.size, 0))
-        if moving:
-            slope = formula.slope(moving, time, *arguments)
-            total = slope @ np.vstack([gradients[i] for i in moving])
-        return InitializeAutoDiff(value, total).reshape(-1)
+        return _chained(formula, context.get_time(), given)
+
+    def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
+        port, known = self.GetInputPort("reference"), {}
+        if port.HasValue(context):
+            known["reference"] = port.Eval(context)
+        known["parameters"] = self._source("parameters", context)
+        value.set_value(_Feedback(self._law, self._references, known))
+
+
+class _Feedback(Immutable):
+    """A law as a value on a wire, as `Feedback`.
+
+    Args:
+        law: The law.
+        references: What its references are.
+        known: Its parameters; and its references, if they are fixed.
+    """
+
+    def __init__(self, law: Formula, references: Formula | None, known: Mapping[str, Any]) -> None:
+        self._law, self._references, self._known = law, references, known
+
+    def control(self, time: AutoDiffXd, state: Any) -> Any:
+        """u at a time and a state, an array of AutoDiffXd."""
+        given = {"estimated_state": state, **self._known}
+        if "reference" not in given and self._references is not None:
+            given["reference"] = _chained(self._references, time, [np.array([time])])
+        return _chained(self._law, time, [given[name] for name in self._law.sources])
+
+
+def _chained(formula: Formula, time: AutoDiffXd, given: Sequence[Any]) -> Any:
+    """A formula's value with its gradient, by the chain rule; an array of AutoDiffXd.
+
+    Args:
+        formula: The formula.
+        time: The time, in s.
+        given: Its arguments, arrays of AutoDiffXd.
+    """
+    arguments = [ExtractValue(values).reshape(-1) for values in given]
+    gradients = [ExtractGradient(values) for values in given]
+    value = formula.value(time.value(), *arguments)
+    moving = tuple(i for i, gradient in enumerate(gradients) if gradient.size)
+    total = np.zeros((value.size, 0))
+    if moving:
+        slope = formula.slope(moving, time.value(), *arguments)
+        total = slope @ np.vstack([gradients[i] for i in moving])
+    return InitializeAutoDiff(value, total).reshape(-1)
 
 
 def _read(sources: Sequence[str], places: Sequence[int]) -> set[str]:

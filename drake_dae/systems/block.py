@@ -59,6 +59,11 @@ class DifferentiableSystem(LeafSystem):
     def _formulas(self) -> dict[str, Formula]:
         raise NotImplementedError
 
+    @property
+    def references_by_time(self) -> Formula | None:
+        """What an input port `reference` has where it has no wire; None if it needs one."""
+        return None
+
     def check_context(self, context: Context) -> None:
         """Refuses the context of another system.
 
@@ -244,4 +249,4 @@ class ParameterizedSystem(DifferentiableSystem):
 def _converted(original: DifferentiableSystem) -> AutoDiffSystem:
     """A block on AutoDiffXd."""
     places = original.exogenous_places if isinstance(original, ParameterizedSystem) else []
-    return AutoDiffSystem(original, original.formulas, places)
+    return AutoDiffSystem(original, original.formulas, places, original.references_by_time)

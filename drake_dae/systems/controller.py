@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -21,8 +22,10 @@ from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, NonMinimumPhaseWarning
 from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.feedback import Feedback, nothing
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
@@ -46,6 +49,9 @@ class TrackingController(ParameterizedSystem):
             zero, or where `set_integral` puts them. Where an entry of `hold` is not 0, or an
             integral has come to its limit and its error would carry it on, it stays (anti-windup).
 
+        feedback: The law with its references and parameters as a value, for the port `feedback` of
+            a `DaePlant`; if it has `references` and takes nothing but the state besides.
+
     A law with integrals also has an input port `hold`, shape (k,): where it is not 0 that error is
     not integrated, as while a drive is at its limit or a contact is lost. Without a wire it is 0.
 
@@ -63,6 +69,7 @@ class TrackingController(ParameterizedSystem):
         sample_period: Integrals are sums of the errors at the multiples of this time in s, as those
             of a `Sampling`, and do not convert; 0 for integrals by the integrator. An integrator
             has no use for a discrete plant, whose state jumps while time goes on.
+        references: What R is where the port `reference` has no wire; None if it needs one.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
@@ -80,6 +87,7 @@ class TrackingController(ParameterizedSystem):
         outputs: ArrayLike | None = None,
         integral_limits: ArrayLike = np.inf,
         sample_period: float = 0.0,
+        references: ReferenceGenerator | None = None,
     ) -> None:
         dae = law.system
         signals = {
@@ -95,11 +103,20 @@ class TrackingController(ParameterizedSystem):
         if law.measured_force:
             sizes["measured_force"] = dae.num_constraints
         self._evaluators = [self.DeclareVectorInputPort(*item).Eval for item in sizes.items()]
+        self._references = references
+        if references is not None:
+            self._reference_at = references.function
+            self._reference_port = self.GetInputPort("reference")
+            self._evaluators[1] = weakly(self._reference)
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         if law.integral.outputs:
             sources = self._add_integrals(integral_limits, sample_period)
-        self._takes_state_and_reference = len(self._evaluators) == 2 and self._exogenous is None
+        self._is_plain = len(self._evaluators) == 2 and self._exogenous is None
+        if references is not None:
+            sources.add(self.time_ticket())
+            if self._is_plain:
+                self._declare_feedback()
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
@@ -204,7 +221,7 @@ class TrackingController(ParameterizedSystem):
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
         function = self.law.function
-        if self._takes_state_and_reference:  # The same without a call more, where it has values.
+        if self._is_plain:  # The same without a call more, where it has values.
             of_state, of_reference = self._evaluators
             state, reference = of_state(context), of_reference(context)
             x, r, parameters = function.arguments
@@ -215,6 +232,34 @@ class TrackingController(ParameterizedSystem):
                 return function.outputs
         inputs = [evaluate(context) for evaluate in self._evaluators]
         return self._checked(function, context, *inputs)
+
+    def _declare_feedback(self) -> None:
+        port = self.input_port_ticket(self._reference_port.get_index())
+        self.DeclareAbstractOutputPort(
+            "feedback", nothing, weakly(self._calc_feedback), {self.all_parameters_ticket(), port}
+        )
+
+    def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
+        parameters = np.array(context.get_numeric_parameter(0).value())
+        reference = self._reference_at
+        if self._reference_port.HasValue(context):
+            fixed = self._reference_port.Eval(context)
+
+            def reference(time: float) -> FloatArray:
+                return fixed
+
+        value.set_value(Feedback(self.law.function, reference, parameters, self._signals))
+
+    def _reference(self, context: Context) -> FloatArray:
+        """R: what is wired or fixed, or what the references are at the context's time."""
+        if self._reference_port.HasValue(context):
+            return self._reference_port.Eval(context)
+        return self._reference_at(context.get_time())
+
+    @property
+    def references_by_time(self) -> Formula | None:
+        """What R is where the input port `reference` has no wire; None if it needs one."""
+        return None if self._references is None else self._references.formulas["reference"]
 
     def _integrals(self, context: Context) -> FloatArray:
         if self.sample_period:

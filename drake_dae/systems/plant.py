@@ -1,16 +1,20 @@
 """Any DaeSystem as a LeafSystem."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
+    CacheIndex,
     Context,
     ContinuousState,
     EventStatus,
     State,
+    ValueProducer,
 )
 
 from drake_dae.arguments import checked
@@ -30,10 +34,26 @@ from drake_dae.errors import (
 from drake_dae.systems.along import function_along
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.failures import off_manifold
+from drake_dae.systems.feedback import Feedback, nothing
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
+
+
+class _FedBack(NamedTuple):
+    """What a plant's derivative needs besides time and state; it never changes.
+
+    Attributes:
+        feedback: The law that is fed back; None where the control has a wire or a fixed value.
+        parameters: Values of all parameters.
+    """
+
+    feedback: Feedback | None
+    parameters: FloatArray
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
+        return self
 
 
 @checked(ModelError)
@@ -53,6 +73,9 @@ class DaePlant(ParameterizedSystem):
         control: u, shape (p,).
         exogenous: The signals w with their derivatives, if the system has any; see
             `ParameterizedSystem`.
+        feedback: A law, as the port `feedback` of a `TrackingController` gives it; if asked for.
+            Where `control` has no wire, u is what the law says of x. That is the same as by wires
+            for `state` and `control`, in half the time: an integrator calls one block, and not two.
 
     Output ports:
         state: x, shape (n,).
@@ -86,6 +109,7 @@ class DaePlant(ParameterizedSystem):
         structure: The structure of the system, by `find_constraint_structure` or
             `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
+        feedback: Whether there is an input port `feedback`; then nothing may be exogenous.
 
     Attributes:
         structure: The structure.
@@ -95,7 +119,8 @@ class DaePlant(ParameterizedSystem):
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
-        ModelError: This is no system, or the structure is that of another one.
+        ModelError: This is no system, the structure is that of another one, or a law cannot be fed
+            back.
         InconsistentStateError: A simulation starts from a state that is off N*.
         SingularityError: A(x) is singular on the way; the exception has time and state. Where
             friction jams a contact it is a JammedContactError, which tells what becomes of it.
@@ -113,6 +138,7 @@ class DaePlant(ParameterizedSystem):
         *,
         structure: ConstraintStructure | None = None,
         project: bool = True,
+        feedback: bool = False,
     ) -> None:
         structure = constraint_structure_of(type(self).__name__, system, structure)
         signals = {"state": system.state_signals, "control": system.control_signals}
@@ -151,7 +177,8 @@ class DaePlant(ParameterizedSystem):
         self._left_out = manifold_of_left_out(system)
         degrees = system.exogenous.degrees(rate, force, output, residual)
         by_state = self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
-        by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
+        self._declare_feedback(feedback)
+        self._by_control = by_state | self._control_tickets
         self.DeclareVectorOutputPort(
             "state", system.num_states, weakly(self._copy_state), state_tickets(self)
         )
@@ -159,7 +186,7 @@ class DaePlant(ParameterizedSystem):
             "constraint_force",
             len(system.force_signals),
             weakly(self._calc_force),
-            by_control if self._force_needs_control else by_state,
+            self._by_control if self._force_needs_control else by_state,
         )
         self.DeclareVectorOutputPort(
             "constraint_residual",
@@ -171,12 +198,35 @@ class DaePlant(ParameterizedSystem):
             "controlled_output",
             system.num_outputs,
             weakly(self._calc_output),
-            by_control if self._output_needs_control else by_state,
+            self._by_control if self._output_needs_control else by_state,
         )
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
         self.projects = bool(project and system.num_constraints)
         if self.projects:
             self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
+
+    def _declare_feedback(self, wanted: bool) -> None:
+        """Declares the input port `feedback`, and what u depends on besides time and state."""
+        self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
+        self._fed_back: CacheIndex | None = None
+        if not wanted:
+            return
+        if not self._is_controlled or self._exogenous is not None:
+            missing = "has exogenous signals" if self._is_controlled else "has no control"
+            raise ModelError(f"{self.dae.name} {missing}: no law can be fed back to it")
+        self._feedback_port = self.DeclareAbstractInputPort("feedback", nothing())
+        self._control_tickets.add(self.input_port_ticket(self._feedback_port.get_index()))
+        # Both are the same for many states: one look at the context, and not three.
+        self._fed_back = self.DeclareCacheEntry(
+            "feedback and parameters",
+            ValueProducer(nothing, weakly(self._calc_fed_back)),
+            self._control_tickets | {self.all_parameters_ticket()},
+        ).cache_index()
+
+    def _calc_fed_back(self, context: Context, value: AbstractValue) -> None:
+        is_fed_back = not self._control_port.HasValue(context)
+        feedback = self._feedback_port.Eval(context) if is_fed_back else None
+        value.set_value(_FedBack(feedback, np.array(self._values(context))))
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
@@ -209,14 +259,23 @@ class DaePlant(ParameterizedSystem):
         # What an integrator calls most: without a call more where the values are of use.
         dynamics = self.dynamics
         if self._is_controlled and self._exogenous is None:
-            control = self._control_port.Eval(context)
             x, u, parameters = dynamics.arguments
-            x[...] = context.get_continuous_state_vector().value()
-            u[...] = control
-            parameters[...] = context.get_numeric_parameter(0).value()
-            if dynamics.run():
-                derivatives.SetFromVector(dynamics.outputs[0])
-                return
+            if self._fed_back is None:
+                feedback, given = None, context.get_numeric_parameter(0).value()
+            else:
+                feedback, given = self.get_cache_entry(self._fed_back).Eval(context)
+            state = context.get_continuous_state_vector().value()
+            if feedback is None:
+                control = self._control_port.Eval(context)
+            else:
+                control = feedback.control(context.get_time(), state)
+            if control is not None:
+                x[...] = state
+                u[...] = control
+                parameters[...] = given
+                if dynamics.run():
+                    derivatives.SetFromVector(dynamics.outputs[0])
+                    return
         derivatives.SetFromVector(self._evaluate(dynamics, context, self._is_controlled))
 
     def _evaluate(
@@ -224,8 +283,24 @@ class DaePlant(ParameterizedSystem):
     ) -> FloatArray:
         x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
         if needs_control:
-            return self._checked(function, context, x, self._control_port.Eval(context))[0]
+            control = self._control(context)
+            if control is None:
+                return function.nowhere()[0]
+            return self._checked(function, context, x, control)[0]
         return self._checked(function, context, x)[0]
+
+    def _control(self, context: Context) -> FloatArray | None:
+        """u; None where the law that is fed back has no value at a trial."""
+        if self._fed_back is not None:
+            feedback = self.get_cache_entry(self._fed_back).Eval(context).feedback
+            if feedback is not None:
+                time, state = context.get_time(), self.state(context)
+                control = feedback.control(time, state)
+                if control is None:
+                    self._steps.tolerate(context, feedback.error(time, state))
+                    return None
+                return np.array(control)
+        return np.array(self._control_port.Eval(context))
 
     def _otherwise(
         self,
@@ -274,8 +349,11 @@ class DaePlant(ParameterizedSystem):
 
     def _crosses(self, state: FloatArray, context: Context) -> bool:
         """Whether the system crosses a singular configuration at a state next to one."""
-        control = self._control_port.Eval(context) if self._is_controlled else np.zeros(0)
-        return self._passage.motion(state, control, self._values(context)) is not None
+        control = self._control(context) if self._is_controlled else np.zeros(0)
+        return (
+            control is not None
+            and self._passage.motion(state, control, self._values(context)) is not None
+        )
 
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray

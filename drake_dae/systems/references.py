@@ -111,6 +111,7 @@ class ReferenceGenerator(DifferentiableSystem):
 
     Attributes:
         references, degrees: The arguments.
+        function: R(t) as a function of the time in s, whose array the next call overwrites.
 
     The block converts to AutoDiffXd. A time that has derivatives itself asks each reference for
     one more.
@@ -132,7 +133,7 @@ class ReferenceGenerator(DifferentiableSystem):
                 f"the references cover {covered} outputs, the law has {len(degrees)}"
             )
         self.references, self.degrees = tuple(references), tuple(degrees)
-        self._evaluate = stack_references(references, degrees)
+        self.function = stack_references(references, degrees)
         self.DeclareVectorOutputPort(
             "reference",
             sum(degree + 1 for degree in degrees),
@@ -142,15 +143,15 @@ class ReferenceGenerator(DifferentiableSystem):
 
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s, shape (sum (mu_i + 1),)."""
-        return self._evaluate(time).copy()
+        return self.function(time).copy()
 
     def along(self, times: ArrayLike) -> FloatArray:
         """R(t) at many times in s, one row for each; nan where it has no value."""
         moments = vector("times", times, None, ReferenceSignalError)
-        return signal_along(self._evaluate, self.get_output_port().size(), moments)
+        return signal_along(self.function, self.get_output_port().size(), moments)
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluate(context.get_time()))
+        output.SetFromVector(self.function(context.get_time()))
 
     def _formulas(self) -> dict[str, Formula]:
         return {"reference": _ReferenceFormula(self.references, self.degrees)}

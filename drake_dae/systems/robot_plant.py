@@ -41,6 +41,7 @@ class RobotPlant(DaePlant):
         model: The robot.
         structure: The structure of `model.dae`; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
+        feedback: Whether there is an input port `feedback`, as for `DaePlant`.
 
     Attributes:
         model: The robot.
@@ -55,8 +56,9 @@ class RobotPlant(DaePlant):
         *,
         structure: ConstraintStructure | None = None,
         project: bool = True,
+        feedback: bool = False,
     ) -> None:
-        super().__init__(model.dae, structure=structure, project=project)
+        super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
         self.model = model
         size = model.links.q.numel() + model.links.v.numel()
         parts = {"link_state": slice(0, size)}
@@ -97,9 +99,7 @@ class RobotPlant(DaePlant):
         inputs = {"state": dae.state, "force": force, "parameters": dae.parameter_symbol}
         self._wrenches = TracedFunction("constraint wrenches", inputs, {"value": wrenches})
         self._wrench_formula = wrenches, force
-        tickets = set(self._by_state)
-        if self._force_needs_control:
-            tickets.add(self.input_port_ticket(self._control_port.get_index()))
+        tickets = self._by_control if self._force_needs_control else self._by_state
         size, calc = len(self.wrench_signals), weakly(self._calc_wrenches)
         self.DeclareVectorOutputPort("constraint_wrenches", size, calc, tickets)
 

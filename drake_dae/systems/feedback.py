@@ -1,0 +1,65 @@
+"""A law as a value on a wire: what a plant needs to compute its control itself."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+from pydrake.common.value import AbstractValue
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
+from drake_dae.errors import SimulationError
+from drake_dae.systems.failures import simulation_error
+from drake_dae.trace.functions import TracedFunction
+
+
+class Immutable:
+    """A value on a wire that never changes, so that the contexts of a diagram may share it."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+
+def nothing() -> AbstractValue:
+    """What stands on such a wire before something is computed."""
+    return AbstractValue.Make(Immutable())
+
+
+class Feedback(Immutable):
+    """A law with its references and parameters: the control as a function of time and state.
+
+    Args:
+        function: The law, of state, reference and parameters; its first output is the control.
+        reference: R(t), at a time in s.
+        parameters: What the law takes as parameters; not to be changed.
+        signals: Name of an input of the law -> names of its entries, for messages.
+    """
+
+    def __init__(
+        self,
+        function: TracedFunction,
+        reference: Callable[[float], FloatArray],
+        parameters: FloatArray,
+        signals: Mapping[str, Sequence[Signal]],
+    ) -> None:
+        self._function, self._reference = function, reference
+        self._parameters, self._signals = parameters, signals
+
+    def control(self, time: float, state: FloatArray) -> FloatArray | None:
+        """u, shape (p,), overwritten by the next call; None where it has no value.
+
+        Args:
+            time: The time, in s.
+            state: x, shape (n,).
+
+        Raises:
+            NonFiniteError: The reference is not finite.
+        """
+        x, r, parameters = self._function.arguments
+        r[...] = self._reference(time)
+        x[...] = state
+        parameters[...] = self._parameters
+        return self._function.outputs[0] if self._function.run() else None
+
+    def error(self, time: float, state: FloatArray) -> SimulationError:
+        """Why the last call had no value, at its time and state."""
+        return simulation_error(self._function.failure(), time, state, self._signals)
