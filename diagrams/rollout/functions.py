@@ -23,6 +23,7 @@ class LoopFunctions:
 
     Attributes:
         loop: The closed loop.
+        is_model: Whether the plant is the law's own model, with the same numbers.
         signals: t -> R(t), and what moves with its derivatives, for the plant and for the law.
         plant: (x, u, parameters) -> x' and v.
         rest: (x, v, parameters) -> what else the record has of the plant, below each other.
@@ -30,6 +31,7 @@ class LoopFunctions:
     """
 
     loop: ClosedLoop
+    is_model: bool
     signals: TracedFunction
     plant: TracedFunction
     rest: TracedFunction
@@ -46,16 +48,27 @@ class LoopFunctions:
         return self.loop.plant.structure.manifold.newton_step
 
     @cached_property
-    def motion(self) -> TracedFunction:
+    def motion(self) -> ca.Function:
         """Plant, law and sensor at once: what both compute of the state is computed once.
 
         A function of the state with that of the sensor, of R, of what the sensor holds (or its
-        noise), and of the parameters of plant and law. It returns the derivative, v, u, the
-        measured force, and a number that is finite if all matrices are regular.
+        noise), and of the parameters of plant and law. It returns the derivative, v, a number that
+        is finite if all have values and all matrices are regular, u, and the measured force.
         """
+        return self._motions[0]
+
+    @cached_property
+    def rate(self) -> ca.Function:
+        """The first three values of `motion` alone, in fewer operations; `motion` if it has none.
+
+        Of a plant that is the law's own model the derivative follows from what the law wants.
+        """
+        return self._motions[1]
+
+    @cached_property
+    def _motions(self) -> tuple[ca.Function, ca.Function]:
         loop, dae = self.loop, self.loop.plant.dae
         lags, sensor = self.num_lags, loop.sensor
-        names = ("state", "reference", "hold", "plant", "law")
         sizes = (
             dae.num_states + lags,
             self.law.sizes[1],
@@ -63,8 +76,11 @@ class LoopFunctions:
             self.plant.sizes[-1],
             self.law.sizes[-1],
         )
-        inputs = {name: ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)}
-        state, reference, hold, plant, law = inputs.values()
+        names = ("state", "reference", "hold", "plant", "law")
+        inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
+        state, reference, hold, plant, law = inputs
+        if self.is_model:
+            plant, law = self._one_model(plant, law)
         x, felt, measured = state[: dae.num_states], state[dae.num_states :], []
         if self.is_direct:
             measured = [self.plant.function(x, ca.SX.zeros(dae.num_controls), plant)[1]]
@@ -73,13 +89,34 @@ class LoopFunctions:
         elif sensor is not None:
             measured = [felt + sensor.bias + sensor.noise_deviation * hold]
         control, _, *of_law = self.law.function(x, reference, *measured, law)
-        rate, force, *of_plant = self.plant.function(x, control, plant)
-        if lags and sensor is not None:
-            rate = ca.vertcat(rate, (force - felt) / sensor.time_constant)
-        shown = measured[0] if sensor is not None else ca.SX(0, 1)
-        outputs = {"rate": rate, "force": force, "control": control, "measured": shown}
-        valid = {"valid": of_law[-1] + of_plant[-1]}
-        return TracedFunction(f"{dae.name} closed loop", inputs, {**outputs, **valid})
+        shown = [control, measured[0] if sensor is not None else ca.SX(0, 1)]
+
+        def moved(by: TracedFunction, *arguments: ca.SX) -> list[ca.SX]:
+            rate, force, *checks = by.function(*arguments)
+            if lags and sensor is not None:
+                rate = ca.vertcat(rate, (force - felt) / sensor.time_constant)
+            return [rate, force, checks[-1]]
+
+        def function(values: list[ca.SX], *more: ca.SX) -> ca.Function:
+            if more:
+                values = [*values[:2], values[2] + of_law[-1], *more]
+            return ca.Function("motion", inputs, ca.cse(values), {"cse": False})
+
+        both = function(moved(self.plant, x, control, plant), *shown)
+        under = self.loop.controller.law.trace_motion() if self.is_model else None
+        if under is not None:
+            values = moved(under, x, reference, *measured, law)
+            if function(values).n_instructions() < 0.9 * both.n_instructions():
+                return function(values, *shown), function(values)
+        return both, both
+
+    def _one_model(self, plant: ca.SX, law: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """The parameters of plant and law, the same symbols where the numbers are the same."""
+        law = ca.SX(law)
+        places = list(self.loop.plant.exogenous_places)
+        if places:
+            law[places] = plant[places]
+        return law[: plant.numel()], law
 
     @cached_property
     def residual(self) -> TracedFunction:
@@ -130,8 +167,11 @@ class LoopFunctions:
     @property
     def num_operations(self) -> int:
         """How many operations all functions have together."""
-        functions = (self.signals, self.motion, self.rest, self.residual, self.newton)
-        return sum(function.num_operations for function in functions)
+        traced = (self.signals, self.rest, self.residual, self.newton)
+        own = [self.motion] if self.rate is self.motion else [self.motion, self.rate]
+        return sum(function.num_operations for function in traced) + sum(
+            int(function.n_instructions()) for function in own
+        )
 
     @property
     def columns(self) -> dict[str, Sequence[Signal]]:
@@ -149,7 +189,7 @@ class LoopFunctions:
 
 
 def loop_functions(loop: ClosedLoop) -> LoopFunctions:
-    """The functions of a closed loop.
+    """The functions of a closed loop, where plant and law may have different numbers.
 
     Raises:
         ModelError: A reference is no expression of time, or the loop has what no rollout has:
@@ -193,6 +233,7 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
         named["loop_state"] = plant.model.loop_joints.signals
     return LoopFunctions(
         loop,
+        False,
         signals,
         dae.trace(
             "plant",

@@ -37,13 +37,12 @@ class Fused:
             plant, law = ca.SX(plant), ca.SX(law)
             plant[loop.plant.exogenous_places] = moving
             law[loop.controller.exogenous_places] = of_law
-        rate, force, control, measured, valid, *of_motion = functions.motion.function(
-            state, reference, hold, plant, law
-        )
-        rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
-        valid += checks[-1] + of_motion[-1]
         options = {"cse": False}
-        self._rate = ca.Function("rate", inputs, [rate, force, valid], options)
+        rate, force, valid, *_ = functions.rate(state, reference, hold, plant, law)
+        self._rate = ca.Function("rate", inputs, [rate, force, valid + checks[-1]], options)
+        _, force, valid, control, measured = functions.motion(state, reference, hold, plant, law)
+        rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
+        valid += checks[-1]
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
         rows = ca.Function("rows", inputs, [row, valid + of_rest[-1]], options)
         self._rows = rows.map(CHUNK)

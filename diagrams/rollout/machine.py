@@ -111,12 +111,14 @@ def _source(functions: LoopFunctions) -> str:
     plant, sensor = loop.plant, loop.sensor
     dae = plant.dae
     calls = {
-        "signals": functions.signals,
+        "signals": functions.signals.function,
         "motion": functions.motion,
-        "rest": functions.rest,
-        "residual": functions.residual,
-        "newton": functions.newton,
+        "rest": functions.rest.function,
+        "residual": functions.residual.function,
+        "newton": functions.newton.function,
     }
+    if functions.rate is not functions.motion:
+        calls["rate"] = functions.rate
     columns = functions.columns
     moving = [len(block.exogenous_places) for block in (plant, loop.controller)]
     if loop.exogenous is None:
@@ -140,9 +142,9 @@ def _source(functions: LoopFunctions) -> str:
         "PROJECTS": int(plant.projects),
     }
     for name, function in calls.items():
-        sizes[f"{name.upper()}_ARG"] = function.function.sz_arg()
+        sizes[f"{name.upper()}_ARG"] = function.sz_arg()
         # At least as many as the initializers in stepper.c.
-        sizes[f"{name.upper()}_RES"] = max(7, function.function.sz_res())
+        sizes[f"{name.upper()}_RES"] = max(7, function.sz_res())
     zeros = np.zeros(dae.num_constraints)
     places = [plant.exogenous_places, loop.controller.exogenous_places]
     tables = {
@@ -158,14 +160,15 @@ def _source(functions: LoopFunctions) -> str:
         "dop_a_more": DOP853.A_EXTRA,
         "dop_c_more": DOP853.C_EXTRA,
     }
-    lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
+    lines = [] if "rate" in calls else ["#define dae_rate dae_motion"]
+    lines += [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for name, chosen, count in zip(("plant", "law"), places, moving, strict=True):
         listed = ", ".join(map(str, [*chosen[:count], 0]))
         lines.append(f"static const int {name}_places[] = {{{listed}}};")
     lines += [_table(name, np.asarray(values)) for name, values in tables.items()]
     words = {
         "generated": without_branches(
-            generate(*(_renamed(each.function, f"dae_{name}") for name, each in calls.items()))
+            generate(*(_renamed(each, f"dae_{name}") for name, each in calls.items()))
         ),
         "constants": "\n".join([*lines, ""]),
     }

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
 from typing import TypeVar
@@ -121,27 +121,37 @@ def run_loop(
     scale = np.concatenate([loop.plant.dae.scale, np.ones(functions.num_lags)])
     settings = Settings.of(config, scale)
     problems = _problems(functions, starts, parameters, moments, seeds)
-    if lasting is None:
-        code = _machine_code(functions, choice, settings, len(problems) * np.ptp(moments))
-    else:
-        code = _machine_code(functions, choice, settings, lasting, look=False)
-    # Machine code lets go of Python's lock: threads are enough for all cores.
+    seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
+    kinds = [_is_model(loop, problem) for problem in problems]
+    found: dict[int, Rollout] = {}
+    for kind in set(kinds):
+        chosen = [index for index, each in enumerate(kinds) if each is kind]
+        functions = functions_of(loop, kind)
+        code = _machine_code(functions, choice, settings, seconds, look=lasting is None)
+        runs = _runs(functions, [problems[index] for index in chosen], settings, code)
+        for index, run in zip(chosen, runs, strict=True):
+            found[index] = _result(functions, problems[index], run)
+    return [found[index] for index in range(len(problems))]
+
+
+def _runs(
+    functions: LoopFunctions,
+    problems: Sequence[Problem],
+    settings: Settings,
+    code: machine.Library | None,
+) -> list[Run]:
+    """What runs come to, by machine code if there is any."""
     if code is None:
-        fused = _kept(loop, "fused", lambda: Fused(functions))
+        fused = _kept(functions, "fused", lambda: Fused(functions))
         run = interpreted.runner(fused, settings)
-        return [_result(functions, problem, run(problem)) for problem in problems]
-
-    def step(problem: Problem) -> Run:
-        return machine.run(code, functions, problem, settings)
-
-    # What else there is shares arrays, and so takes one thread.
+        return [run(problem) for problem in problems]
     if len(problems) == 1:
-        return [_result(functions, problems[0], step(problems[0]))]
+        return [machine.run(code, functions, problems[0], settings)]
+    # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:
-        runs = pool.map(step, problems)
-        return [
-            _result(functions, problem, run) for problem, run in zip(problems, runs, strict=True)
-        ]
+        return list(
+            pool.map(lambda problem: machine.run(code, functions, problem, settings), problems)
+        )
 
 
 @checked(ModelError)
@@ -170,20 +180,40 @@ def start_values(loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatA
     return np.concatenate(parts), np.concatenate(values)
 
 
-def functions_of(loop: ClosedLoop) -> LoopFunctions:
+def functions_of(loop: ClosedLoop, is_model: bool = False) -> LoopFunctions:
     """The functions of a closed loop, traced once.
+
+    Args:
+        loop: The closed loop.
+        is_model: Whether plant and law have the same numbers; see `LoopFunctions`.
 
     Raises:
         ModelError: The loop has what no rollout has.
     """
-    return _kept(loop, "functions", lambda: loop_functions(loop))
+    memory, name = loop.memory, f"functions {is_model}"
+    if name not in memory:
+        memory[name] = (
+            replace(functions_of(loop), is_model=True) if is_model else loop_functions(loop)
+        )
+    found: LoopFunctions = memory[name]
+    return found
 
 
-def _kept(loop: ClosedLoop, name: str, make: Callable[[], T]) -> T:
-    """What is made once for a loop."""
-    if name not in loop.memory:
-        loop.memory[name] = make()
-    found: T = loop.memory[name]
+def _is_model(loop: ClosedLoop, problem: Problem) -> bool:
+    """Whether the plant of a run is the law's own model, with the same numbers."""
+    if loop.plant.dae is not loop.controller.law.system:
+        return False
+    same = problem.plant == problem.law[: problem.plant.size]
+    same[loop.plant.exogenous_places] = True
+    return bool(same.all())
+
+
+def _kept(functions: LoopFunctions, name: str, make: Callable[[], T]) -> T:
+    """What is made once for the functions of a loop."""
+    memory, key = functions.loop.memory, f"{name} {functions.is_model}"
+    if key not in memory:
+        memory[key] = make()
+    found: T = memory[key]
     return found
 
 
@@ -271,7 +301,8 @@ def _machine_code(
     """
     if compiled is False:
         return None
-    kept: machine.Library | None = functions.loop.memory.get("library")
+    name = f"library {functions.is_model}"
+    kept: machine.Library | None = functions.loop.memory.get(name)
     if kept is not None:
         return kept
     make = True
@@ -285,7 +316,7 @@ def _machine_code(
             return None
     found = machine.load(functions, compiled, make)
     if found is not None:
-        functions.loop.memory["library"] = found
+        functions.loop.memory[name] = found
     return found
 
 

@@ -61,24 +61,28 @@ static int set_time(double time, Moment *m) {
 
 /* The derivative of the state; where it has no value all of it is nan. */
 static int rates(double time, const double *x, Moment *m, double *rate) {
-  double valid, checks[2];
+  double valid;
   const double *arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
-  double *res[MOTION_RES] = {rate, m->force, m->control, m->measured, &valid, checks, checks + 1};
+  double *res[MOTION_RES] = {rate, m->force, &valid, m->control, m->measured};
   int i, good = set_time(time, m);
-  dae_motion(arg, res, 0, 0, 0);
-  good &= isfinite(valid) && isfinite(checks[1]);
+  dae_rate(arg, res, 0, 0, 0);
+  good &= isfinite(valid) != 0;
   for (i = 0; !good && i < SIZE; i++) rate[i] = NAN;
   return good;
 }
 
 /* One row of the record. */
 static int write(double time, const double *x, Moment *m, double *row) {
-  double rate[SIZE + 1], checks[3];
+  double rate[SIZE + 1], sum, checks[3];
+  const double *motion_arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
+  double *motion_res[MOTION_RES] = {rate, m->force, &sum, m->control, m->measured};
   const double *arg[REST_ARG] = {x, m->force, m->plant};
   double *res[REST_RES] = {row + NUM_STATES, checks, checks + 1};
-  int i, valid = rates(time, x, m, rate);
+  int i, valid = set_time(time, m);
   const double *parts[4] = {m->control, m->reference, m->moving, m->measured};
   const int sizes[4] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING, NUM_MEASURED};
+  dae_motion(motion_arg, motion_res, 0, 0, 0);
+  valid &= isfinite(sum) != 0;
   memcpy(row, x, NUM_STATES * sizeof(double));
   dae_rest(arg, res, 0, 0, 0);
   row += NUM_STATES + NUM_REST;
@@ -219,27 +223,24 @@ static void note(Run *run, double time, const double *x, double *trial) {
   memcpy(trial, x, SIZE * sizeof(double));
 }
 
+/* x and the weighted sum of rates; most weights of a high order are zero. */
+static void weigh(double step, int count, const double *b, const double *x, double (*k)[SIZE],
+                  double *reached) {
+  double sum[SIZE] = {0.0};
+  int i, j;
+  for (j = 0; j < count; j++) {
+    if (b[j] == 0.0) continue;
+    for (i = 0; i < SIZE; i++) sum[i] += b[j] * k[j][i];
+  }
+  for (i = 0; i < SIZE; i++) reached[i] = x[i] + step * sum[i];
+}
+
 /* The state and the rate at a stage of an explicit Runge-Kutta method. */
 static void stage(Run *run, double time, double step, int count, const double *a, double c,
                   const double *x, Moment *m, double (*k)[SIZE], double *trial) {
   double at[SIZE];
-  int i, j;
-  for (i = 0; i < SIZE; i++) {
-    double sum = 0.0;
-    for (j = 0; j < count; j++) sum += a[j] * k[j][i];
-    at[i] = x[i] + step * sum;
-  }
+  weigh(step, count, a, x, k, at);
   if (!rates(time + c * step, at, m, k[count])) note(run, time + c * step, at, trial);
-}
-
-static void weigh(double step, int count, const double *b, const double *x, double (*k)[SIZE],
-                  double *reached) {
-  int i, j;
-  for (i = 0; i < SIZE; i++) {
-    double sum = 0.0;
-    for (j = 0; j < count; j++) sum += b[j] * k[j][i];
-    reached[i] = x[i] + step * sum;
-  }
 }
 
 /* Fixed steps, whose number divides what lies between two times of the record or of a sample. */
@@ -320,7 +321,7 @@ static double error_of(double step, const double *x, const double *reached, doub
   int i, j;
   for (i = 0; i < SIZE; i++) {
     double unit = absolute[i] + fmax(fabs(x[i]), fabs(reached[i])) * relative, e5 = 0.0, e3 = 0.0;
-    for (j = 0; j < 13; j++) {
+    for (j = 0; j < 12; j++) {
       e5 += dop_e5[j] * k[j][i];
       e3 += dop_e3[j] * k[j][i];
     }
@@ -339,7 +340,7 @@ __attribute__((visibility("default"))) int run_controlled(
     double relative, long long budget) {
   Moment m;
   double k[16][SIZE], reached[SIZE], f[7][SIZE], between[SIZE];
-  int i, j, s, status, valid;
+  int i, j, s, status, valid, known = 0, is_on = 0;
   memcpy(m.plant, plant_parameters, NUM_PLANT * sizeof(double));
   memcpy(m.law, law_parameters, NUM_LAW * sizeof(double));
   m.hold = hold;
@@ -354,12 +355,17 @@ __attribute__((visibility("default"))) int run_controlled(
   }
   for (;;) {
     double limit, error = 0.0, size;
+    long long event = run->event;
     int rejected = 0;
     if (run->row == num_rows) return DONE;
     if (budget-- == 0) return PAUSED;
     status = update(run, x, hold, &m, events, num_events, noise);
     if (status != DONE) return status;
-    if (!rates(run->time, x, &m, k[0])) return INVALID;
+    if (known && event == run->event) {
+      memcpy(k[0], k[12], sizeof(k[0])); /* The rate where the last step ended. */
+    } else if (!rates(run->time, x, &m, k[0])) {
+      return INVALID;
+    }
     limit = times[num_rows - 1];
     if (run->event < num_events && events[run->event] < limit) limit = events[run->event];
     if (run->step == 0.0) {
@@ -373,10 +379,14 @@ __attribute__((visibility("default"))) int run_controlled(
       if (!(size > 1e-12 * fabs(run->time)) || run->failures >= 1000) return STUCK;
       for (s = 1; s < 12; s++) stage(run, run->time, size, s, dop_a[s], dop_c[s], x, &m, k, trial);
       weigh(size, 12, dop_b, x, k, reached);
-      if (!rates(end, reached, &m, k[12])) note(run, end, reached, trial);
       error = error_of(size, x, reached, k, absolute, relative);
       valid = isfinite(error) != 0;
       factor = error == 0.0 ? 10.0 : fmin(10.0, fmax(0.2, 0.9 * pow(error, -1.0 / 8.0)));
+      if (valid && error < 1.0) {
+        is_on = project(end, reached, &m);
+        valid = rates(end, reached, &m, k[12]);
+        if (!valid) note(run, end, reached, trial);
+      }
       if (valid && error < 1.0) {
         /* A step that only ended early, at a sample, says nothing against longer ones. */
         run->step = rejected ? size * fmin(1.0, factor) : fmax(size * factor, size < run->step ? run->step : 0.0);
@@ -419,11 +429,13 @@ __attribute__((visibility("default"))) int run_controlled(
     }
     status = accept(run, limit, x, reached);
     if (status != DONE) return status;
+    if (is_on) run->pending = 2; /* It is on N* already. */
+    known = is_on;
     if (run->row < num_rows && times[run->row] == limit) {
       if (run->row == num_rows - 1) {
         status = update(run, x, hold, &m, events, num_events, noise);
         if (status != DONE) return status;
-      } else if (!project(limit, x, &m)) {
+      } else if (!is_on) {
         return OFF_MANIFOLD;
       }
       if (!write(limit, x, &m, rows + run->row * WIDTH)) return INVALID;

@@ -111,7 +111,9 @@ class Derivatives:
         """Whether an expression holds unknowns, so that A(x) must be regular for it."""
         return any(ca.depends_on(expression, unknown) for unknown in self._symbols[1:])
 
-    def inverse(self, expression: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX] | None:
+    def inverse(
+        self, expression: ca.SX, wanted: ca.SX, shown: ca.SX | None = None
+    ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
         """The control for which an expression of the motion takes wanted values.
 
         The equations of the motion and `expression = wanted` are solved together for the control
@@ -122,12 +124,16 @@ class Derivatives:
         Args:
             expression: Of the state and of the unknowns, shape (p, 1).
             wanted: The wanted values, shape (p, 1).
+            shown: What else of the motion is asked for, at that control, shape (k, 1).
 
         Returns:
-            u in terms of the state, shape (p, 1), and a scalar that is 0 exactly where it is not
-            determined; None if the equations are not linear in what the control moves.
+            u in terms of the state, shape (p, 1), a scalar that is 0 exactly where it is not
+            determined, and what is shown; None if the equations are not linear in what the control
+            moves.
         """
-        used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
+        shown = ca.SX(0, 1) if shown is None else shown
+        both = ca.vertcat(expression, shown)
+        used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(both, w)]
         orders = max(used, default=0)
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
@@ -153,7 +159,7 @@ class Derivatives:
             factors = Factorization(ca.densify(matrix[rows, columns]))
             blocks.append((own, factors.solve(-known), factors.pivot))
         # From the control back to what it needs: the rest moves, but nobody asks for it.
-        needed, pivot = self.control, ca.SX(1)
+        needed, pivot = ca.vertcat(self.control, shown), ca.SX(1)
         for own, solution, own_pivot in reversed(blocks):
             if ca.depends_on(needed, own):
                 needed, pivot = ca.vertcat(needed, solution), ca.fmin(pivot, own_pivot)
@@ -162,9 +168,9 @@ class Derivatives:
         _, found = ca.substitute_inplace(
             [symbols[still], *(own for own, _, _ in blocks)],
             [values[still], *(solution for _, solution, _ in blocks)],
-            [self.control, pivot],
+            [self.control, pivot, shown],
         )
-        return found[0], found[1]
+        return found[0], found[1], found[2]
 
     def _slopes(self, expression: ca.SX, orders: int, moved: Sequence[bool]) -> ca.SX:
         """The derivatives of equations of some orders, and of an expression, by what moves."""

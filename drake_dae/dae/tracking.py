@@ -121,14 +121,30 @@ class TrackingLaw:
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
+        self._wanted = ubar
+        self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
         return TracedFunction(
             f"{self.system.name} tracking law",
-            {"state": self.system.state, **inputs, "parameters": numbers},
+            self._inputs,
             outputs,
             pivot,
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
             compiled=self.system.compiled,
         )
+
+    def trace_motion(self) -> TracedFunction | None:
+        """x' and v of a plant that is the law's own model, under the law; see `motion_for`.
+
+        Returns:
+            A function of what `function` takes; None where there is none.
+        """
+        found = self.structure.motion_for(self._wanted) if self._model is self.structure else None
+        if found is None:
+            return None
+        rate, force, pivot = found
+        outputs = {"rate": rate, "force": force}
+        name = f"{self.system.name} under its law"
+        return TracedFunction(name, self._inputs, outputs, pivot, often=False)
 
     def _trace_error_coordinates(self) -> TracedFunction:
         """The error coordinates as a function of state and reference: the initial value of (30)."""

@@ -237,6 +237,6 @@ def test_the_inverse_holds_no_unknown_whose_slope_cancels():
     both = rate + c * (s * rate[[1, 0]]) - s * (c * rate[[1, 0]])
     assert ca.sparsify(ca.jacobian(both, rate)).nnz() == 2
     wanted = ca.SX.sym("wanted", 2)
-    found, _ = motion.inverse(both, wanted)
+    found, *_ = motion.inverse(both, wanted)
     function = TracedFunction("inverse", {"x": x, "wanted": wanted}, {"u": found})
     np.testing.assert_allclose(function([0.3, 0.2, 0.1, 0.4], [5.0, 7.0])[0], [5.0, 7.0])

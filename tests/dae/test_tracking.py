@@ -48,6 +48,33 @@ def test_the_closed_loop_has_exactly_the_predicted_error(problem):
         assert np.abs(late).max() < 1e-7
 
 
+def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(problem):
+    """By elimination, equations (9), (10), (13), (14), off N* too; to the round-off of the control.
+
+    A law that finds its control by B(x), or whose contacts rub, tells no motion.
+    """
+    system, law = problem.system, TrackingLaw(problem.system, poles(-3.0))
+    motion, elimination = law.trace_motion(), law.structure.elimination
+    u = ca.SX.sym("u", system.num_controls)
+    if motion is None:
+        by_matrix = law.structure.derivatives.inverse(law.structure.highest_derivatives, u) is None
+        assert by_matrix or system.rubbing or system.control_metric is not None
+        return
+    rate = elimination.f_star + ca.mtimes(elimination.h_star, u)
+    force = elimination.alpha + ca.mtimes(elimination.beta, u)
+    plant = system.trace("plant", {"rate": rate, "force": force}, {"u": u})
+    random, p = np.random.default_rng(5), system.parameter_values
+    start = problem.consistent(random)
+    for state in (start, start + 1e-3 * random.standard_normal(start.size)):
+        R = reference_at(problem, 0.2)
+        control = law.control(state, R)
+        size = 1.0 + np.abs(control).max()
+        for found, wanted in zip(
+            motion(state, R, law.all_parameters()), plant(state, control, p), strict=True
+        ):
+            np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * size)
+
+
 def test_the_closed_loop_stays_on_the_manifold():
     """The law and the elimination hold the constraint; only the integrator drifts."""
     for name in ("two_link_arm", "third_order", "knife_edge"):

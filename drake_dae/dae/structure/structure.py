@@ -83,6 +83,29 @@ class Structure(ConstraintStructure):
         """The output chains below each other, as `layout` stacks them, shape (sum mu_i, 1)."""
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
 
+    def motion_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
+        """x' and v under the control of `control_for`, solved for along with it.
+
+        That takes no forward dynamics: with rigid joints it is kinematics, and no M(q) is factored.
+
+        Args:
+            wanted: ubar of (28), shape (p, 1).
+
+        Returns:
+            x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
+            not determined; None where the control is not found in that way, and where friction may
+            leave the motion open though the control is determined.
+        """
+        if self.system.control_metric is not None or self.system.rubbing:
+            return None
+        motion = self.derivatives
+        shown = ca.vertcat(motion.rate, motion.constraint_input)
+        found = motion.inverse(self.highest_derivatives, wanted, shown)
+        if found is None:
+            return None
+        size = self.system.num_states
+        return found[2][:size, :], found[2][size:, :], found[1]
+
     def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
         """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
 
@@ -94,12 +117,12 @@ class Structure(ConstraintStructure):
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
         """
-        found = None
+        found: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
             found = self.derivatives.inverse(self.highest_derivatives, wanted)
         if found is None:  # L_h* of an output vanishes, but not by structure.
             found = self.control_by_matrix(wanted)
-        control, pivot = found
+        control, pivot, *_ = found
         if self.chains_need_force:
             pivot = ca.fmin(pivot, self.elimination.pivot)
         return control, pivot
