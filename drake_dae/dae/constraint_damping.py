@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from drake_dae.arguments import checked, result_of
 from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import affine, eliminate
+from drake_dae.dae.elimination import eliminate
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.structure.structure import Structure
@@ -69,7 +69,7 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
     rows = list(range(len(degrees)))
     moving = system.l + ca.mtimes(system.m, derivatives.constraint_input)
     for order in range(max(degrees, default=0) + 1):
-        values, _ = affine(derivatives.expand(moving), derivatives.control)
+        values, _ = derivatives.by_control(moving)
         for place, i in enumerate(rows):
             if degrees[i] == order:
                 highest[i] = moving[place]
@@ -79,7 +79,7 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
         rows = [rows[place] for place in still]
         if rows:
             moving = derivatives.derivative(moving[still])
-    drift, control_matrix = affine(derivatives.expand(highest), derivatives.control)
+    drift, control_matrix = derivatives.by_control(highest)
     elimination = eliminate(derivatives)
     return replace(
         structure,

@@ -21,7 +21,11 @@ import numpy as np
 
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+from drake_dae.trace.factorization import (
+    Factorization,
+    PositiveDefiniteFactorization,
+    nonzeros,
+)
 
 
 class Derivatives:
@@ -83,6 +87,7 @@ class Derivatives:
         if system.rubbing:
             self.pivot = ca.fmin(self.pivot, system.rubbing.reserve(self.constraint_matrix))
         self._equations: list[ca.SX] = []
+        self._control_slopes: list[ca.SX] = []
         self._solve_order(damping)
 
     @property
@@ -106,6 +111,50 @@ class Derivatives:
     def expand(self, expression: ca.SX) -> ca.SX:
         """An expression in terms of state, control and parameters alone."""
         return self._inline(expression, len(self._values))
+
+    def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """a(x) and B(x) of an expression a(x) + B(x) u of the motion, as (9)-(14) and (16) read.
+
+        B goes from unknown to unknown, as they solve the equations of the motion: that takes far
+        fewer operations than to differentiate what stands for them.
+
+        Args:
+            expression: Of the state and of the unknowns, shape (k, 1).
+
+        Returns:
+            a and B in terms of the state alone, shapes (k, 1) and (k, p); B is sparse.
+        """
+        orders = self._orders_in(expression)
+        slope = self._slope(expression, orders)
+        unknowns = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
+        zero = ca.SX.zeros(self.control.numel())
+        free = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
+        both = ca.substitute(
+            ca.vertcat(expression, ca.vec(slope)),
+            ca.vertcat(unknowns, self.control),
+            ca.vertcat(ca.substitute(free, self.control, zero), zero),
+        )
+        size = expression.numel()
+        return both[:size, :], ca.sparsify(ca.reshape(both[size:, :], slope.shape))
+
+    def _orders_in(self, expression: ca.SX) -> int:
+        """How many orders of unknowns an expression is in terms of."""
+        used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
+        return max(used, default=0)
+
+    def _slope(self, expression: ca.SX, orders: int) -> ca.SX:
+        """The derivative of an expression by the control, in terms of unknowns."""
+        while len(self._control_slopes) < orders:
+            k, count = len(self._control_slopes), len(self._rows)
+            # The matrix in front of the newest unknowns holds the state alone.
+            moved = self._slope(self._equations[k], k)
+            solution = self._unknowns(moved[:count, :], moved[count:, :])
+            self._control_slopes.append(ca.sparsify(solution))
+        slope = ca.jacobian(expression, self.control)
+        for unknown, moves in zip(self._symbols[1:], self._control_slopes[:orders], strict=False):
+            which = sorted(set(moves.sparsity().row()))
+            slope += ca.mtimes(ca.jacobian(expression, unknown[which]), moves[which, :])
+        return slope
 
     def has_unknowns(self, expression: ca.SX) -> bool:
         """Whether an expression holds unknowns, so that A(x) must be regular for it."""
@@ -132,9 +181,7 @@ class Derivatives:
             moves.
         """
         shown = ca.SX(0, 1) if shown is None else shown
-        both = ca.vertcat(expression, shown)
-        used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(both, w)]
-        orders = max(used, default=0)
+        orders = self._orders_in(ca.vertcat(expression, shown))
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
         values = ca.vertcat(ca.SX(0, 1), *self._values[:orders])
         moved = ca.which_depends(values, self.control, 1, True) if orders else []
@@ -151,23 +198,35 @@ class Derivatives:
             return None
         blocks = []
         waiting = list(range(unknowns.numel()))
-        for rows, columns in _diagonal_blocks(matrix.sparsity()):
-            own, ahead = unknowns[columns], unknowns[waiting]
+        for stage in _stages(matrix.sparsity()):
+            ahead = unknowns[waiting]
             # What is solved for later may stand here with a slope that cancels.
-            known = ca.substitute(equations[rows], ahead, ca.SX.zeros(ahead.numel()))
-            waiting = [column for column in waiting if column not in columns]
-            factors = Factorization(ca.densify(matrix[rows, columns]))
-            blocks.append((own, factors.solve(-known), factors.pivot))
+            every = equations[[row for rows, _ in stage for row in rows]]
+            known = ca.vertsplit(
+                ca.substitute(every, ahead, ca.SX.zeros(ahead.numel())),
+                np.cumsum([0, *[len(rows) for rows, _ in stage]]).tolist(),
+            )
+            for (rows, columns), right in zip(stage, known, strict=True):
+                factors = Factorization(ca.densify(matrix[rows, columns]))
+                blocks.append((columns, factors.solve(-right), factors.pivot))
+            solved = {column for _, columns in stage for column in columns}
+            waiting = [column for column in waiting if column not in solved]
         # From the control back to what it needs: the rest moves, but nobody asks for it.
-        needed, pivot = ca.vertcat(self.control, shown), ca.SX(1)
-        for own, solution, own_pivot in reversed(blocks):
-            if ca.depends_on(needed, own):
-                needed, pivot = ca.vertcat(needed, solution), ca.fmin(pivot, own_pivot)
-        if still and ca.depends_on(needed, symbols[still]):
+        solutions = [solution for _, solution, _ in blocks]
+        uses = nonzeros(ca.jacobian_sparsity(ca.vertcat(ca.SX(0, 1), *solutions), unknowns))
+        needed, pivot, last = [self.control, shown], ca.SX(1), len(uses)
+        is_needed = nonzeros(ca.jacobian_sparsity(ca.vertcat(*needed), unknowns)).any(axis=0)
+        for columns, solution, own_pivot in reversed(blocks):
+            last -= len(columns)
+            if is_needed[columns].any():
+                is_needed |= uses[last : last + len(columns)].any(axis=0)
+                needed.append(solution)
+                pivot = ca.fmin(pivot, own_pivot)
+        if still and ca.depends_on(ca.vertcat(*needed), symbols[still]):
             pivot = ca.fmin(pivot, self.pivot)
         _, found = ca.substitute_inplace(
-            [symbols[still], *(own for own, _, _ in blocks)],
-            [values[still], *(solution for _, solution, _ in blocks)],
+            [symbols[still], *(unknowns[columns] for columns, _, _ in blocks)],
+            [values[still], *solutions],
             [self.control, pivot, shown],
         )
         return found[0], found[1], found[2]
@@ -254,16 +313,24 @@ class Derivatives:
         )
 
 
-def _diagonal_blocks(pattern: ca.Sparsity) -> list[tuple[list[int], list[int]]]:
-    """Rows and columns of the blocks of a square matrix, in the order in which they are solved."""
+def _stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:
+    """Rows and columns of the blocks of a square matrix, in stages.
+
+    A block needs what blocks of earlier stages solve for, and nothing else.
+    """
     count, rows, columns, row_starts, column_starts, _, _ = pattern.btf()
-    return [
-        (
-            rows[row_starts[k] : row_starts[k + 1]],
-            columns[column_starts[k] : column_starts[k + 1]],
-        )
-        for k in range(count)
-    ]
+    used = nonzeros(pattern)
+    stages: list[list[tuple[list[int], list[int]]]] = []
+    stage_of = np.full(pattern.size2(), -1)
+    for k in range(count):
+        own_rows = rows[row_starts[k] : row_starts[k + 1]]
+        own = columns[column_starts[k] : column_starts[k + 1]]
+        stage = int(stage_of[used[own_rows].any(axis=0)].max()) + 1
+        stage_of[own] = stage
+        if stage == len(stages):
+            stages.append([])
+        stages[stage].append((own_rows, own))
+    return stages
 
 
 def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:

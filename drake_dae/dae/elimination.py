@@ -44,9 +44,9 @@ class Elimination:
 
 def eliminate(derivatives: Derivatives) -> Elimination:
     """Reads (9)-(14) off the derivatives on N*, which are affine in the control."""
-    system, control = derivatives.system, derivatives.control
-    alpha, beta = affine(derivatives.expand(derivatives.constraint_input), control)
-    f_star, h_star = affine(derivatives.expand(derivatives.rate), control)
+    system = derivatives.system
+    alpha, beta = derivatives.by_control(derivatives.constraint_input)
+    f_star, h_star = derivatives.by_control(derivatives.rate)
     return Elimination(
         constraint_gradient=derivatives.constraint_gradient,
         constraint_matrix=derivatives.constraint_matrix,
@@ -87,12 +87,3 @@ def eliminate_numbers(
     added, added_size = multiply(fields["g"], beta, 1.0 / columns)
     h_star = without_round_off(h + added, size + added_size)
     return h_star, multiply(fields["m"], beta, 1.0 / columns)
-
-
-def affine(expression: ca.SX, control: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """a and B of an expression a(x) + B(x) u, shapes (k, 1) and (k, p)."""
-    zero = ca.SX.zeros(control.numel())
-    slope = ca.jacobian(expression, control)
-    return ca.substitute(expression, control, zero), ca.sparsify(
-        ca.substitute(slope, control, zero)
-    )

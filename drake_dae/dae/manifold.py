@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.factorization import smallest_sine
+from drake_dae.trace.factorization import nonzeros, smallest_sine
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     PRECISION,
@@ -420,9 +420,7 @@ def _followed(
 
 def _levels(layout: Layout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:
     """The rows of each order of derivatives, and the states that are new in them."""
-    used = np.zeros(gradient.shape, dtype=bool)
-    rows, columns = gradient.sparsity().get_triplet()
-    used[rows, columns] = True
+    used = nonzeros(gradient.sparsity())
     known = np.zeros(gradient.shape[1], dtype=bool)
     levels = []
     for order in range(max(layout.degrees, default=0)):

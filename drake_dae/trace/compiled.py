@@ -19,9 +19,11 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import warnings
 from contextlib import suppress
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -45,6 +47,10 @@ FLAGS = (
     "-DGCC_HASCLASSVISIBILITY",
 )
 """-O1 comes with them: -O2 takes twice the time for code that is at most a tenth faster."""
+
+ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
+"""Options of Python that make it a C compiler, where ziglang is installed. Code for any processor:
+a home may be shared by machines; and without Zig's own checks of what C leaves undefined."""
 
 LOOK = 500
 """After so many calls "auto" looks into the cache: that takes about as long as they did."""
@@ -226,7 +232,9 @@ class Compiler(NamedTuple):
 
 
 def find_compiler() -> Compiler:
-    """The C compiler that CC names, with options if it has any; else `cc`.
+    """The C compiler that CC names, with options if it has any; else `cc`; else what pip brought.
+
+    The last is `python -m ziglang cc`, the optional group "compiler".
 
     Raises:
         MachineCodeError: There is none.
@@ -237,13 +245,17 @@ def find_compiler() -> Compiler:
 @cache
 def _find_compiler(named: str, _: str) -> Compiler:
     try:
-        command = shlex.split(named) or ["cc"]
+        command = shlex.split(named)
     except ValueError as error:
         raise MachineCodeError(f"CC is no command, {named!r}: {error}") from None
+    if not command:
+        has_own = shutil.which("cc") or find_spec("ziglang") is None
+        command = ["cc"] if has_own else [sys.executable, *ZIG]
     if shutil.which(command[0]) is None:
         where = f"CC names '{command[0]}', which is" if named.strip() else "'cc' is"
         raise MachineCodeError(
-            f"no C compiler: {where} not found; install gcc or clang, or name one in CC"
+            f"no C compiler: {where} not found; install gcc or clang, or drake_dae[compiler], or "
+            "name one in CC"
         )
     version = _run([*command, "--version"], PATIENCE * LIMIT)
     library = "CS_GNU_LIBC_VERSION" in os.confstr_names and os.confstr("CS_GNU_LIBC_VERSION")

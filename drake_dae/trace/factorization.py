@@ -3,6 +3,16 @@
 from collections.abc import Sequence
 
 import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import Booleans
+
+
+def nonzeros(pattern: ca.Sparsity) -> Booleans:
+    """Which entries of a matrix are not zero by its structure."""
+    result = np.zeros(pattern.shape, dtype=bool)
+    result[pattern.get_triplet()] = True
+    return result
 
 
 class Factorization:

@@ -52,6 +52,25 @@ def test_derivatives_are_those_along_the_constrained_motion(problem):
         np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * np.abs(two).max())
 
 
+def test_the_parts_with_and_without_control_are_those_of_what_unknowns_stand_for(problem):
+    """By unknowns from order to order, and by CasADi's derivative of the expanded expression."""
+    system = problem.system
+    motion = motion_of(system)
+    x, u, p = system.state, motion.control, system.parameter_symbol
+    along = ca.vertcat(ca.sin(x[0]) + ca.sumsqr(x) * x[-1], motion.constraint_input)
+    second = motion.derivative(motion.derivative(along))
+    drift, matrix = motion.by_control(second)
+    whole = motion.expand(second)
+    ours = ca.Function("ours", [x, p], [drift, matrix])
+    expanded = ca.Function("expanded", [x, u, p], [whole, ca.jacobian(whole, u)])
+    state, values = problem.consistent(np.random.default_rng(1)), system.parameter_values
+    found, wanted = ours(state, values), expanded(state, np.zeros(u.numel()), values)
+    for one, two in zip(found, wanted, strict=True):
+        scale = np.abs(two.full()).max(initial=0.0)
+        # Second derivatives, sums of hundreds of terms.
+        np.testing.assert_allclose(one.full(), two.full(), rtol=1e-11, atol=1e-12 * scale)
+
+
 @pytest.mark.slow
 def test_the_rate_is_that_of_the_elimination(problem):
     system = problem.system

@@ -237,6 +237,7 @@ def test_without_a_compiler(cache, monkeypatch):
     runs_interpreted("CC is no command")
     monkeypatch.delenv("CC")
     monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.setattr("drake_dae.trace.compiled.find_spec", lambda name: None)
     runs_interpreted("no C compiler: 'cc' is not found")
     assert contents() == []
 
@@ -245,6 +246,37 @@ def script(path, text: str) -> str:
     path.write_text(f"#!/bin/sh\n{text}\n")
     path.chmod(0o700)
     return str(path)
+
+
+@needs_compiler
+def test_a_compiler_that_python_brings(cache, monkeypatch, tmp_path):
+    """Where there is no `cc`, and `python -m ziglang cc` is one: here a stand-in."""
+    script(tmp_path / "cc", f'PATH={os.environ["PATH"]} exec {find_compiler().command[0]} "$@"')
+    (tmp_path / "ziglang").mkdir()
+    (tmp_path / "ziglang" / "__init__.py").touch()
+    (tmp_path / "ziglang" / "__main__.py").write_text(
+        "import os, sys\n"
+        "options = [word for word in sys.argv[2:] if not word.startswith('-mcpu')]\n"
+        f"os.execv({str(tmp_path / 'cc')!r}, ['cc', *options])\n"
+    )
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "ziglang"))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert find_compiler().command[:3] == (sys.executable, "-m", "ziglang")
+    function = made(True)
+    for one, two in zip(function(X, P), made(False)(X, P), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert function.is_machine_code
+
+
+@needs_compiler
+def test_a_compiler_of_several_words(cache, monkeypatch, tmp_path):
+    launcher = script(tmp_path / "launcher", 'exec "$@"')  # As ccache is.
+    monkeypatch.setenv("CC", f"{launcher} {' '.join(find_compiler().command)}")
+    function = made(True)
+    function(X, P)
+    assert function.is_machine_code
 
 
 def test_a_compiler_that_fails(cache, monkeypatch, tmp_path):

@@ -196,12 +196,11 @@ def examine_constraints(
         ModelError: A function is not finite, or the mass matrix is none.
     """
     try:
-        chains = constraint_chains(system, guesses, region)
+        chains, samples = constraint_chains(system, guesses, region)
     except AssumptionError as error:
         if error.violation is not None:
             raise _as_redundant(system, error.violation).error() from None
         raise
-    samples = Samples(Manifold(system, chains), guesses, region)
     _check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)

@@ -11,13 +11,14 @@ import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination, affine, eliminate_numbers
+from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.dae.structure.dependence import redundant_constraints
 from drake_dae.dae.system import DaeSystem
+from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized
 
@@ -27,7 +28,7 @@ MANY = 10
 
 def constraint_chains(
     system: DaeSystem, guesses: FloatArray, region: Region | None
-) -> list[list[ca.SX]]:
+) -> tuple[list[list[ca.SX]], Samples]:
     """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3).
 
     Args:
@@ -35,9 +36,14 @@ def constraint_chains(
         guesses: States near which consistent ones are sought, shape (count, n).
         region: Where the consistent states must be; None for anywhere.
 
+    Returns:
+        The chains, and consistent states with the numbers at them.
+
     Raises:
         AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
             constraint.
+        InconsistentStateError: There is no consistent state near a guess.
+        ModelError: A function is not finite.
     """
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
@@ -50,6 +56,7 @@ def constraint_chains(
         samples = Samples(Manifold(system, chains), guesses, region)
         force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
         control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
+        reached = _reached(explicit.g, f, last, x)
         still, stuck = [], []
         for row, i in enumerate(undecided):
             order = len(chains[i])
@@ -62,10 +69,12 @@ def constraint_chains(
                 state = samples.states[int(np.argmax(control_acts[row]))]
                 raise Violation(3, Cause.EARLY_CONTROL, (names[i],), order, state).error()
             still.append(i)
-            if not _reaches(explicit.g, f, last[row], x) or (
+            if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
             ):
                 stuck.append(i)
+        if not still:
+            return chains, samples
         if sum(len(chain) for chain in chains) + len(still) > system.num_states:
             stuck = still
         if stuck:
@@ -78,7 +87,7 @@ def constraint_chains(
                 following += system.exogenous.rate(chains[i][-1])
             chains[i].append(following)
         undecided = still
-    return chains
+    return chains, Samples(Manifold(system, chains), guesses, region)
 
 
 class OutputChains(NamedTuple):
@@ -105,7 +114,7 @@ def output_chains(
     Raises:
         AssumptionError: Assumption (4) is violated, or no control acts on an output.
     """
-    system, control = derivatives.system, derivatives.control
+    system = derivatives.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     names, count = [s.name for s in system.output_signals], system.num_outputs
     controls = system.num_controls
@@ -139,9 +148,10 @@ def output_chains(
         last = ca.vertcat(*[chains[i][-1] for i in still])
         # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
         moving = derivatives.derivative(moving[[undecided.index(i) for i in still]])
-        following, rows = affine(derivatives.expand(moving), control)
+        following, rows = derivatives.by_control(moving)
         slopes = samples.derivatives(rows, last, h_star_values)
         acts, stuck = _acts(slopes), []
+        reached = _reached(h_star, f_star, last, x)
         for row, i in enumerate(still):
             if acts[row].any():
                 continue
@@ -150,7 +160,7 @@ def output_chains(
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
             if (
                 used.numel() >= system.num_states
-                or not _reaches(h_star, f_star, last[row], x)
+                or not reached[row]
                 or (rows[row, :].nnz() and samples.dependent(used))
             ):
                 stuck.append(names[i])
@@ -184,24 +194,15 @@ def _acts(numbers: FloatArray) -> Booleans:
     return np.asarray(numbers.any(axis=2)).T
 
 
-def _reaches(fields: ca.SX, drift: ca.SX, expression: ca.SX, state: ca.SX) -> bool:
-    """Whether an input along the fields can influence an expression at all, by structure."""
+def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:
+    """Which expressions an input along the fields can influence at all, by structure."""
     influence = _pattern(drift, state)
-    needed = _pattern(expression, state)[0]
+    moved = nonzeros(fields.sparsity()).any(axis=1)
     for _ in range(state.numel()):
-        needed = needed | influence[needed].any(axis=0)
-    moved = _nonzeros(fields).any(axis=1)
-    return bool((needed & moved).any())
+        moved = moved | influence[:, moved].any(axis=1)
+    return np.asarray((_pattern(expressions, state) & moved).any(axis=1))
 
 
 def _pattern(expression: ca.SX, state: ca.SX) -> Booleans:
     """Which entries (rows) depend on which states (columns)."""
-    return _nonzeros(ca.SX(ca.jacobian_sparsity(expression, state), 1))
-
-
-def _nonzeros(matrix: ca.SX) -> Booleans:
-    """Which entries are structurally nonzero."""
-    result = np.zeros(matrix.shape, dtype=bool)
-    rows, columns = matrix.sparsity().get_triplet()
-    result[rows, columns] = True
-    return result
+    return nonzeros(ca.jacobian_sparsity(expression, state))
