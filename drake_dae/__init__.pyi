@@ -40,6 +40,7 @@ from .diagrams.rollout.rollout import rollout as rollout
 from .diagrams.rollout.rollout import start_values as start_values
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
+from .diagrams.scenario_model import complete_scenario as complete_scenario
 from .diagrams.sweep.study import Study as Study
 from .diagrams.sweep.sweep import sweep as sweep
 from .diagrams.sweep.variations import grid_variations as grid_variations
@@ -79,6 +80,7 @@ from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions
 from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
+from .robots.outputs import TiltFromNormal as TiltFromNormal
 from .simulation.animation import make_animation as make_animation
 from .simulation.record import Record as Record
 from .simulation.record_writer import RecordWriter as RecordWriter
