@@ -16,14 +16,15 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_closed_loop
+from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at, each, violated
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
     add_robot,
+    completed_model,
     index_of,
-    scenario_model,
     scenario_structure,
     start_guess,
 )
@@ -50,22 +51,32 @@ def build_scenario(
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    loop = build_loop(scenario, meshcat)
-    return loop, start_scenario(scenario, loop)
+    completed, loop = build_completed(scenario, meshcat)
+    return loop, start_scenario(completed.scenario, loop)
 
 
-def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
-    """The closed loop of a scenario, which `start_scenario` starts as often as one likes.
+def build_completed(
+    scenario: Scenario, meshcat: Meshcat | None = None
+) -> tuple[Completed, ClosedLoop]:
+    """A scenario completed, and its loop, which `start_scenario` starts as often as one likes.
 
     The arguments and errors are those of `build_scenario`.
     """
     scene_graph = SceneGraph()
-    model = scenario_model(scenario, scene_graph)
+    completed, model = completed_model(scenario, scene_graph)
     try:
         structure = scenario_structure(model)
     except AssumptionError as error:
         raise violated(error) from error
-    return wire_loop(scenario, model, structure, scene_graph, meshcat)
+    return completed, wire_loop(completed.scenario, model, structure, scene_graph, meshcat)
+
+
+def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
+    """The closed loop of a scenario of which nothing is left open.
+
+    The arguments and errors are those of `build_scenario`.
+    """
+    return build_completed(scenario, meshcat)[1]
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:

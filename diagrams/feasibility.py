@@ -15,7 +15,7 @@ from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.diagrams.build import exogenous_references, wire_scenario
 from drake_dae.diagrams.feasibility_report import Feasibility, SignalRange
 from drake_dae.diagrams.scenario import Scenario
-from drake_dae.diagrams.scenario_model import scenario_model, scenario_structure
+from drake_dae.diagrams.scenario_model import completed_model, scenario_structure
 from drake_dae.diagrams.scenario_parts import IdealConstraints
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.model import RobotModel
@@ -47,7 +47,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         ScenarioError: Something does not fit; the message names its key. A violated assumption is
             no error: the analysis tells it.
     """
-    model = scenario_model(scenario)
+    completed, model = completed_model(scenario)
+    scenario = completed.scenario
     try:
         structure = scenario_structure(model)
     except AssumptionError:

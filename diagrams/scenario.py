@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator
@@ -59,6 +59,7 @@ Output = Annotated[
     outputs.PointCoordinates
     | outputs.AxisCoordinates
     | parts.SurfaceCoordinates
+    | parts.TiltFromNormal
     | outputs.JointPositions,
     Choice(_WRITTEN),
 ]
@@ -123,7 +124,10 @@ class Scenario:
             free, locked, and driven.
         constraints: What it touches or holds; a form without a tag is a PointOnSurface. Those that
             the robot's file has, as mimic joints, follow them.
-        outputs: Position outputs; the constraint forces follow them.
+        outputs: Position outputs; the constraint forces follow them. Where they are fewer than
+            actuators less force outputs, they are completed: see `complete_scenario`.
+        tool_axis: What completed outputs hold of the tool's axis: normal to the surface, fixed in
+            the world, or nothing (free).
         forces: The force outputs: names of constraint forces, and combinations of forces by tags;
             all constraint forces where left out. Forces that nobody can or shall steer, as those of
             wheels and of mimic joints, stay out: [] is none.
@@ -150,8 +154,9 @@ class Scenario:
             MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
-        references: The references, in the order of the outputs, the forces last.
-        start: Where the robot starts.
+        references: The references, in the order of the outputs, the forces last. Outputs that
+            complete others may be without; they hold what they start with.
+        start: Where the robot starts; without positions that is found.
         duration: How long the run lasts, in s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
         write: What the run leaves in its folder.
@@ -163,6 +168,7 @@ class Scenario:
     robot: parts.Robot
     constraints: list[Constraint] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
+    tool_axis: Literal["normal", "fixed", "free"] = "normal"
     forces: list[ForceOutput] | None = None
     control_weights: list[float] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)

@@ -1,15 +1,18 @@
 """The robot of a scenario, with what it touches and what it shall steer."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.diagrams.completion.completion import Completed, complete
 from drake_dae.diagrams.keys import at, each
 from drake_dae.diagrams.robot_file.changes import change_robot, finalize
 from drake_dae.diagrams.robot_file.reading import read_into, read_robot
@@ -40,9 +43,76 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
+    return completed_model(scenario, scene_graph)[1]
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def complete_scenario(scenario: Scenario) -> Completed:
+    """A scenario of which nothing is left open: its outputs, and where the robot starts.
+
+    Outputs may be left out, or be fewer than the actuators less the force outputs. What completes
+    them, as far as each is independent of those before it: the world coordinates of each point that
+    touches a surface along it; what `tool_axis` holds of the tool's axis; and positions of joints,
+    of which that set is taken that keeps B(x) (16) best conditioned, and joints off their limits,
+    along the reference. Whatever has no reference holds the value that it starts with.
+
+    Where start.positions are left out and the robot's default configuration leads to no regular
+    start, that is sought with the first values of the references.
+
+    Args:
+        scenario: What `load_scenario` returns.
+
+    Returns:
+        The scenario, the same where nothing was left out, and what was chosen in words.
+
+    Raises:
+        ScenarioError: Something does not fit, the start cannot be reached, or no outputs complete
+            those that are given; the message names the key.
+    """
+    return _read(scenario, SceneGraph()).completed
+
+
+def completed_model(
+    scenario: Scenario, scene_graph: SceneGraph | None = None
+) -> tuple[Completed, RobotModel]:
+    """What `complete_scenario` and `scenario_model` return."""
+    robot = _read(scenario, scene_graph or SceneGraph())
+    scenario = robot.completed.scenario
+    outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
+    with at("actuation" if robot.stages else "outputs"):
+        model = RobotModel(
+            robot.links,
+            robot.constraints,
+            outputs,
+            start_guess(scenario.start.positions, robot.links),
+            robot.name,
+            robot.stages,
+            scenario.forces,
+            tuple(scenario.exogenous),
+            robot.loads,
+            scenario.compliances,
+            scenario.control_weights or None,
+            scenario.compiled,
+        )
+    return robot.completed, model
+
+
+@dataclass(frozen=True, eq=False)
+class _Robot:
+    """A scenario's robot as far as it is checked, and the scenario with nothing left open."""
+
+    name: str
+    links: MultibodyExpressions
+    constraints: Sequence[Constraint]
+    stages: Sequence[Stage]
+    loads: Sequence[KnownForce]
+    completed: Completed
+
+
+def _read(scenario: Scenario, scene_graph: SceneGraph) -> _Robot:
     # The robot.
     name = Path(scenario.robot.file).name.split(".")[0]  # Of "two_arms.dmd.yaml", too.
-    links = _links(scenario.robot, scene_graph or SceneGraph())
+    links = robot_links(scenario.robot, scene_graph)
 
     # What it touches or holds.
     constraints = _constraints(scenario.constraints, links)
@@ -56,31 +126,19 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
         raise ScenarioError(("robot.actuators", text))
 
     # What it shall steer, from where, and by what.
-    outputs = _outputs(scenario.outputs, constraints, links)
+    _outputs(scenario.outputs, constraints, links)
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
     _check_forces(scenario.forces, constraints, links)
     _check_compliances(scenario.compliances, constraints, links)
     loads = each("loads", scenario.loads, lambda load: _load(load, links))
-    weights = scenario.control_weights or None
     with at("control_weights"):
-        choice = control_choice(name, weights, actuators)
+        choice = control_choice(name, scenario.control_weights or None, actuators)
     _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
-    with at("actuation" if stages else "outputs"):
-        return RobotModel(
-            links,
-            constraints,
-            outputs,
-            guess,
-            name,
-            stages,
-            scenario.forces,
-            tuple(scenario.exogenous),
-            loads,
-            scenario.compliances,
-            weights,
-            scenario.compiled,
-        )
+
+    # What it leaves open.
+    completed = complete(scenario, links, constraints, plant_constraints(links), guess)
+    return _Robot(name, links, constraints, stages, loads, completed)
 
 
 def scenario_structure(model: RobotModel) -> Structure:
@@ -113,7 +171,16 @@ def add_robot(robot: Robot, plant: MultibodyPlant, scene_graph: SceneGraph) -> N
 
 
 @at("robot.file")
-def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
+def robot_links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
+    """The links of a scenario's robot.
+
+    Args:
+        robot: What the scenario has under `robot`.
+        scene_graph: Where its geometry is registered.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
     plant, efforts = read_robot(robot, scene_graph)
     change_robot(robot, plant, efforts)
     finalize(plant)

@@ -130,8 +130,9 @@ class Robot:
             names, or name -> effort limit in N m or N, or "all" that turn or slide and mimic no
             other. Where no limit is given it is that of the file. Controls have this order, after
             those that the file gives actuators.
-        leave_out: What the file has and the equations have not: joint_friction, which is Coulomb
-            friction; without this it is refused.
+        leave_out: What the file has and the equations have not, which is refused without this:
+            joint_friction, which is Coulomb friction; inertia that no body can have, in whose place
+            Drake takes that of a ball of water of the same mass.
     """
 
     file: str
@@ -140,7 +141,7 @@ class Robot:
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
-    leave_out: list[Literal["joint_friction"]] = field(default_factory=list)
+    leave_out: list[Literal["joint_friction", "inertia"]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -176,10 +177,27 @@ class SurfaceCoordinates(Written[outputs.PositionOutput]):
     constraint: str
 
     def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
-        named = {constraint.name: constraint for constraint in constraints}
-        if self.constraint not in named:
-            raise ModelError(unknown_name("constraint", self.constraint, named))
-        return outputs.SurfaceCoordinates(named[self.constraint])
+        return outputs.SurfaceCoordinates(_named(self.constraint, constraints))
+
+
+@dataclass(frozen=True)
+class TiltFromNormal(Written[outputs.PositionOutput]):
+    """`robots.outputs.TiltFromNormal` of the constraint with a name."""
+
+    constraint: str
+    axis: str
+    components: str = ""
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        contact = _named(self.constraint, constraints)
+        return outputs.TiltFromNormal(contact, self.axis, self.components)
+
+
+def _named(name: str, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+    named = {constraint.name: constraint for constraint in constraints}
+    if name not in named:
+        raise ModelError(unknown_name("constraint", name, named))
+    return named[name]
 
 
 @dataclass(frozen=True)

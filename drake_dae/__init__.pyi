@@ -40,6 +40,7 @@ from .diagrams.rollout.rollout import rollout as rollout
 from .diagrams.rollout.rollout import start_values as start_values
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
+from .diagrams.scenario_model import complete_scenario as complete_scenario
 from .diagrams.shipped import shipped_model as shipped_model
 from .diagrams.sweep.study import Study as Study
 from .diagrams.sweep.sweep import sweep as sweep
@@ -80,6 +81,7 @@ from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions
 from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
+from .robots.outputs import TiltFromNormal as TiltFromNormal
 from .simulation.animation import make_animation as make_animation
 from .simulation.film import save_film as save_film
 from .simulation.record import Record as Record

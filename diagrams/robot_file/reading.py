@@ -96,6 +96,8 @@ def _is_answered(warning: str, robot: Robot) -> bool:
     """Whether the scenario says what to do about a warning of Drake's parser."""
     if "effort limit" in warning:
         return robot.actuators is not None
+    if "inertia" in warning:
+        return "inertia" in robot.leave_out
     return "friction" in warning and "joint_friction" in robot.leave_out
 
 
@@ -166,7 +168,8 @@ def _explained(warning: str) -> str:
     if "inertia" in text:
         text = (
             "mass or inertia of no body: a mass is positive, moments of inertia are positive and "
-            "none exceeds the sum of the others"
+            "none exceeds the sum of the others. Mend it, or write leave_out: [inertia] under "
+            "robot, which takes a ball of water of that mass in its place"
         )
     elif "friction" in text:
         text = (

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number
 from drake_dae.diagrams.scenario import Scenario, read_scenario, scenario_data, varied_data
+from drake_dae.diagrams.scenario_model import complete_scenario
 from drake_dae.diagrams.sweep.cluster import Cluster
 from drake_dae.diagrams.sweep.journal import Journal, open_journal, study_head
 from drake_dae.diagrams.sweep.processes import cores, run_in_processes
@@ -68,6 +69,8 @@ def sweep(
         ModelError: The file belongs to another study, or cannot be written; processes or cluster
             cannot be used.
     """
+    with suppress(ScenarioError):  # Each run tells it, or has other values.
+        scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)
     chosen = [{key: plain(key, value) for key, value in changes.items()} for changes in variations]
     _check(base, chosen)

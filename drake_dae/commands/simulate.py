@@ -17,7 +17,7 @@ from pydrake.systems.framework import Context
 
 import drake_dae
 from drake_dae.commands.view import show
-from drake_dae.diagrams.build import build_scenario
+from drake_dae.diagrams.build import build_completed, start_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
@@ -53,9 +53,12 @@ def run_command(options: argparse.Namespace) -> int:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
     began = time.perf_counter()
-    loop, context = build_scenario(scenario, meshcat)
+    completed, loop = build_completed(scenario, meshcat)
+    scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
     simulate_by = _roll if options.rollout else _step
     print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
+    for note in completed.notes:
+        print(note, flush=True)
     folder = options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     with ending_signals(end_at_once), run_folder(folder):
         save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")

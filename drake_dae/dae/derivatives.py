@@ -215,7 +215,7 @@ class Derivatives:
         solutions = [solution for _, solution, _ in blocks]
         uses = nonzeros(ca.jacobian_sparsity(ca.vertcat(ca.SX(0, 1), *solutions), unknowns))
         needed, pivot, last = [self.control, shown], ca.SX(1), len(uses)
-        is_needed = nonzeros(ca.jacobian_sparsity(ca.vertcat(*needed), unknowns)).any(axis=0)
+        is_needed = np.any(nonzeros(ca.jacobian_sparsity(ca.vertcat(*needed), unknowns)), axis=0)
         for columns, solution, own_pivot in reversed(blocks):
             last -= len(columns)
             if is_needed[columns].any():

@@ -119,6 +119,55 @@ class SurfaceCoordinates(PositionOutput):
 
 @checked(ModelError)
 @dataclass(frozen=True)
+class TiltFromNormal(PositionOutput):
+    """How far an axis of the frame that touches a surface is off the surface's normal there:
+
+        h_1(q) = R_WF^T n(p_W(q)),    of which the rows across the axis,
+
+    the unit normal n in the axes of the frame. Both rows are zero where the axis is along the
+    normal, whichever way, and the sines of small angles around; on a curved surface the axis
+    follows the normal as the point moves.
+
+    Attributes:
+        contact: A constraint that touches what has a free side, as a `PointOnSurface`.
+        axis: The axis of its frame, "x", "y" or "z".
+        components: Which of the two other axes are rows, "xy" for example; both if empty.
+    """
+
+    contact: Constraint
+    axis: str
+    components: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.axis) != 1:
+            raise ModelError(f"axis must be one of x, y, z, got '{self.axis}'")
+        check_axes("axis", self.axis)
+        others = "xyz".replace(self.axis, "")
+        if self.components:
+            check_axes("components", self.components)
+        if self.axis in self.components:
+            raise ModelError(
+                f"components must be of {' and '.join(others)}, which are across the axis "
+                f"{self.axis}, got '{self.components}'"
+            )
+        object.__setattr__(self, "components", self.components or others)
+
+    def expression(self, links: Links) -> ca.SX:
+        touch = self.contact.touch(links)
+        if touch is None:
+            raise ModelError(
+                f"constraint '{self.contact.name}' touches nothing that has a normal; use "
+                "AxisCoordinates"
+            )
+        normal = ca.mtimes(links.rotation(touch.frame).T, touch.normal)
+        return normal[["xyz".index(a) for a in self.components]]
+
+    def signals(self, links: Links) -> tuple[Signal, ...]:
+        return tuple(Signal(f"{self.contact.name}.tilt_{c}") for c in self.components)
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
 class JointPositions(PositionOutput):
     """The generalized positions with given names.
 

@@ -753,7 +753,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["outputs.0: ", "'pin'", "no coordinates"],
         ),
         # Outputs.
-        ("outputs=[]", ["outputs: ", "2 actuators", "1 position output", "0 (none)"]),
         ("outputs.0.axes=xz", ["outputs: ", "1 position output", "2 (tool.x, tool.z)"]),
         ("outputs.0.axes=x", ["outputs: Assumption (5)", "'tool.x'"]),
         ("outputs.0.axes=zz", ["outputs.0: axes", "'zz'"]),

@@ -16,6 +16,7 @@ from drake_dae import (
     PointOnSurface,
     Signal,
     SurfaceCoordinates,
+    TiltFromNormal,
 )
 from drake_dae.errors import ModelError
 from drake_dae.robots.outputs import PositionOutput
@@ -29,6 +30,8 @@ MEMBERS = {
     "axis": AxisCoordinates("tool", "z", "xy"),
     "wall": SurfaceCoordinates(WALL),
     "pipe": SurfaceCoordinates(PIPE),
+    "tilt": TiltFromNormal(PIPE, "z"),
+    "one tilt": TiltFromNormal(WALL, "x", "z"),
     "joints": JointPositions(["joint7", "joint3"]),
     "expression": ExpressionOutput(
         lambda links: ca.sumsqr(links.position("tool")), [Signal("reach", "m^2")]

@@ -15,6 +15,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture
+from drake_dae.robots.contact.surface import Vector
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
@@ -47,6 +48,23 @@ class Application:
         """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
         force = ca.mtimes(self.force_axes, constraint_force)
         return force if self.drag is None else force + self.drag
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """Where a point of a robot touches something that has a free side.
+
+    Attributes:
+        frame: Name of the frame of the point.
+        point: The point in the frame, m, shape (3,).
+        normal: The unit normal toward the free side there, in the world, shape (3, 1).
+        clearance: A point in the world, shape (3, 1) -> how far it is on the free side, in m.
+    """
+
+    frame: str
+    point: Vector
+    normal: ca.SX
+    clearance: Callable[[ca.SX], ca.SX]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +124,8 @@ class Constraint(ABC):
         `friction_parameter` names that.
     14. `solid` is what its one force comes from where Drake's own contact is the plant: what stands
         in the world and pushes frame B of its first application at the point there.
+    15. `touch` tells at which point it touches what has a free side, if it does; `residual` is then
+        the clearance of that point.
 
     Attributes:
         name: Stands before the names of its forces, residuals and parameters.
@@ -190,6 +210,10 @@ class Constraint(ABC):
     @property
     def joint(self) -> Joint | None:
         """What it has along its one coordinate; None if it is no joint."""
+        return None
+
+    def touch(self, frames: Frames) -> Touch | None:
+        """Where it touches what has a free side; None if there is no such side."""
         return None
 
     def placement(self, values: FloatArray) -> RigidTransform:

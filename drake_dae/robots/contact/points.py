@@ -11,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_axes
 from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.constraint import Application, Constraint
+from drake_dae.robots.contact.constraint import Application, Constraint, Touch
 from drake_dae.robots.contact.friction import Friction, friction_parameters
 from drake_dae.robots.contact.picture import Picture
 from drake_dae.robots.contact.surface import Surface, Vector, rotation_of
@@ -98,7 +98,11 @@ class PointOnSurface(Constraint):
 
     def offset(self, frames: Frames) -> ca.SX:
         """The point relative to the surface as it stands, in its axes, m, shape (3, 1)."""
-        offset = frames.position(self.frame, self.point) - self.parameters[0].symbol
+        return self._offset(frames.position(self.frame, self.point))
+
+    def _offset(self, point: ca.SX) -> ca.SX:
+        """The same of any point in the world."""
+        offset = point - self.parameters[0].symbol
         return ca.mtimes(self._rotation().T, offset) if self.rpy is not None else offset
 
     def _rotation(self) -> ca.SX:
@@ -149,6 +153,14 @@ class PointOnSurface(Constraint):
 
     def coordinates(self, frames: Frames) -> ca.SX:
         return self.surface.coordinates(self.offset(frames))
+
+    def touch(self, frames: Frames) -> Touch:
+        return Touch(
+            self.frame,
+            self.point,
+            self._normal(frames),
+            lambda point: self.surface.distance(self._offset(point)),
+        )
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         push, drag, rubbing = self._normal(kinematics), None, self._friction(kinematics)

@@ -1,0 +1,327 @@
+"""What a scenario leaves open: outputs that are missing, and where the robot starts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.references import ConstantReference, Reference
+from drake_dae.diagrams import scenario_parts as parts
+from drake_dae.diagrams.completion.candidates import Candidates, merged
+from drake_dae.diagrams.completion.choice import best_joints, first_independent
+from drake_dae.diagrams.completion.postures import Posture, Postures
+from drake_dae.diagrams.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.diagrams.scenario import Scenario
+from drake_dae.errors import ScenarioError
+from drake_dae.robots.contact import Constraint
+from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.force_outputs import force_outputs, force_rows
+from drake_dae.robots.links.links import Links
+
+REGULAR = 1e-3
+"""A start whose `independence` is less is singular."""
+
+_TIMES = 25
+"""At so many times along the reference choices are compared."""
+
+_DIGITS = 4
+"""Decimals of m and rad with which a start is written."""
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A scenario of which nothing is left open.
+
+    Attributes:
+        scenario: The scenario.
+        notes: What was chosen, a line each; none if there was nothing to choose.
+    """
+
+    scenario: Scenario
+    notes: tuple[str, ...] = ()
+
+
+def complete(
+    scenario: Scenario,
+    links: Links,
+    constraints: Sequence[Constraint],
+    of_plant: Sequence[Constraint],
+    guess: FloatArray,
+) -> Completed:
+    """Chooses the outputs that a scenario leaves out, and where the robot starts.
+
+    Outputs are missing where they are, with the force outputs, fewer than the actuators. Those that
+    complete them are, as far as each is independent of the ones before: the world coordinates along
+    the surface of each point that touches one; what `tool_axis` holds of the tool's direction; and
+    positions of joints, of which that set is taken that keeps B(x) best conditioned, and joints off
+    their limits, along the reference. What has no reference holds the value that it starts with.
+
+    Without start.positions the robot starts where its default configuration leads by Newton's
+    method, or else, of 60 tries, in the posture of best `quality` with the first values of the
+    references.
+
+    Args:
+        scenario: The scenario.
+        links: Its robot.
+        constraints: Its constraints.
+        of_plant: Those that the robot's file has.
+        guess: The default configuration with start.positions, shape (nq,).
+
+    Raises:
+        ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
+    """
+    bound = ConstraintSet([*constraints, *of_plant])
+    given = [parts.made(form, constraints) for form in scenario.outputs]
+    size = sum(len(output.signals(links)) for output in given)
+    S = force_rows(force_outputs(scenario.forces, bound), bound, links)
+    actuators = len(links.actuator_signals) + len(bound.motors)
+    missing = actuators - size - S.shape[0]
+    if not (size or S.shape[0] or scenario.references):
+        return Completed(scenario)  # It is only simulated.
+    if scenario.control_weights or scenario.compliances is not None:
+        return Completed(scenario)
+    if np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals):
+        return Completed(scenario)  # The model refuses it.
+    if missing < 0 or (missing == 0 and scenario.start.positions):
+        return Completed(scenario)
+    candidates = Candidates(scenario, links, given, bound)
+    postures = Postures(
+        links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
+    )
+    task = _Task(scenario, candidates, size, S.shape[0], missing)
+    if missing == 0:
+        return _with_start(scenario, task, postures, guess)
+    return _with_outputs(scenario, task, postures, guess)
+
+
+class _Task:
+    """Which rows have references, and their values.
+
+    Attributes:
+        scenario, candidates: The arguments.
+        given: How many rows the scenario gives.
+        missing: How many are missing.
+        referred: How many rows have references: those that are given, and then those that complete
+            them.
+        places: Where among the references those of the rows that complete begin and end.
+    """
+
+    def __init__(
+        self, scenario: Scenario, candidates: Candidates, given: int, forces: int, missing: int
+    ) -> None:
+        self.scenario, self.candidates = scenario, candidates
+        self.given, self.missing = given, missing
+        sizes = np.cumsum([0, *[reference.size for reference in scenario.references]])
+        self.referred = int(sizes[-1]) - forces
+        if missing and not given <= self.referred <= given + missing:
+            raise ScenarioError(
+                (
+                    "references",
+                    f"{sizes[-1]} values; needed are those of the {given} given outputs, of as "
+                    f"many of the {missing} that complete them as one likes, and of the {forces} "
+                    "forces",
+                )
+            )
+        if missing and self.referred not in sizes:
+            text = "one reference covers a position and a force; write it as two"
+            raise ScenarioError(("references", text))
+        self.place = int(np.searchsorted(sizes, self.referred))
+
+    def wanted(self, time: float) -> FloatArray:
+        """The values of the referred rows at a time in s, shape (referred,)."""
+        values = [_value(reference, time) for reference in self.scenario.references]
+        return np.concatenate([np.zeros(0), *values])[: self.referred]
+
+    def times(self) -> FloatArray:
+        """Times along the references, in s."""
+        begin = self.scenario.integrator.start_time
+        return np.linspace(begin, begin + self.scenario.duration, _TIMES)
+
+    def at_start(self, rows: Sequence[int]) -> FloatArray:
+        """The values of the referred rows at the start, with start.errors."""
+        errors = self.scenario.start.errors
+        wanted = self.wanted(self.scenario.integrator.start_time)
+        signals = [self.candidates.signals[row] for row in rows]
+        return wanted + np.array([errors.get(signal.name, 0.0) for signal in signals])
+
+
+def _with_start(
+    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+) -> Completed:
+    """The scenario with a start, if its default configuration leads to none."""
+    if task.referred != task.given:
+        return Completed(scenario)  # Whoever wires the references tells it.
+    rows = range(task.given)
+    wanted = task.at_start(rows)
+    near = near_posture(postures, rows, wanted, guess)
+    # The structure is found at the guess itself.
+    if near is not None and all(
+        posture.independence(rows) > REGULAR for posture in (near, postures.at(guess))
+    ):
+        return Completed(scenario)
+    found = _found(task, postures, rows, wanted, guess)
+    return Completed(_started(scenario, task, found), (_start_note(task, found),))
+
+
+def _with_outputs(
+    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+) -> Completed:
+    """The scenario with all outputs and a start."""
+    candidates, given = task.candidates, list(range(task.given))
+    # Rows that references cover are known before the posture is: by the normal near the guess.
+    near = postures.at(postures.solve((), np.zeros(0), guess))
+    points = [row for row in candidates.points(near) if row in _movable(postures)]
+    referred = [*given, *points][: task.referred]
+    if len(referred) < task.referred:
+        raise ScenarioError(
+            (
+                "references",
+                f"{task.referred} values for positions, but beside the {task.given} outputs that "
+                f"are given only {len(referred) - task.given} along surfaces can complete them; "
+                "name the others under outputs",
+            )
+        )
+    posture, is_normal = _posture(task, postures, referred, guess)
+    # What completes the outputs, in the order of their worth.
+    open_points = [row for row in candidates.points(posture) if row not in referred]
+    room = task.missing - len(referred) + task.given
+    along = first_independent(posture, referred, open_points, room)
+    rows = [*referred, *along]
+    room -= len(along)
+    held = first_independent(posture, rows, candidates.axes, len(candidates.axes))
+    held = held if len(held) <= room else []
+    rows += held
+    wanted = [task.wanted(time)[: len(referred)] for time in task.times()]
+    joints = best_joints(
+        postures, posture, rows, candidates.joints, room - len(held), np.array(wanted)
+    )
+    if joints is None:
+        names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
+        raise ScenarioError(
+            (
+                "outputs",
+                f"{task.missing} are missing, and no positions of joints beside {names} leave "
+                "B(x) regular; name them",
+            )
+        )
+    chosen, resting = [*referred[task.given :], *along, *held, *joints], [*along, *held, *joints]
+    values = _rounded(posture.rows)
+    if is_normal:
+        values[candidates.tilts] = 0.0
+    references = list(scenario.references)
+    if resting:
+        references.insert(task.place, ConstantReference(tuple(values[resting].tolist())))
+    completed = replace(
+        scenario,
+        outputs=[*scenario.outputs, *merged(candidates.form(row) for row in chosen)],
+        references=references,
+    )
+    names = ", ".join(candidates.signals[row].name for row in chosen)
+    reason = " (joints so that B(x) is best conditioned)" if joints else ""
+    note = f"outputs completed by {names}{reason}"
+    return Completed(_started(completed, task, posture), (note, _start_note(task, posture)))
+
+
+def _movable(postures: Postures) -> list[int]:
+    """The rows that move anywhere: an arm that moves in a plane has others."""
+    some = [postures.at(q).gradients for q in postures.guesses(4)]
+    return np.flatnonzero(np.linalg.norm(some, axis=2).max(axis=0) > 1e-9).tolist()
+
+
+def _posture(
+    task: _Task,
+    postures: Postures,
+    rows: Sequence[int],
+    guess: FloatArray,
+) -> tuple[Posture, bool]:
+    """Where the robot starts, and whether its tools are then normal to their surfaces."""
+    candidates, wanted = task.candidates, task.at_start(rows)
+    if task.scenario.start.positions:
+        near = near_posture(postures, rows, wanted, guess)
+        if near is not None and near.independence(rows) > REGULAR:
+            return near, False
+    if candidates.tilts:
+        both = [*rows, *candidates.tilts]
+        goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
+        found = best_posture(postures, both, goal, [guess, *postures.guesses(TRIES)])
+        if found is not None:
+            return found, True
+    return _found(task, postures, rows, wanted, guess), False
+
+
+def _found(
+    task: _Task,
+    postures: Postures,
+    rows: Sequence[int],
+    wanted: FloatArray,
+    guess: FloatArray,
+) -> Posture:
+    """The best posture with wanted values of rows.
+
+    Raises:
+        ScenarioError: There is none; by how much each row misses its value at the nearest.
+    """
+    guesses = [guess, *postures.guesses(TRIES)]
+    found = best_posture(postures, rows, wanted, guesses)
+    if found is not None:
+        return found
+    nearest = nearest_posture(postures, rows, wanted, guesses)
+    polished = near_posture(postures, rows, wanted, nearest.q)
+    if polished is not None:
+        return polished
+    signals = [task.candidates.signals[row] for row in rows]
+    missed = [
+        f"{signal.name} comes to {value:.4g} {signal.unit}, "
+        f"{abs(goal - value):.2g} {signal.unit} from {goal:.4g} {signal.unit}".replace(" ,", ",")
+        for signal, value, goal in zip(signals, nearest.rows[list(rows)], wanted, strict=True)
+        if abs(goal - value) > 1e-6
+    ]
+    residual = float(np.max(np.abs(nearest.left), initial=0.0))
+    if residual > 1e-6:
+        missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
+    raise ScenarioError(
+        (
+            "references" if len(rows) else "constraints",
+            "the robot cannot start there within its joint limits; the nearest that was found "
+            f" leaves this: {'; '.join(missed) or 'nothing, but at a limit'}. Change the "
+            "first values of the references, start.errors or where the surface stands, or give "
+            "start.positions",
+        )
+    )
+
+
+def _started(scenario: Scenario, task: _Task, posture: Posture) -> Scenario:
+    """The scenario with a start."""
+    return replace(scenario, start=replace(scenario.start, positions=_named(task, posture)))
+
+
+def _named(task: _Task, posture: Posture) -> dict[str, float]:
+    """The positions of a posture by their names, rounded."""
+    names = [task.candidates.signals[row].name for row in task.candidates.joints]
+    return dict(zip(names, _rounded(posture.q).tolist(), strict=True))
+
+
+def _rounded(values: FloatArray) -> FloatArray:
+    """Values as they are written, without -0."""
+    return np.round(values, _DIGITS) + 0.0
+
+
+def _start_note(task: _Task, posture: Posture) -> str:
+    positions = (f"{name}: {value:.4g}" for name, value in _named(task, posture).items())
+    return f"start found: {{{', '.join(positions)}}}"
+
+
+def _value(reference: Reference, time: float) -> FloatArray:
+    """r at a time in s, shape (size,)."""
+    return np.asarray(reference.derivatives([0] * reference.size)(time), dtype=float)
+
+
+def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
+    """Parameter name -> value at the start, where it is not the default."""
+    begin = scenario.integrator.start_time
+    moving = {
+        name: np.concatenate([_value(reference, begin) for reference in references])
+        for name, references in scenario.exogenous.items()
+    }
+    return {**{k: np.atleast_1d(v) for k, v in scenario.plant_parameters.items()}, **moving}

@@ -1,0 +1,248 @@
+"""Outputs that complete those of a scenario, and starts that are found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.multibody.tree import JacobianWrtVariable
+from runs import run_scenario, scenario
+
+from drake_dae import (
+    ConstantReference,
+    Cylinder,
+    JointPositions,
+    Plane,
+    PointCoordinates,
+    PointOnSurface,
+    Sphere,
+    analyze,
+    build_scenario,
+    complete_scenario,
+    load_scenario,
+)
+from drake_dae.diagrams.scenario import save_scenario
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.diagrams.scenario_parts import Start, TiltFromNormal
+from drake_dae.errors import ScenarioError
+
+# tool.z = 0.35 m on the wall at 1.2 m, by the law of cosines with two links of 1 m.
+REACH = np.hypot(1.2, 0.35)
+HELD = np.arctan2(0.35, 1.2) + np.arccos(REACH / 2), -2 * np.arccos(REACH / 2)
+
+FORCE = ConstantReference((20.0,))
+
+
+def left_out(name="seven_joint_wall", **changes):
+    """A shipped scenario without outputs and start; its references are force alone."""
+    open_ = {"outputs": [], "start": Start(), "references": [FORCE]}
+    return replace(scenario(name), **(open_ | changes))
+
+
+def names(completed):
+    return [s.name for s in scenario_model(completed.scenario).position_signals]
+
+
+def touching(*constraints):
+    """The seven-joint arm on other surfaces."""
+    return left_out(constraints=list(constraints))
+
+
+def test_a_scenario_that_says_all_is_returned_as_it_is():
+    whole = scenario("seven_joint_wall")
+    completed = complete_scenario(whole)
+    assert completed.scenario is whole
+    assert completed.notes == ()
+
+
+def test_the_arm_on_the_wall_gets_the_outputs_and_the_start_that_were_chosen_by_hand():
+    """They are those of the shipped file: the elbow and the hand of the redundant arm are held."""
+    by_hand = scenario("seven_joint_wall")
+    open_ = left_out(references=[*by_hand.references[:2], by_hand.references[-1]])
+    completed = complete_scenario(open_)
+    assert completed.scenario.outputs == [
+        PointCoordinates("tool", "yz"),
+        TiltFromNormal("wall", "z", "xy"),
+        JointPositions(["joint3", "joint7"]),
+    ]
+    found = completed.scenario.start.positions
+    # Four decimals are written; the file's own numbers have as many.
+    assert {k: v for k, v in found.items() if v} == pytest.approx(by_hand.start.positions, abs=2e-4)
+    assert completed.notes[0].startswith("outputs completed by tool.y, tool.z, wall.tilt_x")
+    assert completed.notes[1].startswith("start found: {joint1: 0, joint2: -0.1938")
+
+
+def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path):
+    completed = complete_scenario(left_out(duration=0.3)).scenario
+    save_scenario(completed, tmp_path / "run.yaml")
+    again = load_scenario(tmp_path / "run.yaml")
+    assert again == completed
+    assert complete_scenario(again).scenario is again
+    errors = replace(again, start=replace(again.start, errors={"tool.y": 0.01}))
+    loop, _, record = run_scenario(errors)
+    off = np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)
+    assert off.max() < 1e-7  # The integrator's accuracy is 1e-8.
+
+
+@pytest.mark.parametrize(
+    ("kind", "held"),
+    [
+        ("normal", ["wall.tilt_x", "wall.tilt_y"]),
+        ("fixed", ["tool.z_axis.y", "tool.z_axis.z"]),
+        ("free", []),
+    ],
+)
+def test_the_tool_axis_is_normal_fixed_or_free(kind, held):
+    found = names(complete_scenario(left_out(tool_axis=kind)))
+    assert found[:2] == ["tool.y", "tool.z"]
+    assert [name for name in found[2:] if "joint" not in name] == held
+    assert len(found) == 6
+
+
+def test_outputs_given_in_part_are_kept_and_come_first():
+    part = left_out(
+        outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
+        references=[ConstantReference((0.1,)), ConstantReference((0.6,)), FORCE],
+    )
+    completed = complete_scenario(part).scenario
+    found = names(complete_scenario(part))
+    assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
+    assert found[5] in ("joint5", "joint7", "joint3")
+    assert completed.start.positions["joint1"] == 0.1
+    # The references of what was given stay where they were, the force comes last.
+    assert completed.references[:2] == part.references[:2]
+    assert completed.references[-1] == FORCE
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        Plane((0.5, 0.0, 0.3), (0.0, 0.6, 0.8)),
+        Sphere((0.5, 0.0, 0.2), 0.25),
+        Cylinder((0.6, 0.0, 0.3), (0.0, 1.0, 0.0), 0.15),
+    ],
+)
+def test_the_tool_starts_normal_to_any_surface_and_the_robot_is_regular(surface):
+    completed = complete_scenario(touching(PointOnSurface("tool", surface, name="part"))).scenario
+    loop, context = build_scenario(completed)
+    model = loop.plant.model
+    q = loop.plant.state(loop.plant.GetMyContextFromRoot(context))[:7]
+    low, high = model.links.position_limits
+    assert np.all((low < q) & (q < high))
+    plant = model.links.plant
+    own = plant.CreateDefaultContext()
+    plant.SetPositions(own, q)
+    pose = plant.GetFrameByName("tool").CalcPoseInWorld(own)
+    place = pose.translation()
+    if isinstance(surface, Plane):
+        normal = np.array(surface.normal)
+    elif isinstance(surface, Sphere):
+        normal = (place - surface.center) / 0.25
+    else:
+        normal = (place - surface.point) * [1, 0, 1] / 0.15
+    # The tool's z axis points into the surface; Newton's method leaves 1e-10.
+    assert pose.rotation().matrix()[:, 2] == pytest.approx(-normal, abs=1e-8)
+
+
+def test_a_start_that_is_left_out_is_found_for_outputs_that_are_given():
+    """The default configuration is stretched, where B(x) is singular."""
+    by_hand = scenario("two_link_wall")
+    completed = complete_scenario(replace(by_hand, start=Start(errors={"tool.z": 0.05})))
+    assert len(completed.notes) == 1
+    assert completed.notes[0].startswith("start found: {joint1:")
+    loop, context = build_scenario(completed.scenario)
+    own = loop.plant.GetMyContextFromRoot(context)
+    plant = loop.plant.model.links.plant
+    placed = plant.CreateDefaultContext()
+    plant.SetPositions(placed, loop.plant.state(own)[:2])
+    x, _, z = plant.GetFrameByName("tool").CalcPoseInWorld(placed).translation()
+    assert (x, z) == pytest.approx((1.2, 0.35), abs=1e-9)
+
+
+def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_kinetic_energy():
+    """For one output z and one contact x it is sqrt(1 - c^2), c = J M^-1 P^T of unit rows."""
+    from drake_dae.diagrams.completion.postures import Postures
+    from drake_dae.robots.contact.constraint_set import ConstraintSet
+    from drake_dae.robots.force_outputs import force_rows
+
+    model = scenario_model(scenario("two_link_wall"))
+    links, bound = model.links, ConstraintSet(model.constraints)
+    height = model.positions[0].expression(links)
+    S = force_rows(model.forces, bound, links)
+    q = np.array([1.2, -1.6])
+    plant = links.plant
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    M = plant.CalcMassMatrixViaInverseDynamics(context)
+    tool, world = plant.GetFrameByName("tool"), plant.world_frame()
+    kind = JacobianWrtVariable.kV
+    x, _, z = plant.CalcJacobianTranslationalVelocity(context, kind, tool, [0, 0, 0], world, world)
+    c = x @ np.linalg.solve(M, z)
+    c /= np.sqrt((x @ np.linalg.solve(M, x)) * (z @ np.linalg.solve(M, z)))
+    for unit in (1.0, 1e3):  # In metres and in millimetres.
+        posture = Postures(links, bound, unit * height, S, [], {}).at(q)
+        assert posture.independence([0]) == pytest.approx(np.sqrt(1 - c**2), rel=1e-10)
+
+
+def refusal(open_):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(open_)
+    return str(caught.value)
+
+
+def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
+    """The arm reaches 1.5 m at most from its shoulder."""
+    height = ConstantReference((3.0,))
+    message = refusal(left_out(references=[ConstantReference((0.0,)), height, FORCE]))
+    assert message.startswith("references: the robot cannot start there within its joint limits")
+    assert "tool.z comes to 1." in message
+    assert "from 3 m" in message
+
+
+def test_a_surface_out_of_reach_is_told():
+    far = PointOnSurface("tool", Plane((4.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), name="wall")
+    message = refusal(touching(far))
+    assert message.startswith("constraints: the robot cannot start there")
+    assert "is left of the constraints" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"outputs": [PointCoordinates("tool", "y")]},
+            "references: 1 values; needed are those of the 1 given outputs",
+        ),
+        (
+            {"references": [ConstantReference((0.0, 0.6, 0.0, FORCE.values[0]))]},
+            "references: one reference covers a position and a force",
+        ),
+        (
+            {"references": [ConstantReference((0.0,) * 4), FORCE]},
+            "references: 4 values for positions, but beside the 0 outputs that are given only 2",
+        ),
+        ({"references": [ConstantReference((0.0,) * 9), FORCE]}, "references: 10 values"),
+    ],
+)
+def test_references_that_fit_no_completion_are_refused(changes, message):
+    assert refusal(left_out(**changes)).startswith(message)
+
+
+def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
+    """Two joints on a wall leave one output, and y is none: the scenario as shipped comes out."""
+    by_hand = scenario("two_link_wall")
+    completed = complete_scenario(replace(by_hand, outputs=[])).scenario
+    assert completed.outputs == by_hand.outputs
+    assert completed.references == by_hand.references
+    assert completed.start.positions == pytest.approx(
+        dict(zip(("joint1", "joint2"), HELD, strict=True)), abs=1e-4
+    )
+
+
+def test_a_robot_that_is_only_simulated_gets_no_outputs():
+    still = left_out("slider_crank", forces=[], references=[])
+    assert complete_scenario(still).scenario is still
+
+
+def test_the_completed_robot_satisfies_all_assumptions():
+    report = analyze(scenario_model(left_out()).dae, count=5)
+    assert report.problems == ()
