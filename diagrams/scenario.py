@@ -71,6 +71,7 @@ Stage = Annotated[
 ]
 Reference = Annotated[
     Annotated[references.ConstantReference, Form(tag="!Constant")]
+    | float
     | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
     | Annotated[
         references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
@@ -138,7 +139,9 @@ class Scenario:
             MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
-        references: The references, in the order of the outputs, the forces last.
+        references: Name -> reference, where a number is a constant. A name is that of an output,
+            tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
+            "tool.y, elbow".
         start: Where the robot starts.
         duration: How long the run lasts, in s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
@@ -165,7 +168,7 @@ class Scenario:
     plant: Plant = field(default_factory=parts.IdealConstraints)
     sampling: Sampling | None = None
     saturation: bool = False
-    references: list[Reference] = field(kw_only=True)
+    references: dict[str, Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
     integrator: Annotated[

@@ -18,7 +18,9 @@ from .dae.references import ConstantReference as ConstantReference
 from .dae.references import ExpressionReference as ExpressionReference
 from .dae.references import PointToPointReference as PointToPointReference
 from .dae.references import Reference as Reference
+from .dae.references import ReferenceRows as ReferenceRows
 from .dae.references import SinusoidReference as SinusoidReference
+from .dae.references import references_by_name as references_by_name
 from .dae.signals import Parameter as Parameter
 from .dae.signals import Signal as Signal
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure

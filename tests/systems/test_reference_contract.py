@@ -10,6 +10,7 @@ from drake_dae import (
     ExpressionReference,
     PointToPointReference,
     ReferenceGenerator,
+    ReferenceRows,
     SinusoidReference,
     TrajectoryReference,
 )
@@ -25,11 +26,14 @@ MEMBERS = {
     "point to point": PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
     "expression": ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
     "trajectory": TrajectoryReference(PATH),
+    "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
+    "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
 }
 
 TIMES = (0.41, 0.93, 1.62)
 
 ROUGH = {
+    "rows": ReferenceRows(ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),
     "point to point": PointToPointReference(0.0, 1.0, 0.0, 1.0, order=1),
     "expression": ExpressionReference(lambda t: ca.fabs(t - 1.0)),
     "trajectory": TrajectoryReference(PiecewisePolynomial.FirstOrderHold([0, 1, 2], [[0, 1, 0]])),
