@@ -69,14 +69,21 @@ Stage = Annotated[
     actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
     Choice(_WRITTEN),
 ]
+_PathLimits = Annotated[references.PathLimits, Form()]
 Reference = Annotated[
     Annotated[references.ConstantReference, Form(tag="!Constant")]
     | float
     | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
     | Annotated[
         references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
-    ],
-    Choice({**_WRITTEN, ArrayLike: Row}),
+    ]
+    | Annotated[references.LineReference, Form(tag="!Line")]
+    | Annotated[references.CircleReference, Form(tag="!Circle")]
+    | Annotated[references.SpiralReference, Form(tag="!Spiral")]
+    | Annotated[references.PolylineReference, Form(tag="!Polyline")]
+    | Annotated[references.CsvReference, Form(tag="!Csv")]
+    | Annotated[references.TextReference, Form(tag="!Text")],
+    Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
 Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
@@ -257,7 +264,16 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     except (OSError, RuntimeError, ValueError) as error:
         # The working directory is gone; a link that leads to itself; a null byte.
         raise ScenarioError(("robot", f"no path: {error}")) from None
-    return replace(scenario, robot=replace(robot, file=file, packages=packages))
+
+    def located(one: Any) -> Any:
+        return one.beside(here) if isinstance(one, references.Reference) else one
+
+    return replace(
+        scenario,
+        robot=replace(robot, file=file, packages=packages),
+        references={name: located(one) for name, one in scenario.references.items()},
+        exogenous={name: [*map(located, rows)] for name, rows in scenario.exogenous.items()},
+    )
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

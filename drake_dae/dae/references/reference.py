@@ -3,6 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import Path
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -29,6 +31,8 @@ class Reference(ABC):
        and a remedy, and never later. A time at which there is no value is refused by the function.
     6. A reference that is an expression of time says so in `expression`, so that all of them are
        traced as one function; the values are the same either way.
+    7. A reference that names a file reads it when it is used, and gives itself an absolute path by
+       `beside`.
     """
 
     @property
@@ -54,6 +58,10 @@ class Reference(ABC):
             ReferenceSignalError: The reference is not smooth enough for these degrees.
         """
         return None
+
+    def beside(self, folder: Path) -> Self:
+        """The same, where a file that it names is relative to a folder."""
+        return self
 
 
 @checked(ReferenceSignalError)
