@@ -1,6 +1,6 @@
 """The closed loop that a scenario describes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import cast
 
@@ -10,8 +10,8 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.references import ConstantReference, Reference
+from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
@@ -19,7 +19,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_clo
 from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
-from drake_dae.diagrams.keys import at, each, violated
+from drake_dae.diagrams.keys import at, violated
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
     add_robot,
@@ -200,32 +200,15 @@ def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
     return model.control_limits
 
 
-def _references(references: Sequence[Reference], law: TrackingLaw) -> Sequence[Reference]:
-    """References that together cover all outputs, each smooth enough."""
-    signals = law.system.output_signals
-    first = 0
-
-    def check(reference: Reference) -> None:
-        nonlocal first
-        degrees = law.degrees[first : first + reference.size]
-        if len(degrees) < reference.size:
-            raise ModelError(
-                f"too many: {reference.size} values, but left without a reference: "
-                f"{_names(signals[first:])}"
-            )
-        reference.derivatives(degrees)
-        first += reference.size
-
-    each("references", references, check)
-    if first < len(signals):
-        raise ScenarioError(
-            (
-                "references",
-                f"too few, left without one: {_names(signals[first:])}; needed, in this order: "
-                f"{_names(signals)}",
-            )
-        )
-    return references
+def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -> list[Reference]:
+    """References in the order of the outputs, each smooth enough."""
+    outputs = [signal.name for signal in law.system.output_signals]
+    found = []
+    for name, reference in references.items():
+        with at(f"references.{name}"):
+            found.append(assigned(name, reference, outputs, law.degrees))
+    with at("references"):
+        return in_order(found, outputs)
 
 
 def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference]:
@@ -237,7 +220,11 @@ def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference
     moving: list[Reference] = []
     degrees = list(law.exogenous_degrees)
     for parameter in law.system.exogenous.moving:
-        key, references = f"exogenous.{parameter.name}", scenario.exogenous[parameter.name]
+        key = f"exogenous.{parameter.name}"
+        references = [
+            one if isinstance(one, Reference) else ConstantReference(one)
+            for one in scenario.exogenous[parameter.name]
+        ]
         size = sum(reference.size for reference in references)
         if size != parameter.value.size:
             text = f"{size} values, but the parameter has {parameter.value.size}"
@@ -318,7 +305,3 @@ def _configuration(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
-
-
-def _names(signals: Sequence[Signal]) -> str:
-    return ", ".join(signal.name for signal in signals) or "none"

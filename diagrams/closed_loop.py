@@ -14,7 +14,7 @@ from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogS
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
+from drake_dae.dae.references import Reference, references_by_name
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
@@ -199,7 +199,7 @@ def can_be_fed_back(
 def make_closed_loop(
     system: DaePlant | ContactPlant,
     law: TrackingLaw,
-    references: Sequence[Reference],
+    references: Sequence[Reference] | Mapping[str, Reference | float],
     *,
     exogenous: Sequence[Reference] = (),
     sensor: ForceSensor | None = None,
@@ -215,7 +215,8 @@ def make_closed_loop(
         system: A `RobotPlant`, any `DaePlant`, or a `ContactPlant`, with which everything is logged
             at its steps.
         law: A law for the plant's system, or for a model of the same structure.
-        references: References that together cover all controlled outputs, in their order.
+        references: References that together cover all controlled outputs, in their order; or name
+            -> reference, as `references_by_name` takes them.
         exogenous: The exogenous signals of the plant, which its law knows too, as references that
             together cover all entries of w, in their order; without any nothing moves.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
@@ -243,6 +244,9 @@ def make_closed_loop(
             close an algebraic loop, or a sampled loop that diverges; or no law uses the sensor.
     """
     check_sizes(system, law, sensor)
+    if isinstance(references, Mapping):
+        names = [signal.name for signal in law.system.output_signals]
+        references = references_by_name(references, names, law.degrees)
     builder = DiagramBuilder()
 
     # The plant, its reference and its controller.

@@ -22,8 +22,8 @@ from drake_dae.errors import ScenarioError
 
 T = TypeVar("T")
 
-_TEXT = "text"
-"""What stands for plain text where tags choose."""
+_PLAIN = {str: "text", float: "a number"}
+"""What stands for plain values where tags choose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class Choice:
     """Annotates a Union of dataclasses: a tag chooses one, by default the first.
 
     The tag is the name of the class. A member that is annotated with a `Form` has its tag and its
-    defaults. A member `str` is plain text.
+    defaults. Members `str` and `float` are plain text and a number.
 
     Attributes:
         written: The types that stand for others in data, as in `Form`, for all members.
@@ -148,7 +148,7 @@ class Choice:
     ) -> CoreSchema:
         forms: dict[type[Any], Form] = {}
         members = get_args(source)
-        for member in (member for member in members if member is not str):
+        for member in (member for member in members if member not in _PLAIN):
             cls, own = get_args(member) or (member, Form())
             tag = own.tag or f"!{cls.__name__}"
             forms[cls] = replace(own, written=self.written, tag=tag, needs_tag=bool(forms))
@@ -157,15 +157,18 @@ class Choice:
         def chosen(value: Any) -> str | None:
             if isinstance(value, dict):
                 return str(value.get(TAG, first))
-            if isinstance(value, str) and str in members:
-                return _TEXT
+            for plain, types in ((str, str), (float, (int, float))):
+                if plain in members and isinstance(value, types) and not isinstance(value, bool):
+                    return _PLAIN[plain]
             return forms[type(value)].tag if type(value) in forms else None
 
         choices = {
             form.tag: handler.generate_schema(Annotated[cls, form]) for cls, form in forms.items()
         }
         if str in members:
-            choices[_TEXT] = core_schema.str_schema(strict=True)
+            choices[_PLAIN[str]] = core_schema.str_schema(strict=True)
+        if float in members:
+            choices[_PLAIN[float]] = core_schema.float_schema(strict=True, allow_inf_nan=False)
         return core_schema.tagged_union_schema(choices, chosen)
 
 
@@ -233,6 +236,9 @@ class Reader(Generic[T]):
     def _problem(self, details: ErrorDetails, data: Any) -> tuple[str, str]:
         """The dotted key and the text of a problem."""
         kind, loc, value = details["type"], details["loc"], details["input"]
+        if TAG in loc:
+            place = _place(loc[: loc.index(TAG)], self.schema, data)
+            return place.key, f"takes no tag, got {str(place.data[TAG])[:60]}"
         if kind in ("missing", "extra_forbidden"):
             place = _place(loc[:-1], self.schema, data)
             place = replace(place, schema=_with_parts(place.schema))
@@ -287,8 +293,6 @@ def _with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
     """What is wrong with a key that is missing or should not be there."""
-    if name == TAG:
-        return f"takes no tag, got {str(value)[:60]}"
     names = [name for name in place.schema["properties"] if name != TAG]
     title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
     if is_missing:
@@ -338,7 +342,9 @@ def _in_words(schema: Mapping[str, Any]) -> str:
 
 
 def _tag(schema: Mapping[str, Any]) -> str:
-    return str(schema["properties"][TAG]["const"]) if "properties" in schema else _TEXT
+    if "properties" in schema:
+        return str(schema["properties"][TAG]["const"])
+    return _PLAIN[float if schema["type"] == "number" else str]
 
 
 def _tags(schema: Mapping[str, Any]) -> str:

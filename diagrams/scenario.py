@@ -70,13 +70,21 @@ Stage = Annotated[
     actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
     Choice(_WRITTEN),
 ]
+_PathLimits = Annotated[references.PathLimits, Form()]
 Reference = Annotated[
     Annotated[references.ConstantReference, Form(tag="!Constant")]
+    | float
     | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
     | Annotated[
         references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
-    ],
-    Choice({**_WRITTEN, ArrayLike: Row}),
+    ]
+    | Annotated[references.LineReference, Form(tag="!Line")]
+    | Annotated[references.CircleReference, Form(tag="!Circle")]
+    | Annotated[references.SpiralReference, Form(tag="!Spiral")]
+    | Annotated[references.PolylineReference, Form(tag="!Polyline")]
+    | Annotated[references.CsvReference, Form(tag="!Csv")]
+    | Annotated[references.TextReference, Form(tag="!Text")],
+    Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
 Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
@@ -154,8 +162,10 @@ class Scenario:
             MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
-        references: The references, in the order of the outputs, the forces last. Outputs that
-            complete others may be without; they hold what they start with.
+        references: Name -> reference, where a number is a constant. A name is that of an output,
+            tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
+            "tool.y, elbow". Outputs that complete others may be without; they hold what they start
+            with.
         start: Where the robot starts; without positions that is found.
         duration: How long the run lasts, in s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
@@ -183,7 +193,7 @@ class Scenario:
     plant: Plant = field(default_factory=parts.IdealConstraints)
     sampling: Sampling | None = None
     saturation: bool = False
-    references: list[Reference] = field(kw_only=True)
+    references: dict[str, Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
     integrator: Annotated[
@@ -274,7 +284,16 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     except (OSError, RuntimeError, ValueError) as error:
         # The working directory is gone; a link that leads to itself; a null byte.
         raise ScenarioError(("robot", f"no path: {error}")) from None
-    return replace(scenario, robot=replace(robot, file=file, packages=packages))
+
+    def located(one: Any) -> Any:
+        return one.beside(here) if isinstance(one, references.Reference) else one
+
+    return replace(
+        scenario,
+        robot=replace(robot, file=file, packages=packages),
+        references={name: located(one) for name, one in scenario.references.items()},
+        exogenous={name: [*map(located, rows)] for name, rows in scenario.exogenous.items()},
+    )
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

@@ -174,8 +174,8 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
         raise ScenarioError((brief(key), "expected a dotted key, for example start.errors.tool.z"))
     path = ""
     while True:
-        part = ".".join(parts) if path in names else parts[0]
-        rest = [] if path in names else parts[1:]
+        count = _name_length(data, parts) if path in names else 1
+        part, rest = ".".join(parts[:count]), parts[count:]
         slot: str | int = part
         if isinstance(data, list):
             if not (part.isascii() and part.isdecimal() and int(part) < len(data)):
@@ -191,3 +191,12 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
             data.setdefault(slot, {})
         data, parts = data[slot], rest
         path = f"{path}.{part}" if path else part
+
+
+def _name_length(data: Any, parts: list[str]) -> int:
+    """How many parts are the name: all, but for what is inside of an entry that is there."""
+    for count in range(len(parts), 0, -1) if isinstance(data, dict) else ():
+        name = ".".join(parts[:count])
+        if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):
+            return count
+    return len(parts)

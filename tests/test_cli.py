@@ -296,7 +296,7 @@ def test_each_mistake_in_a_scenario_has_its_line(capsys):
 @pytest.mark.slow
 def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, capsys):
     """The arm is stretched out at z = 1.6 m, which the reference passes after 0.13 s."""
-    move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
     assert main([*arguments, "--set", move, "--set", "write.plots=false"]) == 1
     assert re.match(r"error: .* at t = 0\.1\d+ s, state \[", error_line(capsys))
@@ -365,7 +365,7 @@ def test_the_reason_of_a_failure_is_printed_too_when_files_fail(tmp_path, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Record, "save", fill)
-    move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
     assert main([*arguments, "--set", move, *QUICK]) == 1
     first, second = capsys.readouterr().err.splitlines()
@@ -621,7 +621,7 @@ def test_a_rollout_leaves_the_files_of_a_run(tmp_path, capsys):
 
 
 def test_a_rollout_that_fails_keeps_its_record(tmp_path, capsys):
-    settings = ["--set", "references.0.amplitudes=[3.0]", "--set", "compiled=false"]
+    settings = ["--set", "references.tool.z.amplitudes=[3.0]", "--set", "compiled=false"]
     assert main(["simulate", "two_link_wall", "--rollout", "--out", str(tmp_path), *settings]) == 1
     assert "the simulation cannot go on at t = 0.38" in capsys.readouterr().err
     assert 0.3 < Record.load(tmp_path / "record.npz").time[-1] < 0.4

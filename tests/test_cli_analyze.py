@@ -72,8 +72,8 @@ def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
 def test_the_joint_force_behind_an_actuation():
     """At rest the springs hold what rigid joints would: the same tau, against the same limits."""
     still = [
-        "references.0=!Constant {values: [0.3]}",
-        "references.1=!Constant {values: [400]}",
+        "references.tool.z=0.3",
+        "references.wall.force=400",
         "start.errors={}",
         "duration=0.1",
     ]
@@ -92,8 +92,8 @@ def test_a_torque_limit_that_is_exceeded(capsys):
     code, text = analyze(
         capsys,
         "two_link_wall",
-        *("--set", "references.0=!Constant {values: [0.3]}"),
-        *("--set", "references.1=!Constant {values: [400]}"),
+        *("--set", "references.tool.z=0.3"),
+        *("--set", "references.wall.force=400"),
     )
     x, z, force, gravity = 1.2, 0.3, 400.0, 9.81
     elbow = -np.arccos((x**2 + z**2 - 2.0) / 2.0)
@@ -119,7 +119,7 @@ def test_a_reference_that_leaves_the_workspace(capsys):
 
     The quintic blend from 0.3 to 3 m in 0.3 s is there when 10 s^3 - 15 s^4 + 6 s^5 = 1.3 / 2.7.
     """
-    move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
     when = 0.3 * brentq(lambda s: 10 * s**3 - 15 * s**4 + 6 * s**5 - 1.3 / 2.7, 0.0, 1.0)
     code, text = analyze(capsys, "two_link_wall", "--set", move)
     assert code == 2
@@ -135,7 +135,7 @@ def test_a_reference_that_leaves_the_workspace(capsys):
 @pytest.mark.slow
 def test_a_contact_that_would_have_to_pull(capsys):
     """2 + 5 sin 2t is negative from t = (pi + asin 0.4) / 2 on; samples are 10 ms apart."""
-    code, text = analyze(capsys, "two_link_wall", "--set", "references.1.offset=2")
+    code, text = analyze(capsys, "two_link_wall", "--set", "references.wall.force.offset=2")
     assert code == 2
     (line,) = [line for line in text.splitlines() if line.startswith("PROBLEM")]
     found = re.fullmatch(
@@ -184,7 +184,10 @@ def test_times_that_do_not_suffice_are_told():
 def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
     """2 + 5 sin 20 pi t over 10 s at 101 even times, all of them at its zeros."""
     monkeypatch.setattr(module, "SAMPLES", 101)
-    fast = ("references.1.offset=2", "references.1.frequencies=[62.83185307179586]")
+    fast = (
+        "references.wall.force.offset=2",
+        "references.wall.force.frequencies=[62.83185307179586]",
+    )
     arguments = [word for setting in fast for word in ("--set", setting)]
     code, text = analyze(capsys, "two_link_wall", *arguments, "--set", "duration=10")
     assert code == 2
@@ -195,7 +198,7 @@ def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_extremes_of_a_constant_have_no_time(capsys):
-    settings = ["--set", "references.1=!Constant {values: [15]}", "--set", "duration=2"]
+    settings = ["--set", "references.wall.force=15", "--set", "duration=2"]
     _, text = analyze(capsys, "two_link_wall", *settings)
     row = [line.split() for line in text.splitlines() if line.startswith("wall.force")][-1]
     assert row == ["wall.force", "N", "15", "15"]
@@ -204,7 +207,7 @@ def test_extremes_of_a_constant_have_no_time(capsys):
 
 @pytest.mark.slow
 def test_a_pin_may_pull():
-    told = find_feasibility(scenario("five_bar", "references.2.offset=-15"))
+    told = find_feasibility(scenario("five_bar", "references.pin.fx.offset=-15"))
     assert course(told.constraint_forces, "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
     assert not any("pulls" in problem for problem in told.problems)
     loop, _ = build_scenario(scenario("five_bar"))
@@ -240,7 +243,7 @@ def test_a_violated_assumption_is_a_finding(capsys):
 
 @pytest.mark.slow
 def test_json(capsys):
-    move = "references.0=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
     code, text = analyze(capsys, "two_link_motors", "--json", "--set", "duration=1")
     assert code == 0
     found = json.loads(text)
@@ -263,7 +266,7 @@ def test_json(capsys):
     [
         (["no_such_scenario"], "no scenario file 'no_such_scenario'"),
         (["two_link_wall", "--set", "duratoin=1"], "duratoin"),
-        (["two_link_wall", "--set", "references.0.offset=7"], "start: found no configuration"),
+        (["two_link_wall", "--set", "references.tool.z.offset=7"], "start: found no configuration"),
         (["two_link_wall", "--set", "duration=-1"], "duration: "),
     ],
 )

@@ -5,15 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ConstantReference, Reference
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.references import Reference
+from drake_dae.dae.references.by_name import meant
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.completion.candidates import Candidates, merged
 from drake_dae.diagrams.completion.choice import best_joints, first_independent
 from drake_dae.diagrams.completion.postures import Posture, Postures
 from drake_dae.diagrams.completion.search import TRIES, best_posture, near_posture, nearest_posture
 from drake_dae.diagrams.scenario import Scenario
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.force_outputs import force_outputs, force_rows
@@ -74,7 +75,9 @@ def complete(
     bound = ConstraintSet([*constraints, *of_plant])
     given = [parts.made(form, constraints) for form in scenario.outputs]
     size = sum(len(output.signals(links)) for output in given)
-    S = force_rows(force_outputs(scenario.forces, bound), bound, links)
+    steered = force_outputs(scenario.forces, bound)
+    names = [signal.name for output in steered for signal in output.signals(bound)]
+    S = force_rows(steered, bound, links)
     actuators = len(links.actuator_signals) + len(bound.motors)
     missing = actuators - size - S.shape[0]
     if not (size or S.shape[0] or scenario.references):
@@ -89,7 +92,11 @@ def complete(
     postures = Postures(
         links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
     )
-    task = _Task(scenario, candidates, size, S.shape[0], missing)
+    # Rows that references name are known before the posture is: by the normal near the guess.
+    near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
+    movable = _movable(postures) if missing else []
+    along = [row for row in candidates.points(near) if row in movable] if near else []
+    task = _Task(scenario, candidates, size, missing, names, along)
     if missing == 0:
         return _with_start(scenario, task, postures, guess)
     return _with_outputs(scenario, task, postures, guess)
@@ -102,36 +109,87 @@ class _Task:
         scenario, candidates: The arguments.
         given: How many rows the scenario gives.
         missing: How many are missing.
-        referred: How many rows have references: those that are given, and then those that complete
-            them.
-        places: Where among the references those of the rows that complete begin and end.
+        referred: The rows that have references: those that are given, and then those that complete
+            them and are named by references.
     """
 
     def __init__(
-        self, scenario: Scenario, candidates: Candidates, given: int, forces: int, missing: int
+        self,
+        scenario: Scenario,
+        candidates: Candidates,
+        given: int,
+        missing: int,
+        forces: Sequence[str],
+        along: Sequence[int],
     ) -> None:
+        """Finds the rows that references name.
+
+        Args:
+            scenario: The scenario.
+            candidates: Its rows.
+            given: How many of these it gives.
+            missing: How many are missing.
+            forces: The names of the force outputs.
+            along: The rows along the surfaces, near the start.
+
+        Raises:
+            ScenarioError: A name means none of them, or they are too many.
+        """
         self.scenario, self.candidates = scenario, candidates
         self.given, self.missing = given, missing
-        sizes = np.cumsum([0, *[reference.size for reference in scenario.references]])
-        self.referred = int(sizes[-1]) - forces
-        if missing and not given <= self.referred <= given + missing:
-            raise ScenarioError(
-                (
-                    "references",
-                    f"{sizes[-1]} values; needed are those of the {given} given outputs, of as "
-                    f"many of the {missing} that complete them as one likes, and of the {forces} "
-                    "forces",
-                )
-            )
-        if missing and self.referred not in sizes:
-            text = "one reference covers a position and a force; write it as two"
+        self._forces, self._along = forces, along
+        self._rows = {name: self._named(name) for name in scenario.references}
+        named = dict.fromkeys(row for rows in self._rows.values() for row in rows)
+        beside = [row for row in named if row is not None and row >= given]
+        if len(beside) > missing:
+            names = ", ".join(candidates.signals[row].name for row in beside)
+            text = f"{names} are {len(beside)} outputs, but only {missing} are missing"
             raise ScenarioError(("references", text))
-        self.place = int(np.searchsorted(sizes, self.referred))
+        left = [candidates.signals[row].name for row in range(given) if row not in named]
+        if left:
+            raise ScenarioError(("references", f"left without one: {', '.join(left)}"))
+        self.referred = [*range(given), *beside]
+
+    def _named(self, name: str) -> list[int | None]:
+        """The rows that a key of the references means; None for a force."""
+        key, found = f"references.{name}", list[int | None]()
+        for part in map(str.strip, name.split(",")):
+            found += self._meant(part, key)
+        reference = self.scenario.references[name]
+        if isinstance(reference, Reference) and reference.size != len(found):
+            text = f"{reference.size} values for {len(found)} outputs"
+            raise ScenarioError((key, text))
+        return found
+
+    def _meant(self, name: str, key: str) -> Sequence[int | None]:
+        signals = [signal.name for signal in self.candidates.signals]
+        known = [*signals[: self.given], *self._forces]
+        degrees = [2] * self.given + [0] * len(self._forces)
+        try:
+            places = meant(name, known, degrees)
+        except ReferenceSignalError as error:
+            if not self.missing:
+                raise ScenarioError((key, str(error))) from None
+        else:
+            return [place if place < self.given else None for place in places]
+        # A name of no output yet: of rows that may complete them.
+        along = [signals[row] for row in self._along]
+        beside = [*along, *(one for one in signals[self.given :] if one not in along)]
+        own = [one for one in along if one.rpartition(".")[0] == name]
+        try:
+            chosen = own or [beside[k] for k in meant(name, beside, [2] * len(beside))]
+        except ReferenceSignalError:
+            text = unknown_name("output", name, [*known, *beside])
+            raise ScenarioError((key, text)) from None
+        return [signals.index(one) for one in chosen]
 
     def wanted(self, time: float) -> FloatArray:
         """The values of the referred rows at a time in s, shape (referred,)."""
-        values = [_value(reference, time) for reference in self.scenario.references]
-        return np.concatenate([np.zeros(0), *values])[: self.referred]
+        values: dict[int | None, float] = {}
+        for name, rows in self._rows.items():
+            found = _value(self.scenario.references[name], len(rows), time)
+            values.update(zip(rows, found.tolist(), strict=True))
+        return np.array([values[row] for row in self.referred])
 
     def times(self) -> FloatArray:
         """Times along the references, in s."""
@@ -150,9 +208,7 @@ def _with_start(
     scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
 ) -> Completed:
     """The scenario with a start, if its default configuration leads to none."""
-    if task.referred != task.given:
-        return Completed(scenario)  # Whoever wires the references tells it.
-    rows = range(task.given)
+    rows = task.referred
     wanted = task.at_start(rows)
     near = near_posture(postures, rows, wanted, guess)
     # The structure is found at the guess itself.
@@ -168,20 +224,7 @@ def _with_outputs(
     scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
 ) -> Completed:
     """The scenario with all outputs and a start."""
-    candidates, given = task.candidates, list(range(task.given))
-    # Rows that references cover are known before the posture is: by the normal near the guess.
-    near = postures.at(postures.solve((), np.zeros(0), guess))
-    points = [row for row in candidates.points(near) if row in _movable(postures)]
-    referred = [*given, *points][: task.referred]
-    if len(referred) < task.referred:
-        raise ScenarioError(
-            (
-                "references",
-                f"{task.referred} values for positions, but beside the {task.given} outputs that "
-                f"are given only {len(referred) - task.given} along surfaces can complete them; "
-                "name the others under outputs",
-            )
-        )
+    candidates, referred = task.candidates, task.referred
     posture, is_normal = _posture(task, postures, referred, guess)
     # What completes the outputs, in the order of their worth.
     open_points = [row for row in candidates.points(posture) if row not in referred]
@@ -189,13 +232,13 @@ def _with_outputs(
     along = first_independent(posture, referred, open_points, room)
     rows = [*referred, *along]
     room -= len(along)
-    held = first_independent(posture, rows, candidates.axes, len(candidates.axes))
+    axes = [row for row in candidates.axes if row not in rows]
+    held = first_independent(posture, rows, axes, len(axes))
     held = held if len(held) <= room else []
     rows += held
     wanted = [task.wanted(time)[: len(referred)] for time in task.times()]
-    joints = best_joints(
-        postures, posture, rows, candidates.joints, room - len(held), np.array(wanted)
-    )
+    free = [row for row in candidates.joints if row not in rows]
+    joints = best_joints(postures, posture, rows, free, room - len(held), np.array(wanted))
     if joints is None:
         names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
         raise ScenarioError(
@@ -209,13 +252,11 @@ def _with_outputs(
     values = _rounded(posture.rows)
     if is_normal:
         values[candidates.tilts] = 0.0
-    references = list(scenario.references)
-    if resting:
-        references.insert(task.place, ConstantReference(tuple(values[resting].tolist())))
+    held_values = {candidates.signals[row].name: float(values[row]) for row in resting}
     completed = replace(
         scenario,
         outputs=[*scenario.outputs, *merged(candidates.form(row) for row in chosen)],
-        references=references,
+        references={**scenario.references, **held_values},
     )
     names = ", ".join(candidates.signals[row].name for row in chosen)
     reason = " (joints so that B(x) is best conditioned)" if joints else ""
@@ -312,16 +353,18 @@ def _start_note(task: _Task, posture: Posture) -> str:
     return f"start found: {{{', '.join(positions)}}}"
 
 
-def _value(reference: Reference, time: float) -> FloatArray:
+def _value(reference: Reference | float, size: int, time: float) -> FloatArray:
     """r at a time in s, shape (size,)."""
-    return np.asarray(reference.derivatives([0] * reference.size)(time), dtype=float)
+    if not isinstance(reference, Reference):
+        return np.full(size, float(reference))
+    return np.asarray(reference.derivatives([0] * size)(time), dtype=float)
 
 
 def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
     """Parameter name -> value at the start, where it is not the default."""
     begin = scenario.integrator.start_time
     moving = {
-        name: np.concatenate([_value(reference, begin) for reference in references])
+        name: np.concatenate([_value(one, getattr(one, "size", 1), begin) for one in references])
         for name, references in scenario.exogenous.items()
     }
     return {**{k: np.atleast_1d(v) for k, v in scenario.plant_parameters.items()}, **moving}

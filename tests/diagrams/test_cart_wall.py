@@ -130,9 +130,7 @@ def test_its_heading_is_that_of_a_trailer():
 
     It follows from heading' = -sin(heading) x' / REACH; the integrator leaves 1e-8.
     """
-    chosen = scenario(
-        NAME, "duration=6", "references.1=!Constant {values: [0.4]}", "start.errors={}"
-    )
+    chosen = scenario(NAME, "duration=6", "references.rod=0.4", "start.errors={}")
     _, _, record = run_scenario(chosen)
     heading, x = record["state"][:, 2], record["controlled_output"][:, 0]
     wanted = np.tan(heading[0] / 2) * np.exp(-(x - x[0]) / REACH)

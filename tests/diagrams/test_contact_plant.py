@@ -24,7 +24,7 @@ ONE_LATE = "sampling={period: 1.0e-3, delay: 1.0e-3}"
 
 def pressing(*settings: str) -> Scenario:
     """The two-link arm that holds still on its wall and presses."""
-    still = "references=[!Constant {values: [0.3]}, !Constant {values: [20.0]}]"
+    still = "references={tool.z: 0.3, wall.force: 20}"
     return two_link(still, *settings)
 
 

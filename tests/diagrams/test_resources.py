@@ -17,7 +17,7 @@ robot: {file: robot/arm.urdf}
 constraints: []
 outputs: [!JointPositions {joints: [joint]}]
 gains: !Poles {all: [-3.0]}
-references: [!Constant {values: [0.2]}]
+references: {joint: 0.2}
 duration: 0.01
 """
 

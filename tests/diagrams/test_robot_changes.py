@@ -42,10 +42,13 @@ outputs:
 - !JointPositions {joints: [panda_joint3, panda_joint5, panda_joint6, panda_joint7]}
 gains: !Poles {all: [-4.0]}
 references:
-- !Sinusoids {offset: 0.3, amplitudes: [0.05], frequencies: [2.0]}
-- !Sinusoids {offset: 1.3, amplitudes: [0.04], frequencies: [2.0]}
-- !Constant {values: [0.2, 0.1, 1.3, 0.4]}
-- !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}
+  panda_hand.y: !Sinusoids {offset: 0.3, amplitudes: [0.05], frequencies: [2.0]}
+  panda_hand.z: !Sinusoids {offset: 1.3, amplitudes: [0.04], frequencies: [2.0]}
+  panda_joint3: 0.2
+  panda_joint5: 0.1
+  panda_joint6: 1.3
+  panda_joint7: 0.4
+  wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}
 start:
   positions: {panda_joint2: 0.5, panda_joint4: -1.1, panda_joint6: 1.3}
   errors: {panda_hand.z: 0.01}
@@ -68,8 +71,8 @@ constraints:
 outputs: [!JointPositions {joints: [shoulder]}]
 gains: !Poles {all: [-4.0]}
 references:
-- !Sinusoids {offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}
-- !Constant {values: [10.0]}
+  shoulder: !Sinusoids {offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}
+  ceiling.force: 10.0
 start: {errors: {shoulder: 0.02}}
 duration: 1.0
 """
@@ -84,8 +87,8 @@ outputs: [!JointPositions {joints: [ARM, panda_finger_joint1]}]
 forces: []
 gains: !Poles {all: [-4.0]}
 references:
-- !Constant {values: [0.1, 0.5, 0.2, -1.1, 0.1, 1.3, 0.4]}
-- !Sinusoids {offset: 0.02, amplitudes: [0.01], frequencies: [2.0]}
+  ARM: !Constant {values: [0.1, 0.5, 0.2, -1.1, 0.1, 1.3, 0.4]}
+  panda_finger_joint1: !Sinusoids {offset: 0.02, amplitudes: [0.01], frequencies: [2.0]}
 start: {errors: {panda_joint2: 0.05}}
 duration: 1.0
 """.replace("ARM", ", ".join(ARM))
@@ -199,7 +202,7 @@ def test_what_leads_a_locked_joint_is_locked_as_well(tmp_path):
     path.write_text(
         "robot: {file: tree.urdf, base: {weld: b0}, locked: {j2: 0.3}, actuators: all}\n"
         "outputs: [!JointPositions {joints: [j5, j6]}]\nforces: []\n"
-        "references: [!Constant {values: [0, 0]}]"
+        "references: {j5: 0, j6: 0}"
     )
     model = scenario_model(load_scenario(path))
     assert [signal.name for signal in model.links.position_signals] == ["j4", "j5", "j6"]
@@ -217,7 +220,7 @@ def test_what_leads_a_locked_joint_is_locked_as_well(tmp_path):
 DRIVEN = """
 robot: {file: ROBOT}
 outputs: [!JointPositions {joints: [joint1]}]
-references: [!Constant {values: [0]}]
+references: {joint1: 0}
 """
 
 
@@ -228,7 +231,7 @@ def test_actuators_of_the_file_stay_or_go(tmp_path):
 
     def links(*settings: str):
         outputs = "outputs.0.joints=[joint1, joint2]"
-        values = "references.0.values=[0, 0]"
+        values = "references={joint1: 0, joint2: 0}"
         many = [outputs, values] if "joint2" in settings[0] or "all" in settings[0] else []
         return scenario_model(load_scenario(path, [*settings, *many])).links
 
@@ -331,7 +334,7 @@ def test_an_effort_limit_that_tells_nothing_is_none(effort, tmp_path):
 FRICTION = """
 robot: {file: arm.urdf, base: {weld: base}, actuators: all, leave_out: [joint_friction]}
 outputs: [!JointPositions {joints: [j]}]
-references: [!Constant {values: [0]}]
+references: {j: 0}
 """
 
 

@@ -135,8 +135,8 @@ def test_error_control_agrees(name, compiled):
     "settings",
     [
         # The tool leaves what the arm can reach.
-        ("references.0.amplitudes=[3.0]", "integrator.accuracy=1e-6"),
-        ("references.0.amplitudes=[3.0]", *fixed(step=0.01)[:3]),
+        ("references.tool.z.amplitudes=[3.0]", "integrator.accuracy=1e-6"),
+        ("references.tool.z.amplitudes=[3.0]", *fixed(step=0.01)[:3]),
         # Gains that no step of this length follows.
         ("gains.all=[-4000]", *fixed("explicit_euler", 0.01)[:3]),
     ],

@@ -61,7 +61,7 @@ DRIVE = """<transmission><type>transmission_interface/SimpleTransmission</type>
 LEVER = """robot: {file: lever.urdf}
 constraints:
 - {name: wall, frame: tip, surface: !Plane {point: [0.8, 0, 0], normal: [-1, 0, 0]}}
-references: [!Constant {values: [10]}]
+references: {wall.force: 10}
 start: {positions: {joint: 0.6}}
 duration: 0.1
 """
@@ -247,11 +247,12 @@ def test_every_form_reads_back_equal(tmp_path):
         ],
         force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0], gain=np.eye(2)),
         gains=forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
-        references=[
-            ConstantReference([1.0]),
-            SinusoidReference(1.0, [2.0], [3.0], [4.0]),
-            PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
-        ],
+        references={
+            "a": ConstantReference([1.0]),
+            "b": SinusoidReference(1.0, [2.0], [3.0], [4.0]),
+            "c.d, e": PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
+            "f": 2.0,
+        },
         start=forms.Start({"joint1": 1e-9}, {"a.b": -1e300}),
         duration=1e-3,
         integrator=SimulatorConfig(integration_scheme="radau3", max_step_size=0.5),
@@ -313,7 +314,9 @@ def test_packages_of_a_robot(tmp_path):
         ("constraints.0.surface.point.0=1.1", lambda s: s.constraints[0].surface.point[0] == 1.1),
         ("constraints.0.surface.point=[1, 0, 0]", lambda s: s.constraints[0].surface.point[0] == 1),
         ("gains=!Coefficients {all: [16, 8]}", lambda s: s.gains == forms.Coefficients([16, 8])),
-        ("references.1=!Constant {values: [9]}", lambda s: s.references[1].values == (9,)),
+        ("references.wall.force=9", lambda s: s.references["wall.force"] == 9.0),
+        ("references.wall.force.offset=9", lambda s: s.references["wall.force"].offset == 9.0),
+        ("references.tool=0.3", lambda s: list(s.references) == ["tool.z", "wall.force", "tool"]),
         ("start.errors.tool.z=0.01", lambda s: s.start.errors == {"tool.z": 0.01}),
         ("gains={outputs: {tool.z: [-3]}}", lambda s: s.gains.outputs == {"tool.z": [-3]}),
         ("plant_parameters.link2.mass=[5]", lambda s: s.plant_parameters == {"link2.mass": [5]}),
@@ -359,7 +362,7 @@ def test_later_settings_see_earlier_ones():
     ],
 )
 def test_surfaces(form, surface):
-    still = "references=[!Constant {values: [0.3, 20]}]"
+    still = "references={tool.z: 0.3, wall.force: 20}"
     scenario = two_link(f"constraints.0.surface={form}", still, "duration=0.2")
     loop, record, distance = run(scenario)
     assert loop.plant.model.constraints[0].surface == surface
@@ -410,7 +413,7 @@ def test_gains(form, poles):
     ],
 )
 def test_references(form, signal):
-    loop, _ = build_scenario(two_link(f"references.0={form}"))
+    loop, _ = build_scenario(two_link(f"references.tool.z={form}"))
     truth = signal.derivatives([2])
     for time in (0.0, 0.7, 1.3):
         np.testing.assert_allclose(loop.reference.reference(time)[:3], truth(time), atol=1e-15)
@@ -418,11 +421,13 @@ def test_references(form, signal):
 
 def test_outputs():
     """The outputs of seven_joint_wall in other words."""
-    change = "outputs.0=!SurfaceCoordinates {constraint: wall}"
-    errors = "start.errors={wall.across: 0.02}"
-    loop, context = build_scenario(
-        load_scenario(find_scenario("seven_joint_wall"), [change, errors])
-    )
+    settings = [
+        "outputs.0=!SurfaceCoordinates {constraint: wall}",
+        "start.errors={wall.across: 0.02}",
+        "references={wall: !Constant {values: [0, 0.6]}, tool.z_axis: 0, 'joint3, joint7': 0, "
+        "wall.force: 20}",
+    ]
+    loop, context = build_scenario(load_scenario(find_scenario("seven_joint_wall"), settings))
     names = [signal.name for signal in loop.plant.dae.output_signals]
     assert names[:3] == ["wall.along", "wall.across", "tool.z_axis.y"]
     assert names[3:] == ["tool.z_axis.z", "joint3", "joint7", "wall.force"]
@@ -450,7 +455,7 @@ def test_a_start_is_at_rest():
 
 def test_build_leaves_the_scenario_alone():
     scenario = two_link(
-        "references.0={_tag: '!Sinusoids', offset: 0.3, amplitudes: [0.1], frequencies: [1]}"
+        "references.tool.z={_tag: '!Sinusoids', offset: 0.3, amplitudes: [0.1], frequencies: [1]}"
     )
     before = deepcopy(scenario)
     build_scenario(scenario)
@@ -623,7 +628,10 @@ def test_a_robot_that_does_not_fit(change, words, tmp_path):
         (TWO_LINK + "---\na: 1\n", ["s.yaml: line 34: ", "another document"]),
         ("!Foo\n" + TWO_LINK, ["scenario: takes no tag, got !Foo"]),
         (TWO_LINK.replace("start:", "start: !Foo"), ["start: takes no tag, got !Foo"]),
-        (TWO_LINK.replace("references:", "references: !Foo"), ["s.yaml: line 16: ", "!Foo"]),
+        (
+            TWO_LINK.replace("references:", "references: !Foo"),
+            ["references: takes no tag, ", "!Foo"],
+        ),
         (TWO_LINK.replace("duration: 10.0", "duration: !Foo 1"), ["s.yaml: line 29: ", "!Foo"]),
         (TWO_LINK + "x: !!python/object/apply:os.getcwd []", ["s.yaml: line 34: ", "os.getcwd"]),
         (TWO_LINK.replace("!Poles", "!Pole"), ["gains: expected one of !Poles, ", "got !Pole"]),
@@ -631,8 +639,8 @@ def test_a_robot_that_does_not_fit(change, words, tmp_path):
         ("\ufeff" + TWO_LINK, None),
         ("_mine: &z 0.3\n" + TWO_LINK.replace("offset: 0.3", "offset: *z"), None),
         (
-            TWO_LINK.replace("- !Sinusoids\n  offset: 0.3", "-\n  offset: 0.3"),
-            ["references.0: !Constant has no key 'offset'", "No tag is given", "!Sinusoids"],
+            TWO_LINK.replace("tool.z: !Sinusoids", "tool.z:"),
+            ["references.tool.z: !Constant has no key 'offset'", "No tag is given", "!Sinusoids"],
         ),
     ],
 )
@@ -650,8 +658,8 @@ def test_texts(text, words, tmp_path):
 
 
 SPHERE = "constraints.0.surface=!Sphere"
-SINES = "references.1=!Sinusoids"
-MOVE = "references.0=!PointToPoint"
+SINES = "references.wall.force=!Sinusoids"
+MOVE = "references.tool.z=!PointToPoint"
 WELD = "constraints.0=!WeldedFrames {frame_a: world,"
 PIN = "constraints.0=!CoincidentPoints {frame_a: world, point_a: [1.2, 0, 0], frame_b: link2,"
 ALONG = "outputs.0=!SurfaceCoordinates"
@@ -681,9 +689,9 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("duration=1: 2", ["duration: line 1: ", "'1' is not text"]),
         ("duration=1\nfoo: 2", ["duration: line 2: "]),
         ("duration.x=1", ["duration: 10.0 has no entry 'x'"]),
-        ("references.2=1", ["references: no entry '2'; entries: 0, 1"]),
-        ("references.-1=1", ["references: no entry '-1'"]),
-        ("references.²=1", ["references: no entry '²'"]),
+        ("constraints.2=1", ["constraints: no entry '2'; entries: 0"]),
+        ("constraints.-1=1", ["constraints: no entry '-1'"]),
+        ("constraints.²=1", ["constraints: no entry '²'"]),
         ("constraints.wall.frame=tool", ["constraints: no entry 'wall'; entries: 0"]),
         ("gains.all.3=1", ["gains.all: no entry '3'; entries: 0"]),
         # Types.
@@ -698,7 +706,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("constraints.0.surface=3", ["constraints.0.surface: expected one of !Plane, ", "got 3"]),
         ("constraints.0.frame=3", ["constraints.0.frame: expected text, got 3; ", "quotes"]),
         ("write.plots=maybe", ["write.plots: expected true or false, got 'maybe'"]),
-        (f"{MOVE} {{start: [0], end: [1], end_time: 1, order: 2.5}}", ["0.order: ", "whole"]),
+        (f"{MOVE} {{start: [0], end: [1], end_time: 1, order: 2.5}}", ["tool.z.order: ", "whole"]),
         ("start.errors=[0.1]", ["start.errors: expected names with values, got [0.1]"]),
         ("start.positions.joint1=a", ["start.positions.joint1: expected a number, got 'a'"]),
         ("gains.all=[-4+1j]", ["gains.all.0: expected a number, got '-4+1j'"]),
@@ -772,23 +780,36 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
         ("gains=!Matrices {groups: [[[[1, 0], [1]], [[1]]]]}", ["gains: groups: ", "lengths"]),
         # References.
-        ("references=[]", ["references: too few", "tool.z, wall.force"]),
+        ("references={}", ["references: left without one: tool.z, wall.force"]),
+        ("references=[1, 2]", ["references: expected names with values, got [1, 2]"]),
+        ("references={tool: 1}", ["references: left without one: wall.force"]),
+        ("references={tool.z: a}", ["references.tool.z: expected one of !C", "a number, "]),
+        ("references={tool.z: true}", ["references.tool.z: expected one of !Constant", "got True"]),
+        ("references.wall.forc=1", ["references.wall.forc: no output", "mean 'wall.force'?"]),
+        ("references.tool.zz=1", ["references.tool.zz: no output 'tool.zz'", "'tool.z'?"]),
+        ("references.tool=1", ["references: 'tool.z' has two, by 'tool.z' and 'tool'"]),
+        ("references.tool.z, =1", ["references.tool.z, : no output ''"]),
         (
-            "references=[!Constant {values: [1]}]",
-            ["references: too few", "without one: wall.force"],
+            "references.tool.z=!Constant {values: [1, 2, 3]}",
+            ["references.tool.z: 3 values for 1 output: tool.z"],
         ),
-        ("references.0=!Constant {values: [1, 2, 3]}", ["references.0: too many: 3 values"]),
-        ("references.1=!Constant {values: [1, 2]}", ["references.1: too many: 2", ": wall.force"]),
-        ("references.1=!Constant {values: []}", ["references.1: values: empty"]),
+        (
+            "references={'wall.force, tool.z': !Constant {values: [1]}}",
+            ["references.wall.force, tool.z: 1 value for 2 outputs: wall.force, tool.z"],
+        ),
+        ("references.wall.force=!Constant {values: []}", ["references.wall.force: values: empty"]),
         (f"{SINES} {{offset: 1, amplitudes: [1], frequencies: [1, 2]}}", ["frequencies has 2"]),
         (
             f"{SINES} {{offset: 1, amplitudes: [1, 2], frequencies: [1, 2], phases: [0]}}",
-            ["references.1: ", "amplitudes has 2", "phases has 1"],
+            ["references.wall.force: ", "amplitudes has 2", "phases has 1"],
         ),
-        (f"{SINES} {{offset: 1, amplitudes: [], frequencies: []}}", ["1: ", "at least one"]),
+        (
+            f"{SINES} {{offset: 1, amplitudes: [], frequencies: []}}",
+            ["wall.force: ", "at least one"],
+        ),
         (f"{MOVE} {{start: [1, 2], end: [1], end_time: 1}}", ["start has 2, end has 1"]),
-        (f"{MOVE} {{start: [1], end: [2], end_time: 0}}", ["references.0: end_time 0"]),
-        (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["0: ", "order=2"]),
+        (f"{MOVE} {{start: [1], end: [2], end_time: 0}}", ["references.tool.z: end_time 0"]),
+        (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["tool.z: ", "order=2"]),
         # Actuation and force.
         ("actuation=[!FlexibleJoints {stiffness: []}]", ["actuation.0.stiffness: empty"]),
         (
@@ -863,7 +884,7 @@ def test_all_problems_are_told_at_once():
         f"{MOVE} {{start: [1], end: [2], end_time: 0}}",
     )
     keys = [line.split(": ")[0] for line in message.splitlines()]
-    assert keys == ["constraints.0.surface", "outputs.0", "references.0"]
+    assert keys == ["constraints.0.surface", "outputs.0", "references.tool.z"]
 
 
 def test_a_file_that_is_not_there(tmp_path):

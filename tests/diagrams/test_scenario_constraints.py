@@ -97,8 +97,8 @@ constraints:
 outputs: [!PointCoordinates {{frame: tool, axes: z}}]
 gains: !Poles {{all: [-4.0]}}
 references:
-- !Sinusoids {{offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}}
-- !Constant {{values: [30.0]}}
+  tool.z: !Sinusoids {{offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}}
+  rod.thrust: 30.0
 start: {{positions: {{joint1: 1.2, joint2: -1.6}}, errors: {{tool.z: 0.02}}}}
 """
 GEARS = f"""{TWO_LINK}
@@ -106,8 +106,8 @@ constraints: [!JointCoupler {{follower: joint2, leader: joint1, ratio: -1.5, off
 outputs: [!JointPositions {{joints: [joint1]}}]
 gains: !Poles {{all: [-4.0]}}
 references:
-- !Sinusoids {{offset: 0.9, amplitudes: [0.2], frequencies: [2.0]}}
-- !Constant {{values: [5.0]}}
+  joint1: !Sinusoids {{offset: 0.9, amplitudes: [0.2], frequencies: [2.0]}}
+  coupler.moment: 5.0
 start: {{positions: {{joint1: 0.9, joint2: -1.15}}, errors: {{joint1: 0.05}}}}
 """
 FLUSH = """robot: {file: package://drake_dae_models/seven_joint_arm.dmd.yaml}
@@ -125,8 +125,11 @@ outputs:
 - !JointPositions {joints: [joint3, joint7]}
 gains: !Poles {all: [-4.0]}
 references:
-- !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [2.0]}
-- !Constant {values: [0.5, 0.0, 0.0, 20.0, 0.0, 0.3]}
+  tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [2.0]}
+  tool.z: 0.5
+  joint3, joint7: 0.0
+  wall.force: 20.0
+  flush: !Constant {values: [0.0, 0.3]}
 start: {positions: {joint2: -0.6, joint4: -1.7, joint6: 0.5}, errors: {tool.z: 0.02}}
 """
 SKATE = f"""{ROBOT}
@@ -134,9 +137,9 @@ constraints: [!Blade {{frame: deck}}]
 outputs: [!JointPositions {{joints: [x, turn_z]}}]
 gains: !Poles {{all: [-4.0]}}
 references:
-- !Sinusoids {{offset: 0.0, amplitudes: [0.5], frequencies: [1.0]}}
-- !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
-- !Constant {{values: [1.0]}}
+  x: !Sinusoids {{offset: 0.0, amplitudes: [0.5], frequencies: [1.0]}}
+  turn_z: !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
+  blade: 1.0
 start: {{errors: {{x: 0.05}}}}
 """
 ROLL = f"""{ROBOT}
@@ -147,8 +150,8 @@ outputs: [!PointCoordinates {{frame: deck, axes: xy, point: [0.3, 0, 0]}}]
 forces: []
 gains: !Poles {{all: [-4.0]}}
 references:
-- !Sinusoids {{offset: 0.3, amplitudes: [0.4], frequencies: [0.8]}}
-- !Sinusoids {{offset: 0.0, amplitudes: [0.3], frequencies: [1.1]}}
+  deck.x: !Sinusoids {{offset: 0.3, amplitudes: [0.4], frequencies: [0.8]}}
+  deck.y: !Sinusoids {{offset: 0.0, amplitudes: [0.3], frequencies: [1.1]}}
 start: {{errors: {{deck.y: 0.05}}}}
 """
 MARBLE = f"""{ROBOT}
@@ -162,8 +165,9 @@ outputs: [!PointCoordinates {{frame: ball, axes: xy}}]
 forces: [dome.force]
 gains: !Poles {{all: [-4.0]}}
 references:
-- !Sinusoids {{offset: 0.0, amplitudes: [0.2], frequencies: [1.0]}}
-- !Constant {{values: [0.1, 25.0]}}
+  ball.x: !Sinusoids {{offset: 0.0, amplitudes: [0.2], frequencies: [1.0]}}
+  ball.y: 0.1
+  dome.force: 25.0
 start: {{errors: {{ball.x: 0.03}}}}
 """
 PADS = f"""{ROBOT}
@@ -171,8 +175,8 @@ outputs: [!JointPositions {{joints: [arm, left]}}]
 forces: []
 gains: !Poles {{all: [-4.0]}}
 references:
-- !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
-- !Sinusoids {{offset: 0.02, amplitudes: [0.01], frequencies: [3.0]}}
+  arm: !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
+  left: !Sinusoids {{offset: 0.02, amplitudes: [0.01], frequencies: [3.0]}}
 start: {{errors: {{left: 0.01}}}}
 """
 END = """duration: 0.5

@@ -10,10 +10,13 @@ from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
 
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
+LINE = "!Sinusoids {offset: 0.3, amplitudes: [0.3], frequencies: [1.5]}"
+PUSH = "!Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}"
 TWICE = [
     f"constraints=[{WALL}, {WALL.replace('wall', 'board')}]",
     "forces=[!ForceCombination {name: press, weights: {wall.force: 1, board.force: 1}}]",
     "duration=0.3",
+    f"references={{tool.z: {LINE}, press: {PUSH}}}",
 ]
 
 

@@ -100,7 +100,7 @@ def test_a_scenario_with_another_mass_in_the_plant():
         "duration=2",
         "force.noise_deviation=[0]",
         "force.time_constant=0.002",
-        "references.1.frequencies=[0.5]",
+        "references.wall.force.frequencies=[0.5]",
     )
     loop, _, record = run_scenario(scenario("two_link_measured_force", *quiet))
     plant = loop.plant.GetMyContextFromRoot(loop.diagram.CreateDefaultContext())

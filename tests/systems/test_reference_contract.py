@@ -1,16 +1,28 @@
 """The rules of `Reference`, run on every member: a new one is a line in MEMBERS."""
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
+from members import subclasses
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import (
+    CircleReference,
     ConstantReference,
+    CsvReference,
     ExpressionReference,
+    LineReference,
+    PathLimits,
     PointToPointReference,
+    PolylineReference,
+    Reference,
     ReferenceGenerator,
+    ReferenceRows,
     SinusoidReference,
+    SpiralReference,
+    TextReference,
     TrajectoryReference,
 )
 from drake_dae.errors import ReferenceSignalError
@@ -19,17 +31,32 @@ PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
     [0.0, 1.0, 2.0], [[0.0, 1.0, 0.5], [1.0, -1.0, 2.0]], np.zeros((2, 1)), np.zeros((2, 1))
 )
 
+LIMITS = PathLimits(1.0, 2.0, 20.0)
+EDGES = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]
+
 MEMBERS = {
     "constant": ConstantReference([0.3, -2.0]),
     "sinusoids": SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
     "point to point": PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
     "expression": ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
     "trajectory": TrajectoryReference(PATH),
+    "line": LineReference([0.0, 1.0], [0.8, 0.4], LIMITS, 0.2),
+    "circle": CircleReference([0.0, 1.0], 0.3, period=2.0),
+    "turn": CircleReference([0.0, 1.0], 0.1, limits=LIMITS),
+    "spiral": SpiralReference([0.0, 1.0], 0.0, 0.3, 0.2, LIMITS),
+    "polyline": PolylineReference(EDGES, LIMITS, 0.2),
+    "text": TextReference("L", [0.0, 0.0], 1.0, LIMITS, press=[2.0, 1.0], corner=0.3),
+    "file": CsvReference(str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3),
+    "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
+    "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
 }
 
 TIMES = (0.41, 0.93, 1.62)
 
 ROUGH = {
+    "line": LineReference(0.0, 1.0, LIMITS, order=2),
+    "polyline": PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),
+    "rows": ReferenceRows(ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),
     "point to point": PointToPointReference(0.0, 1.0, 0.0, 1.0, order=1),
     "expression": ExpressionReference(lambda t: ca.fabs(t - 1.0)),
     "trajectory": TrajectoryReference(PiecewisePolynomial.FirstOrderHold([0, 1, 2], [[0, 1, 0]])),
@@ -40,6 +67,10 @@ def table(reference, degree, time):
     """Row per output: value, first derivative, ..."""
     value = reference.derivatives([degree] * reference.size)(time)
     return np.array(value).reshape(reference.size, degree + 1)
+
+
+def test_no_member_is_left_out():
+    assert subclasses(Reference) <= {type(member) for member in MEMBERS.values()}
 
 
 @pytest.fixture(params=MEMBERS)
@@ -89,7 +120,7 @@ def test_rule_4_a_value_depends_on_the_time_alone(reference):
 def test_rule_5_what_is_too_rough_is_refused_before_it_is_used(name):
     ROUGH[name].derivatives([0])
     with pytest.raises(ReferenceSignalError, match="needs"):
-        ROUGH[name].derivatives([2])
+        ROUGH[name].derivatives([3])
 
 
 def test_rule_6_traced_together_the_values_are_the_same(reference):

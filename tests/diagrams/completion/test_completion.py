@@ -8,6 +8,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
 from drake_dae import (
+    CircleReference,
     ConstantReference,
     Cylinder,
     JointPositions,
@@ -19,6 +20,7 @@ from drake_dae import (
     build_scenario,
     complete_scenario,
     load_scenario,
+    simulate,
 )
 from drake_dae.diagrams.scenario import save_scenario
 from drake_dae.diagrams.scenario_model import scenario_model
@@ -34,7 +36,7 @@ FORCE = ConstantReference((20.0,))
 
 def left_out(name="seven_joint_wall", **changes):
     """A shipped scenario without outputs and start; its references are force alone."""
-    open_ = {"outputs": [], "start": Start(), "references": [FORCE]}
+    open_ = {"outputs": [], "start": Start(), "references": {"wall.force": FORCE}}
     return replace(scenario(name), **(open_ | changes))
 
 
@@ -44,7 +46,8 @@ def names(completed):
 
 def touching(*constraints):
     """The seven-joint arm on other surfaces."""
-    return left_out(constraints=list(constraints))
+    forces = {f"{constraint.name}.force": FORCE for constraint in constraints}
+    return left_out(constraints=list(constraints), references=forces)
 
 
 def test_a_scenario_that_says_all_is_returned_as_it_is():
@@ -57,7 +60,8 @@ def test_a_scenario_that_says_all_is_returned_as_it_is():
 def test_the_arm_on_the_wall_gets_the_outputs_and_the_start_that_were_chosen_by_hand():
     """They are those of the shipped file: the elbow and the hand of the redundant arm are held."""
     by_hand = scenario("seven_joint_wall")
-    open_ = left_out(references=[*by_hand.references[:2], by_hand.references[-1]])
+    written = {name: by_hand.references[name] for name in ("tool.y", "tool.z")}
+    open_ = left_out(references={**written, "wall.force": by_hand.references["wall.force"]})
     completed = complete_scenario(open_)
     assert completed.scenario.outputs == [
         PointCoordinates("tool", "yz"),
@@ -101,16 +105,33 @@ def test_the_tool_axis_is_normal_fixed_or_free(kind, held):
 def test_outputs_given_in_part_are_kept_and_come_first():
     part = left_out(
         outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
-        references=[ConstantReference((0.1,)), ConstantReference((0.6,)), FORCE],
+        references={"joint1": 0.1, "tool.z": 0.6, "wall.force": FORCE},
     )
     completed = complete_scenario(part).scenario
     found = names(complete_scenario(part))
     assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
     assert found[5] in ("joint5", "joint7", "joint3")
     assert completed.start.positions["joint1"] == 0.1
-    # The references of what was given stay where they were, the force comes last.
-    assert completed.references[:2] == part.references[:2]
-    assert completed.references[-1] == FORCE
+    assert list(completed.references) == [*part.references, *found[2:]]
+    assert {name: completed.references[name] for name in part.references} == part.references
+
+
+def test_what_references_name_becomes_an_output_and_follows_them():
+    """A circle of the tool is along the surface; a joint that is named is steered."""
+    circle = CircleReference([0.0, 0.6], 0.1, period=5.0)
+    named = left_out(references={"tool": circle, "joint3": 0.2, "wall.force": FORCE})
+    completed = complete_scenario(named)
+    found = names(completed)
+    assert found[:3] == ["tool.y", "tool.z", "joint3"]
+    assert completed.scenario.start.positions["joint3"] == 0.2
+    loop, context = build_scenario(completed.scenario)
+    simulate(loop.diagram, context, 0.1, completed.scenario.integrator)
+    record = loop.record(context)
+    wanted = [0.1 * np.cos(2 * np.pi * 0.1 / 5), 0.6 + 0.1 * np.sin(2 * np.pi * 0.1 / 5), 0.2]
+    np.testing.assert_allclose(record["desired_output"][-1, :3], wanted, rtol=1e-12)
+    # It starts at rest, on a circle that does not: off as predicted, to the integrator's 1e-8.
+    off = record["tracking_error"] - loop.predicted_error(record)
+    np.testing.assert_allclose(off, 0.0, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -191,8 +212,7 @@ def refusal(open_):
 
 def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
     """The arm reaches 1.5 m at most from its shoulder."""
-    height = ConstantReference((3.0,))
-    message = refusal(left_out(references=[ConstantReference((0.0,)), height, FORCE]))
+    message = refusal(left_out(references={"tool": ConstantReference([0.0, 3.0])}))
     assert message.startswith("references: the robot cannot start there within its joint limits")
     assert "tool.z comes to 1." in message
     assert "from 3 m" in message
@@ -210,17 +230,21 @@ def test_a_surface_out_of_reach_is_told():
     [
         (
             {"outputs": [PointCoordinates("tool", "y")]},
-            "references: 1 values; needed are those of the 1 given outputs",
+            "references: left without one: tool.y",
         ),
         (
-            {"references": [ConstantReference((0.0, 0.6, 0.0, FORCE.values[0]))]},
-            "references: one reference covers a position and a force",
+            {"references": {"tool": ConstantReference((0.0,) * 4), "wall.force": FORCE}},
+            "references.tool: 4 values for 2 outputs",
         ),
         (
-            {"references": [ConstantReference((0.0,) * 4), FORCE]},
-            "references: 4 values for positions, but beside the 0 outputs that are given only 2",
+            {"references": {f"joint{k}": 0.0 for k in range(1, 8)}},
+            "references: joint1, joint2, joint3, joint4, joint5, joint6, joint7 are 7 outputs, but "
+            "only 6 are missing",
         ),
-        ({"references": [ConstantReference((0.0,) * 9), FORCE]}, "references: 10 values"),
+        (
+            {"references": {"tol.y": 0.0, "wall.force": FORCE}},
+            "references.tol.y: no output 'tol.y'; did you mean 'tool.y'?",
+        ),
     ],
 )
 def test_references_that_fit_no_completion_are_refused(changes, message):
@@ -239,7 +263,7 @@ def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
 
 
 def test_a_robot_that_is_only_simulated_gets_no_outputs():
-    still = left_out("slider_crank", forces=[], references=[])
+    still = left_out("slider_crank", forces=[], references={})
     assert complete_scenario(still).scenario is still
 
 

@@ -86,7 +86,7 @@ def test_another_structure_is_built():
     base = scenario_data(scenario("two_link_wall", *SHORT))
     variations = [
         {"constraints.0.surface.point": [1.25, 0.0, 0.0]},
-        {"references.0.offset": 0.2},
+        {"references.tool.z.offset": 0.2},
         {"gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}},
         {"actuation": [{"_tag": "!DcMotors", "torque_constant": 0.5, "inductance": 1e-2,
                         "resistance": 1.0, "gear_ratio": 100.0}],
@@ -106,7 +106,7 @@ def test_another_structure_is_built():
 def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
     """By Drake's Simulator, and by rollouts."""
     base = scenario_data(scenario("two_link_wall", *SHORT))
-    far = {"references.0.offset": 1.0, "references.0.amplitudes": [0.9], "duration": 2.0}
+    far = {"references.tool.z.offset": 1.0, "references.tool.z.amplitudes": [0.9], "duration": 2.0}
     cases = [
         ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "found no configuration"),
         ({"start.positions.joint1": 9.0}, Outcome.REFUSED, "outside its limits"),

@@ -1,9 +1,7 @@
-"""References with all the derivatives that a tracking law asks for."""
+"""References that are expressions of time: constants, sinusoids, moves, and any other."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from math import comb
 from typing import Any
 
@@ -12,91 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked, result_of
-from drake_dae.arrays import FloatArray
-from drake_dae.errors import NonFiniteError, ReferenceSignalError
-from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.smoothness import find_flaw
-
-
-@checked(ReferenceSignalError)
-class Reference(ABC):
-    """Desired values r(t) of one or several outputs, with their time derivatives.
-
-    1. `size`, at least 1, is the number of outputs that it covers. It never changes.
-    2. `derivatives` takes one degree mu_i >= 0 per output, and returns a function of the time in s
-       with the values r_1, r_1', ..., r_1^(mu_1), r_2, ...: output-major, shape
-       (sum (mu_i + 1),).
-    3. Each value is the exact time derivative of the one before it. All but the last of an output
-       are continuous: the law integrates them.
-    4. A value depends on the time alone: not on the other degrees, nor on earlier calls.
-    5. An output that is not smooth enough for its degree is refused by `derivatives`, with the row
-       and a remedy, and never later. A time at which there is no value is refused by the function.
-    6. A reference that is an expression of time says so in `expression`, so that all of them are
-       traced as one function; the values are the same either way.
-    """
-
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """The number of outputs that it covers."""
-
-    @abstractmethod
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        """Prepares r_1, r_1', ..., r_1^(mu_1), r_2, ... as a function of the time in s.
-
-        Args:
-            degrees: The degree mu of each covered output.
-
-        Raises:
-            ReferenceSignalError: The reference is not smooth enough for these degrees.
-        """
-
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None if they are no expression.
-
-        Raises:
-            ReferenceSignalError: The reference is not smooth enough for these degrees.
-        """
-        return None
-
-
-@checked(ReferenceSignalError)
-class _Expression(Reference):
-    """A reference that is a CasADi expression of time; differentiated exactly."""
-
-    @abstractmethod
-    def _rows(self, time: ca.SX) -> ca.SX:
-        """r(t), shape (size, 1)."""
-
-    def _check(self, degrees: Sequence[int]) -> None:
-        """Refuses what lacks derivatives up to the degrees."""
-        time = ca.SX.sym("t")
-        rows = self._rows(time)
-        for i, degree in enumerate(degrees):
-            flaw = find_flaw(rows[i], time, ca.SX(0, 1))
-            if degree and flaw:
-                raise ReferenceSignalError(
-                    f"row {i} of the reference {flaw.describe('the time')}. The law needs {degree} "
-                    "derivatives of it; a move from rest to rest is a PointToPointReference"
-                )
-
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        self._check(degrees)
-        values = []
-        for row, degree in zip(ca.vertsplit(self._rows(time)), degrees, strict=True):
-            values.append(row)
-            for _ in range(degree):
-                values.append(ca.jacobian(values[-1], time))
-        return ca.vertcat(*values)
-
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        time = ca.SX.sym("t")
-        return _at_time(time, self.expression(degrees, time))
+from drake_dae.dae.references.reference import FormulaReference, Reference
+from drake_dae.errors import ReferenceSignalError
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
-class ConstantReference(_Expression):
+class ConstantReference(FormulaReference):
     """A reference that stays at given values.
 
     Attributes:
@@ -109,19 +29,19 @@ class ConstantReference(_Expression):
     values: ArrayLike
 
     def __post_init__(self) -> None:
-        _settle(self, "values")
+        settle(self, "values")
 
     @property
     def size(self) -> int:
         return np.size(self.values)
 
-    def _rows(self, time: ca.SX) -> ca.SX:
+    def rows(self, time: ca.SX) -> ca.SX:
         return ca.SX(ca.DM(self.values))
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
-class SinusoidReference(_Expression):
+class SinusoidReference(FormulaReference):
     """The sum r(t) = offset + sum_i amplitude_i sin(frequency_i t + phase_i), for one output.
 
     Attributes:
@@ -140,20 +60,20 @@ class SinusoidReference(_Expression):
     phases: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
-        _settle(self, "amplitudes", "frequencies", "phases")
+        settle(self, "amplitudes", "frequencies", "phases")
 
     @property
     def size(self) -> int:
         return 1
 
-    def _rows(self, time: ca.SX) -> ca.SX:
+    def rows(self, time: ca.SX) -> ca.SX:
         terms = np.transpose([self.amplitudes, self.frequencies, self.phases])
         return ca.SX(self.offset + sum(a * ca.sin(w * time + p) for a, w, p in terms))
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
-class PointToPointReference(_Expression):
+class PointToPointReference(FormulaReference):
     """A smooth move from rest at `start` to rest at `end`, held before and after.
 
     It is the polynomial of degree 2 order + 1 whose derivatives 1, ..., order vanish at both ends:
@@ -177,7 +97,7 @@ class PointToPointReference(_Expression):
     order: int = 2
 
     def __post_init__(self) -> None:
-        _settle(self, "start", "end")
+        settle(self, "start", "end")
         if not self.end_time > self.start_time:
             raise ReferenceSignalError(
                 f"end_time {self.end_time} must be after start_time {self.start_time}"
@@ -189,7 +109,7 @@ class PointToPointReference(_Expression):
     def size(self) -> int:
         return np.size(self.start)
 
-    def _rows(self, time: ca.SX) -> ca.SX:
+    def rows(self, time: ca.SX) -> ca.SX:
         s = (time - self.start_time) / (self.end_time - self.start_time)
         # Positive terms alone, so that nothing cancels.
         fraction = s ** (self.order + 1) * sum(
@@ -209,7 +129,7 @@ class PointToPointReference(_Expression):
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
-class ExpressionReference(_Expression):
+class ExpressionReference(FormulaReference):
     """A reference that is any CasADi expression of time.
 
     Attributes:
@@ -225,7 +145,7 @@ class ExpressionReference(_Expression):
 
     def __post_init__(self) -> None:
         time = ca.SX.sym("t")
-        rows = self._rows(time)
+        rows = self.rows(time)
         unknown = [s.name() for s in ca.symvar(rows) if not ca.is_equal(s, time)]
         if unknown or rows.shape[1] != 1:
             raise ReferenceSignalError(
@@ -235,9 +155,9 @@ class ExpressionReference(_Expression):
 
     @property
     def size(self) -> int:
-        return int(self._rows(ca.SX.sym("t")).numel())
+        return int(self.rows(ca.SX.sym("t")).numel())
 
-    def _rows(self, time: ca.SX) -> ca.SX:
+    def rows(self, time: ca.SX) -> ca.SX:
         value = result_of("function", self.function, time, error=ReferenceSignalError)
         try:
             return ca.SX(ca.vertcat(*(value if isinstance(value, (list, tuple)) else [value])))
@@ -247,7 +167,7 @@ class ExpressionReference(_Expression):
             ) from error
 
 
-def _settle(reference: Reference, *names: str) -> None:
+def settle(reference: Reference, *names: str) -> None:
     """Makes fields tuples of the same length; a single number serves all.
 
     Raises:
@@ -277,50 +197,3 @@ def _settle(reference: Reference, *names: str) -> None:
     for name, array in arrays.items():
         values = tuple(float(value) for value in np.broadcast_to(array, length))
         object.__setattr__(reference, name, values)
-
-
-def stack_references(
-    references: Sequence[Reference], degrees: Sequence[int]
-) -> Callable[[float], FloatArray]:
-    """All references as one function of the time in s; expressions are traced together.
-
-    Args:
-        references: The references, in the order of the outputs.
-        degrees: The degrees mu_1, ..., mu_p of all outputs.
-
-    Raises:
-        ReferenceSignalError: A reference is not smooth enough.
-    """
-    ends = np.cumsum([0, *[reference.size for reference in references]])
-    parts = list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))
-    time = ca.SX.sym("t")
-    rows = [reference.expression(part, time) for reference, part in parts]
-    if all(row is not None for row in rows):
-        return _at_time(time, ca.vertcat(*rows))
-    functions = [reference.derivatives(part) for reference, part in parts]
-
-    def evaluate(time: float) -> FloatArray:
-        value = np.concatenate([function(time) for function in functions])
-        if not np.isfinite(value).all():
-            raise _not_finite(time, value)
-        return value
-
-    return evaluate
-
-
-def _at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
-    """An expression of the time alone as a function that is called with a float."""
-    function = TracedFunction("reference", {"time": time}, {"R": rows})
-    (moment,), (value,) = function.arguments, function.outputs
-
-    def evaluate(time: float) -> FloatArray:
-        moment[0] = time
-        if not function.run():
-            raise _not_finite(time, value)
-        return value
-
-    return evaluate
-
-
-def _not_finite(time: float, value: FloatArray) -> NonFiniteError:
-    return NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)

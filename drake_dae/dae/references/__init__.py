@@ -1,0 +1,33 @@
+"""What a system shall follow: values of time with all the derivatives that a law asks for."""
+
+from drake_dae.dae.references.by_name import ReferenceRows, references_by_name
+from drake_dae.dae.references.csv_file import CsvReference
+from drake_dae.dae.references.formulas import (
+    ConstantReference,
+    ExpressionReference,
+    PointToPointReference,
+    SinusoidReference,
+)
+from drake_dae.dae.references.paths import CircleReference, LineReference, SpiralReference
+from drake_dae.dae.references.reference import Reference, stack_references
+from drake_dae.dae.references.splines import PolylineReference
+from drake_dae.dae.references.travel import PathLimits
+from drake_dae.dae.references.writing import TextReference
+
+__all__ = [
+    "CircleReference",
+    "ConstantReference",
+    "CsvReference",
+    "ExpressionReference",
+    "LineReference",
+    "PathLimits",
+    "PointToPointReference",
+    "PolylineReference",
+    "Reference",
+    "ReferenceRows",
+    "SinusoidReference",
+    "SpiralReference",
+    "TextReference",
+    "references_by_name",
+    "stack_references",
+]

@@ -1,0 +1,182 @@
+"""References by the names of the outputs that they are for.
+
+A name is that of an output, "tool.y"; of several that share what stands before their last dot,
+"tool", of which those with the highest degree are meant: positions before forces; of some of these
+by their letters, in that order, "tool.yz"; or a list of all these, "tool.y, joint3".
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.references.formulas import ConstantReference
+from drake_dae.dae.references.reference import Reference
+from drake_dae.errors import ReferenceSignalError
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True, eq=False)
+class ReferenceRows(Reference):
+    """Some rows of a reference, in any order.
+
+    Attributes:
+        reference: The reference.
+        rows: Which of its rows, shape (k,).
+
+    Raises:
+        ReferenceSignalError: There is no such row, a row stands twice, or there are none.
+    """
+
+    reference: Reference
+    rows: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        known = range(self.reference.size)
+        if not self.rows or len(set(self.rows) & set(known)) != len(self.rows):
+            raise ReferenceSignalError(
+                f"rows must be distinct ones of 0 to {known[-1]}, got {self.rows}"
+            )
+
+    @property
+    def size(self) -> int:
+        return len(self.rows)
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        needed = self._needed(degrees)
+        function, places = self.reference.derivatives(needed), self._places(needed)
+        return lambda time: function(time)[places]
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+        needed = self._needed(degrees)
+        value = self.reference.expression(needed, time)
+        return None if value is None else value[self._places(needed)]
+
+    def _needed(self, degrees: Sequence[int]) -> list[int]:
+        """The degree of each row of the whole reference."""
+        given = dict(zip(self.rows, degrees, strict=True))
+        return [given.get(row, 0) for row in range(self.reference.size)]
+
+    def _places(self, degrees: Sequence[int]) -> list[int]:
+        """Where the values of the chosen rows stand among those of all."""
+        first = np.cumsum([0, *[degree + 1 for degree in degrees]])
+        return [int(first[row]) + k for row in self.rows for k in range(degrees[row] + 1)]
+
+
+@dataclass(frozen=True)
+class Assigned:
+    """A reference, and where the outputs that it is for stand among all."""
+
+    name: str
+    reference: Reference
+    places: Sequence[int]
+
+
+def assigned(
+    name: str, reference: Reference | float, outputs: Sequence[str], degrees: Sequence[int]
+) -> Assigned:
+    """A reference and the outputs that a name means; a number is a constant for each of them.
+
+    Args:
+        name: The name.
+        reference: The reference, with as many rows as the name means outputs.
+        outputs: The names of all outputs.
+        degrees: Their degrees mu_1, ..., mu_p.
+
+    Raises:
+        ReferenceSignalError: The name means no output, or the reference has more or fewer rows, or
+            is not smooth enough.
+    """
+    places = [place for part in name.split(",") for place in meant(part.strip(), outputs, degrees)]
+    if not isinstance(reference, Reference):
+        reference = ConstantReference([reference] * len(places))
+    if reference.size != len(places):
+        listed = ", ".join(outputs[place] for place in places)
+        raise ReferenceSignalError(
+            f"{reference.size} value{'s' * (reference.size > 1)} for {len(places)} "
+            f"output{'s' * (len(places) > 1)}: {listed}"
+        )
+    reference.derivatives([degrees[place] for place in places])
+    return Assigned(name, reference, places)
+
+
+def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Reference]:
+    """References in the order of the outputs, of which each needs one.
+
+    Raises:
+        ReferenceSignalError: An output has none, or two.
+    """
+    rows: dict[int, tuple[Assigned, int]] = {}
+    for one in references:
+        for row, place in enumerate(one.places):
+            if place in rows:
+                names = " and ".join(f"'{name}'" for name in (rows[place][0].name, one.name))
+                raise ReferenceSignalError(f"'{outputs[place]}' has two, by {names}")
+            rows[place] = one, row
+    left = [name for place, name in enumerate(outputs) if place not in rows]
+    if left:
+        raise ReferenceSignalError(
+            f"left without one: {', '.join(left)}; needed for {', '.join(outputs)}"
+        )
+    return list(_runs([rows[place] for place in range(len(outputs))]))
+
+
+@checked(ReferenceSignalError)
+def references_by_name(
+    references: Mapping[str, Reference | float], outputs: Sequence[str], degrees: Sequence[int]
+) -> list[Reference]:
+    """References in the order of the outputs.
+
+    Args:
+        references: Name -> reference, or a number for a constant.
+        outputs: The names of all outputs.
+        degrees: Their degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
+
+    Raises:
+        ReferenceSignalError: A name means no output, an output has no reference or two, or a
+            reference does not fit or is not smooth enough.
+    """
+    found = []
+    for name, reference in references.items():
+        try:
+            found.append(assigned(name, reference, outputs, degrees))
+        except ReferenceSignalError as error:
+            raise ReferenceSignalError(f"reference '{name}': {error}") from error
+    return in_order(found, outputs)
+
+
+def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
+    """The places of the outputs that a name means.
+
+    Raises:
+        ReferenceSignalError: There is no such output.
+    """
+    places = {output: place for place, output in enumerate(outputs)}
+    if name in places:
+        return [places[name]]
+    group, _, letters = name.rpartition(".")
+    chosen = [f"{group}.{letter}" for letter in letters]
+    if len(set(chosen)) == len(chosen) > 1 and all(one in places for one in chosen):
+        return [places[one] for one in chosen]
+    members = [place for output, place in places.items() if output.rpartition(".")[0] == name]
+    if not name or not members:
+        raise ReferenceSignalError(unknown_name("output", name, outputs))
+    highest = max(degrees[place] for place in members)
+    return [place for place in members if degrees[place] == highest]
+
+
+def _runs(rows: Sequence[tuple[Assigned, int]]) -> Iterator[Reference]:
+    """The references of rows, as few as there can be."""
+    first = 0
+    while first < len(rows):
+        one, row = rows[first]
+        last = first + 1
+        while last < len(rows) and rows[last] == (one, row + last - first):
+            last += 1
+        is_whole = last - first == one.reference.size
+        chosen = tuple(range(row, row + last - first))
+        yield one.reference if is_whole else ReferenceRows(one.reference, chosen)
+        first = last

@@ -1,0 +1,282 @@
+"""Paths with a shape of their own: lines, circles and spirals, from rest to rest within limits."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import copysign, tau
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import positive, vector
+from drake_dae.dae.references.formulas import settle
+from drake_dae.dae.references.reference import FormulaReference
+from drake_dae.dae.references.travel import PathLimits, Travel, rest_to_rest
+from drake_dae.errors import ReferenceSignalError
+
+
+@checked(ReferenceSignalError)
+class PathReference(FormulaReference):
+    """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest.
+
+    s is a `Travel` with `order` continuous derivatives: as many as the law needs, where motions
+    that are the fastest within the same limits have two (a double S) or one (Drake's Toppra). Where
+    the curve makes the acceleration or the jerk too large, the whole motion is slowed until both
+    fit.
+
+    A member has p(s) with |dp/ds| <= 1, for 0 <= s <= `length`.
+    """
+
+    limits: PathLimits | None
+    start_time: float
+    order: int
+
+    @property
+    @abstractmethod
+    def length(self) -> float:
+        """How long the path is at most, in the outputs' unit."""
+
+    @abstractmethod
+    def point(self, distance: ca.SX) -> ca.SX:
+        """p(s), shape (size, 1)."""
+
+    @cached_property
+    def travel(self) -> Travel:
+        """The distance along the path at a time after the start; `duration` tells how long.
+
+        Raises:
+            ReferenceSignalError: The reference has no limits, as it never rests.
+        """
+        if self.limits is None:
+            raise ReferenceSignalError("this reference has no limits: it moves all the time")
+        travel = rest_to_rest(self.length, self.limits, self.order)
+        time = ca.SX.sym("t")
+        _, *derivatives = self._derivatives(travel.derivatives(time, 3))
+        peaks = ca.Function("peaks", [time], [ca.norm_2(one) for one in derivatives])
+        end, ramp = travel.duration, travel.ramp
+        shares = np.linspace(0.0, 1.0, 401)
+        moments = np.concatenate(
+            [ramp * shares, ramp + (end - 2 * ramp) * shares, end - ramp * shares]
+        )
+        found = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
+        excess = [peak / limit for peak, limit in zip(found, self.limits.values, strict=True)]
+        slower = max(excess[0], excess[1] ** (1 / 2), excess[2] ** (1 / 3))
+        # What lies between the samples is below one in a thousand.
+        return travel if slower <= 1.0 + 1e-9 else travel.slower(1.001 * slower)
+
+    def rows(self, time: ca.SX) -> ca.SX:
+        return self.point(self.travel.derivatives(time - self.start_time, 0)[0])
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        self._check(degrees)
+        along = self.travel.derivatives(time - self.start_time, max(degrees))
+        values = self._derivatives(along)
+        return ca.vertcat(*[values[k][i] for i, mu in enumerate(degrees) for k in range(mu + 1)])
+
+    def _derivatives(self, along: Sequence[ca.SX]) -> list[ca.SX]:
+        """r, r', ... for s, s', ..., by the chain rule."""
+        s = ca.SX.sym("s", len(along))
+        values = [self.point(s[0])]
+        for _ in along[1:]:
+            values.append(ca.jtimes(values[-1], s, ca.vertcat(s[1:], 0)))
+        return [ca.substitute(value, s, ca.vertcat(*along)) for value in values]
+
+    def _check(self, degrees: Sequence[int]) -> None:
+        if self.limits is not None and max(degrees) > self.order:
+            raise ReferenceSignalError(
+                f"this {type(self).__name__} has {self.order} continuous derivatives, the law "
+                f"needs {max(degrees)}: pass order={max(degrees)} or more"
+            )
+
+
+def check_order(order: int) -> None:
+    """Refuses an order that a path cannot have.
+
+    Raises:
+        ReferenceSignalError: It is not from 2 to 12.
+    """
+    if not 2 <= order <= 12:
+        raise ReferenceSignalError(f"order must be from 2 to 12, got {order}")
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class LineReference(PathReference):
+    """A straight move from rest at `start` to rest at `end`, as fast as limits allow.
+
+    Attributes:
+        start: The values before, in the outputs' unit, shape (k,), or one number for all.
+        end: The values after, likewise.
+        limits: The largest speed, acceleration and jerk.
+        start_time: When the move begins, in s.
+        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: A number is not finite or of no use, or start is end.
+    """
+
+    start: ArrayLike
+    end: ArrayLike
+    limits: PathLimits
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        settle(self, "start", "end")
+        check_order(self.order)
+        if not self.length:
+            raise ReferenceSignalError(f"start and end must differ, both are {self.start!r}")
+
+    @property
+    def size(self) -> int:
+        return np.size(self.start)
+
+    @property
+    def length(self) -> float:
+        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+
+    def point(self, distance: ca.SX) -> ca.SX:
+        first, last = ca.DM(self.start), ca.DM(self.end)
+        return first + distance / self.length * (last - first)
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class CircleReference(PathReference):
+    """A circle: r = center + radius (cos a, sin a), for two outputs.
+
+    With `period` it goes round for ever, a = phase + 2 pi (t - start_time) / period. With `limits`
+    it makes a number of turns from rest to rest.
+
+    Attributes:
+        center: The center, in the outputs' unit, shape (2,).
+        radius: The radius, likewise.
+        period: How long a turn takes, in s; None with limits.
+        limits: The largest speed, acceleration and jerk; None with a period.
+        turns: How many turns it makes with limits, negative for the other sense.
+        phase: The angle a at the start, in rad.
+        start_time: When the motion begins, in s; with a period, when the angle is `phase`.
+        order: How many derivatives are continuous with limits, from 2 to 12; at least mu of the
+            outputs.
+
+    Raises:
+        ReferenceSignalError: A number is of no use, or there are both a period and limits, or none.
+    """
+
+    center: ArrayLike
+    radius: float
+    period: float | None = None
+    limits: PathLimits | None = None
+    turns: float = 1.0
+    phase: float = 0.0
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        _settle_center(self)
+        positive("radius", self.radius, ReferenceSignalError)
+        check_order(self.order)
+        if (self.period is None) == (self.limits is None):
+            raise ReferenceSignalError(
+                "a circle takes either a period, for one that goes on, or limits, for one from "
+                f"rest to rest, got {'none' if self.period is None else 'both'}"
+            )
+        if self.period == 0.0 or self.turns == 0.0:
+            raise ReferenceSignalError("period and turns must not be zero")
+
+    @property
+    def size(self) -> int:
+        return 2
+
+    @property
+    def length(self) -> float:
+        return tau * abs(self.turns) * self.radius
+
+    def point(self, distance: ca.SX) -> ca.SX:
+        return self._at(self.phase + copysign(1.0, self.turns) * distance / self.radius)
+
+    def rows(self, time: ca.SX) -> ca.SX:
+        if self.period is None:
+            return super().rows(time)
+        return self._at(self.phase + tau / self.period * (time - self.start_time))
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        if self.period is None:
+            return super().expression(degrees, time)
+        return FormulaReference.expression(self, degrees, time)
+
+    def _at(self, angle: ca.SX) -> ca.SX:
+        return ca.DM(self.center) + self.radius * ca.vertcat(ca.cos(angle), ca.sin(angle))
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class SpiralReference(PathReference):
+    """A spiral of Archimedes between two radii, from rest to rest, for two outputs.
+
+    With b = pitch / (2 pi) it is r = center + b a (cos, sin)(a + const), and a goes as
+
+        a(s) = sqrt((a_0 + 1)^2 + 2 s / b) - 1,   so that   |dr/ds| = sqrt(1 + a^2) / (1 + a)
+
+    is from 0.71 (at a = 1) to 1: nearly an even speed, and smooth at the center.
+
+    Attributes:
+        center: The center, in the outputs' unit, shape (2,).
+        start_radius: The radius at the start, likewise; larger than the other for a way inward.
+        end_radius: The radius at the end, likewise.
+        pitch: How far apart neighbouring turns are, likewise.
+        limits: The largest speed, acceleration and jerk.
+        phase: The angle at the start, in rad.
+        start_time: When the motion begins, in s.
+        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: A number is of no use.
+    """
+
+    center: ArrayLike
+    start_radius: float
+    end_radius: float
+    pitch: float
+    limits: PathLimits
+    phase: float = 0.0
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        _settle_center(self)
+        positive("pitch", self.pitch, ReferenceSignalError)
+        check_order(self.order)
+        if min(self.start_radius, self.end_radius) < 0 or self.start_radius == self.end_radius:
+            raise ReferenceSignalError(
+                "start_radius and end_radius must differ and not be negative, got "
+                f"{self.start_radius:g} and {self.end_radius:g}"
+            )
+
+    @property
+    def size(self) -> int:
+        return 2
+
+    @property
+    def length(self) -> float:
+        low, high = sorted((self.start_radius, self.end_radius))
+        b = self.pitch / tau
+        return b / 2 * ((high / b + 1) ** 2 - (low / b + 1) ** 2)
+
+    def point(self, distance: ca.SX) -> ca.SX:
+        b = self.pitch / tau
+        first = self.start_radius / b
+        is_outward = self.start_radius < self.end_radius
+        outward = distance if is_outward else self.length - distance
+        low = min(self.start_radius, self.end_radius) / b
+        a = ca.sqrt((low + 1) ** 2 + 2 * outward / b) - 1
+        angle = self.phase + a - first
+        return ca.DM(self.center) + b * a * ca.vertcat(ca.cos(angle), ca.sin(angle))
+
+
+def _settle_center(reference: CircleReference | SpiralReference) -> None:
+    center = vector("center", reference.center, 2, ReferenceSignalError)
+    object.__setattr__(reference, "center", tuple(float(value) for value in center))

@@ -1,0 +1,145 @@
+"""What a reference is, and all references as one function of the time."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import NonFiniteError, ReferenceSignalError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.smoothness import find_flaw
+
+
+@checked(ReferenceSignalError)
+class Reference(ABC):
+    """Desired values r(t) of one or several outputs, with their time derivatives.
+
+    1. `size`, at least 1, is the number of outputs that it covers. It never changes.
+    2. `derivatives` takes one degree mu_i >= 0 per output, and returns a function of the time in s
+       with the values r_1, r_1', ..., r_1^(mu_1), r_2, ...: output-major, shape
+       (sum (mu_i + 1),).
+    3. Each value is the exact time derivative of the one before it. All but the last of an output
+       are continuous: the law integrates them.
+    4. A value depends on the time alone: not on the other degrees, nor on earlier calls.
+    5. An output that is not smooth enough for its degree is refused by `derivatives`, with the row
+       and a remedy, and never later. A time at which there is no value is refused by the function.
+    6. A reference that is an expression of time says so in `expression`, so that all of them are
+       traced as one function; the values are the same either way.
+    7. A reference that names a file reads it when it is used, and gives itself an absolute path by
+       `beside`.
+    """
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """The number of outputs that it covers."""
+
+    @abstractmethod
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        """Prepares r_1, r_1', ..., r_1^(mu_1), r_2, ... as a function of the time in s.
+
+        Args:
+            degrees: The degree mu of each covered output.
+
+        Raises:
+            ReferenceSignalError: The reference is not smooth enough for these degrees.
+        """
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None if they are no expression.
+
+        Raises:
+            ReferenceSignalError: The reference is not smooth enough for these degrees.
+        """
+        return None
+
+    def beside(self, folder: Path) -> Self:
+        """The same, where a file that it names is relative to a folder."""
+        return self
+
+
+@checked(ReferenceSignalError)
+class FormulaReference(Reference):
+    """A reference that is a CasADi expression of time; differentiated exactly."""
+
+    @abstractmethod
+    def rows(self, time: ca.SX) -> ca.SX:
+        """r(t), shape (size, 1)."""
+
+    def _check(self, degrees: Sequence[int]) -> None:
+        """Refuses what lacks derivatives up to the degrees."""
+        time = ca.SX.sym("t")
+        rows = self.rows(time)
+        for i, degree in enumerate(degrees):
+            flaw = find_flaw(rows[i], time, ca.SX(0, 1))
+            if degree and flaw:
+                raise ReferenceSignalError(
+                    f"row {i} of the reference {flaw.describe('the time')}. The law needs {degree} "
+                    "derivatives of it; a move from rest to rest is a PointToPointReference"
+                )
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        self._check(degrees)
+        values = []
+        for row, degree in zip(ca.vertsplit(self.rows(time)), degrees, strict=True):
+            values.append(row)
+            for _ in range(degree):
+                values.append(ca.jacobian(values[-1], time))
+        return ca.vertcat(*values)
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        time = ca.SX.sym("t")
+        return at_time(time, self.expression(degrees, time))
+
+
+def stack_references(
+    references: Sequence[Reference], degrees: Sequence[int]
+) -> Callable[[float], FloatArray]:
+    """All references as one function of the time in s; expressions are traced together.
+
+    Args:
+        references: The references, in the order of the outputs.
+        degrees: The degrees mu_1, ..., mu_p of all outputs.
+
+    Raises:
+        ReferenceSignalError: A reference is not smooth enough.
+    """
+    ends = np.cumsum([0, *[reference.size for reference in references]])
+    parts = list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))
+    time = ca.SX.sym("t")
+    rows = [reference.expression(part, time) for reference, part in parts]
+    if all(row is not None for row in rows):
+        return at_time(time, ca.vertcat(*rows))
+    functions = [reference.derivatives(part) for reference, part in parts]
+
+    def evaluate(time: float) -> FloatArray:
+        value = np.concatenate([function(time) for function in functions])
+        if not np.isfinite(value).all():
+            raise _not_finite(time, value)
+        return value
+
+    return evaluate
+
+
+def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
+    """An expression of the time alone as a function that is called with a float."""
+    function = TracedFunction("reference", {"time": time}, {"R": rows})
+    (moment,), (value,) = function.arguments, function.outputs
+
+    def evaluate(time: float) -> FloatArray:
+        moment[0] = time
+        if not function.run():
+            raise _not_finite(time, value)
+        return value
+
+    return evaluate
+
+
+def _not_finite(time: float, value: FloatArray) -> NonFiniteError:
+    return NonFiniteError(f"the reference is not finite at t = {time:g} s", time, value)

@@ -1,0 +1,252 @@
+"""Motions through many points: uniform B-splines in time, with limits that their points tell."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, positive
+from drake_dae.dae.references.paths import check_order
+from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.references.travel import PathLimits
+from drake_dae.errors import ReferenceSignalError
+
+MOST_IN_EXPRESSION = 200
+"""Of how many points a reference is an expression of time: longer ones are tables."""
+
+
+@dataclass(frozen=True, eq=False)
+class TimeSpline:
+    """r(t) = sum_k c_k N((t - start_time) / step - k), N the uniform B-spline of order + 1.
+
+    It rests at the first point before, and at the last one after; `order` derivatives are
+    continuous. Its derivatives are averages of differences of neighbouring points, and no larger:
+    |r^(j)| <= max |Delta^j c| / step^j.
+
+    Attributes:
+        points: c_0, ..., c_(n-1), shape (n, k).
+        step: The time between two points, in s.
+        start_time: When it leaves the first point, in s.
+        order: How many derivatives are continuous.
+    """
+
+    points: FloatArray
+    step: float
+    start_time: float
+    order: int
+
+    @property
+    def degree(self) -> int:
+        """The degree of the polynomials."""
+        return self.order + 1
+
+    @property
+    def spans(self) -> int:
+        """How many polynomials there are between the rests."""
+        return len(self.points) + self.degree - 2
+
+    @property
+    def duration(self) -> float:
+        """How long it moves, in s."""
+        return self.spans * self.step
+
+    @cached_property
+    def differences(self) -> list[FloatArray]:
+        """Delta^j c / step^j for j = 0, ..., order; the first and the last point repeated."""
+        rest = self.degree - 1
+        found = [np.pad(self.points, ((rest, rest), (0, 0)), mode="edge")]
+        while len(found) <= self.order:
+            found.append(np.diff(found[-1], axis=0) / self.step)
+        return found
+
+    def at(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        """The function t -> r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+        rows = {
+            j: sliding_window_view(self.differences[j], self.degree - j + 1, axis=0)
+            @ basis_pieces(self.degree - j).T
+            for j in range(max(degrees) + 1)
+        }
+        factors = np.zeros((self.spans, sum(degrees) + len(degrees), self.degree + 1))
+        places = [(i, j) for i, degree in enumerate(degrees) for j in range(degree + 1)]
+        for row, (i, j) in enumerate(places):
+            factors[:, row, : self.degree - j + 1] = rows[j][:, i]
+        powers, last = np.arange(self.degree + 1), self.spans - 1
+
+        def evaluate(time: float) -> FloatArray:
+            place = min(max((time - self.start_time) / self.step, 0.0), last + 1.0)
+            span = min(int(place), last)
+            return factors[span] @ (place - span) ** powers
+
+        return evaluate
+
+    def expression(self, degree: int, time: ca.SX) -> ca.SX:
+        """r, r', ... at a symbolic time, shape (degree + 1, k)."""
+        place = ca.fmin(ca.fmax((time - self.start_time) / self.step, 0), self.spans)
+        span = ca.fmin(ca.floor(place), self.spans - 1)
+        chosen = ca.vertcat(*[span == index for index in range(self.spans)])
+        monomials = ca.horzcat(*[(place - span) ** k for k in range(self.degree + 1)])
+        rows = []
+        for j in range(degree + 1):
+            piece, table = basis_pieces(self.degree - j), self.differences[j]
+            window = ca.vertcat(
+                *[
+                    ca.mtimes(ca.DM(table[k : k + self.spans]).T, chosen).T
+                    for k in range(len(piece))
+                ]
+            )
+            rows.append(ca.mtimes([monomials[: len(piece)], ca.DM(piece), window]))
+        return ca.vertcat(*rows)
+
+
+def basis_pieces(degree: int) -> FloatArray:
+    """The uniform B-splines on a span: entry (i, k) is the factor of x^i for its k-th point.
+
+    By the recursion of Cox and de Boor, shape (degree + 1, degree + 1).
+    """
+    pieces = np.ones((1, 1))
+    for p in range(1, degree + 1):
+        higher = np.zeros((p + 1, p + 1))
+        for k in range(p + 1):
+            for constant, slope, source in ((p - k, 1, k - 1), (k + 1, -1, k)):
+                if 0 <= source < p:
+                    higher[:p, k] += constant / p * pieces[:, source]
+                    higher[1:, k] += slope / p * pieces[:, source]
+        pieces = higher
+    return pieces
+
+
+@checked(ReferenceSignalError)
+class SplineReference(Reference):
+    """A reference that is a `TimeSpline`."""
+
+    @property
+    @abstractmethod
+    def spline(self) -> TimeSpline:
+        """The spline."""
+
+    @property
+    def size(self) -> int:
+        return int(self.spline.points.shape[1])
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        self._check(degrees)
+        return self.spline.at(degrees)
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+        self._check(degrees)
+        if self.spline.spans > MOST_IN_EXPRESSION:
+            return None
+        table = self.spline.expression(max(degrees), time)
+        return ca.vertcat(*[table[: degree + 1, i] for i, degree in enumerate(degrees)])
+
+    def _check(self, degrees: Sequence[int]) -> None:
+        if max(degrees) > self.spline.order:
+            raise ReferenceSignalError(
+                f"this {type(self).__name__} has {self.spline.order} continuous derivatives, the "
+                f"law needs {max(degrees)}: pass order={max(degrees)} or more"
+            )
+
+
+def spline_within(
+    points: FloatArray, limits: PathLimits, start_time: float, order: int, among: int | None = None
+) -> TimeSpline:
+    """The fastest spline over points whose derivatives keep limits.
+
+    Args:
+        points: The points, shape (n, k).
+        limits: The largest speed, acceleration and jerk, of the first `among` columns.
+        start_time: When it leaves the first point, in s.
+        order: How many derivatives are continuous.
+        among: How many columns the limits are about; None for all.
+    """
+    rest = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
+    steps = [
+        (np.linalg.norm(np.diff(rest, j, axis=0), axis=1).max() / limit) ** (1 / j)
+        for j, limit in enumerate(limits.values, start=1)
+    ]
+    return TimeSpline(points, float(max(steps)), start_time, order)
+
+
+def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[int]]:
+    """Points along straight edges, no farther apart than a spacing, with the corners among them.
+
+    Returns:
+        The points, shape (n, k), and which edge each is on; a corner is on the edge before it.
+    """
+    found, edges = [corners[:1]], [0]
+    for edge, (first, last) in enumerate(pairwise(corners)):
+        count = int(np.ceil(np.linalg.norm(last - first) / spacing - 1e-9))
+        found.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
+        edges += [edge] * count
+    return np.concatenate(found), edges
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class PolylineReference(SplineReference):
+    """Straight edges between points, with rounded corners, from rest to rest.
+
+    It leaves an edge `corner` before its end, and is back on the next one as far behind. It is a
+    uniform B-spline over points on the edges, 2 corner / order apart: on straight parts it has an
+    even speed, and at corners it is slower. That speed is the largest with which all limits are
+    kept, so that larger corners are faster.
+
+    Attributes:
+        points: The points, in the outputs' unit, shape (n, k).
+        limits: The largest speed, acceleration and jerk.
+        corner: How far before and behind a point the path leaves the edges, in the same unit.
+        start_time: When the motion begins, in s.
+        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: A number is of no use, there are fewer than two points, two in a row
+            are the same, or they are too many.
+    """
+
+    points: Sequence[Sequence[float]]
+    limits: PathLimits
+    corner: float
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        points = numbers("points", self.points, ReferenceSignalError)
+        if points.ndim != 2 or len(points) < 2 or not points.size or not np.isfinite(points).all():
+            raise ReferenceSignalError(
+                "points must be two or more, as a list of rows of finite numbers, got shape "
+                f"{points.shape}"
+            )
+        object.__setattr__(self, "points", tuple(tuple(map(float, row)) for row in points))
+        lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        if not lengths.all():
+            place = int(np.argmin(lengths))
+            raise ReferenceSignalError(
+                f"points {place} and {place + 1} are the same, {self.points[place]}"
+            )
+        check_spline(self.corner, self.order, float(lengths.sum()))
+
+    @cached_property
+    def spline(self) -> TimeSpline:
+        points, _ = along_edges(np.array(self.points), 2 * self.corner / self.order)
+        return spline_within(points, self.limits, self.start_time, self.order)
+
+
+def check_spline(corner: float, order: int, length: float) -> None:
+    """Refuses roundings of no use.
+
+    Raises:
+        ReferenceSignalError: The corner is not positive or very small, or the order out of range.
+    """
+    positive("corner", corner, ReferenceSignalError)
+    check_order(order)
+    least = length * order / 2 / 100_000
+    if corner < least:
+        raise ReferenceSignalError(
+            f"corner must be {least:.3g} or more for a path of length {length:.3g}, got {corner:g}"
+        )

@@ -1,0 +1,91 @@
+"""A motion that writes a text."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, positive, vector
+from drake_dae.dae.references.letters import HEIGHT, strokes
+from drake_dae.dae.references.splines import (
+    SplineReference,
+    TimeSpline,
+    along_edges,
+    check_spline,
+    spline_within,
+)
+from drake_dae.dae.references.travel import PathLimits
+from drake_dae.errors import ReferenceSignalError
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class TextReference(SplineReference):
+    """A text in capital letters of single strokes, from rest to rest, for two outputs.
+
+    It goes as a `PolylineReference` goes, also straight from a stroke to the next one: a tool on a
+    surface is not lifted. With `press` there is a third output, a force that is smaller there.
+
+    Attributes:
+        text: The text: letters, digits, "-+.,!?" and spaces.
+        origin: The left end of the line that the letters stand on, shape (2,), in the
+            outputs' unit.
+        height: The height of the letters, likewise.
+        limits: The largest speed, acceleration and jerk of the two outputs.
+        along: Where the text goes, shape (2,): by how much of the outputs for a unit of height.
+        up: Where the letters go up, likewise.
+        press: The force in strokes and that between them, in N, shape (2,); None for no force.
+        corner: How far before and behind a corner the path is rounded; None for height / 15.
+        start_time: When the motion begins, in s.
+        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: A letter is not known, or a number is of no use.
+    """
+
+    text: str
+    origin: ArrayLike
+    height: float
+    limits: PathLimits
+    along: ArrayLike = (1.0, 0.0)
+    up: ArrayLike = (0.0, 1.0)
+    press: ArrayLike | None = None
+    corner: float | None = None
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        names = ["origin", "along", "up"] + ["press"] * (self.press is not None)
+        for name in names:
+            value = vector(name, getattr(self, name), 2, ReferenceSignalError)
+            object.__setattr__(self, name, tuple(float(number) for number in value))
+        positive("height", self.height, ReferenceSignalError)
+        if np.linalg.matrix_rank(np.array([self.along, self.up])) < 2:
+            raise ReferenceSignalError(
+                f"along and up must be two directions, got {self.along!r} and {self.up!r}"
+            )
+        corners, _ = self._corners()
+        length = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
+        check_spline(self._rounding, self.order, float(length))
+
+    @property
+    def _rounding(self) -> float:
+        return self.height / 15 if self.corner is None else self.corner
+
+    def _corners(self) -> tuple[FloatArray, list[bool]]:
+        """The ends of all edges, shape (n, 2), and whether each edge is part of a stroke."""
+        parts = list(strokes(self.text))
+        is_stroke = [drawn for part in parts for drawn in [*[True] * (len(part) - 1), False]]
+        axes = np.array([self.along, self.up]) * self.height / HEIGHT
+        return np.array(self.origin) + np.concatenate(parts) @ axes, is_stroke[:-1]
+
+    @cached_property
+    def spline(self) -> TimeSpline:
+        corners, is_stroke = self._corners()
+        points, edges = along_edges(corners, 2 * self._rounding / self.order)
+        if self.press is not None:
+            drawn, between = np.asarray(self.press)
+            points = np.column_stack([points, np.where(is_stroke, drawn, between)[edges]])
+        return spline_within(points, self.limits, self.start_time, self.order, among=2)

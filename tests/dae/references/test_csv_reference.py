@@ -1,0 +1,95 @@
+"""A motion from a CSV file: what smoothing costs, and what is wrong with files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_dae import CsvReference
+from drake_dae.errors import ReferenceSignalError
+
+
+def wave(folder: Path, delimiter: str = ",") -> Path:
+    """y = 0.1 sin(2 t), z = 0.3 t, each 10 ms for 5 s, from t = 2 s on."""
+    rows = [("t", "y", "z")]
+    for t in np.arange(0.0, 5.0 + 1e-9, 0.01):
+        rows.append((f"{t + 2.0}", f"{0.1 * np.sin(2 * t)}", f"{0.3 * t}"))
+    file = folder / "wave.csv"
+    file.write_text("".join(delimiter.join(row) + "\n" for row in rows))
+    return file
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_smoothing_costs_what_is_told(order, tmp_path):
+    """(order + 2) / 24 smoothing^2 times the acceleration, 0.4, away from the ends; 2 % beside."""
+    path = CsvReference(str(wave(tmp_path)), ["y"], "t", smoothing=0.05, order=order)
+    function = path.derivatives([2])
+    times = np.linspace(1.0, 4.0, 400)
+    found = np.array([function(t) for t in times])
+    off = found[:, 0] - 0.1 * np.sin(2 * times)
+    assert np.abs(off).max() == pytest.approx((order + 2) / 24 * 0.05**2 * 0.4, rel=0.02)
+    np.testing.assert_allclose(found[:, 1], 0.2 * np.cos(2 * times), atol=1e-3)
+    np.testing.assert_allclose(found[:, 2], -0.4 * np.sin(2 * times), atol=5e-3)
+
+
+def test_deviation_is_the_largest_at_the_rows(tmp_path):
+    """At the ends, where a motion of 0.2 and 0.3 per s is held: it is rounded like a corner."""
+    path = CsvReference(str(wave(tmp_path, ";")), ["y", "z"], "t")
+    function = path.derivatives([0, 0])
+    off = [abs(function(0.0)[0]), abs(function(5.0)[1] - 1.5)]
+    np.testing.assert_allclose(path.deviation, off, rtol=1e-3)
+    assert np.all(path.deviation < 0.3 * 0.01)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_columns_are_found_by_name_and_held_at_the_ends(delimiter, tmp_path):
+    path = CsvReference(str(wave(tmp_path, delimiter)), ["z", "y"], "t", start_time=1.0)
+    function = path.derivatives([2, 1])
+    np.testing.assert_allclose(function(0.0), np.zeros(5), atol=1e-15)
+    np.testing.assert_allclose(function(9.0), [1.5, 0, 0, 0.1 * np.sin(10.0), 0], atol=1e-15)
+    np.testing.assert_allclose(function(3.0)[:3], [0.6, 0.3, 0.0], atol=1e-9)
+
+
+def test_a_file_is_looked_for_beside_the_one_that_names_it(tmp_path):
+    wave(tmp_path)
+    path = CsvReference("wave.csv", ["y"], "t").beside(tmp_path)
+    assert path.file == str(tmp_path / "wave.csv")
+    assert path.beside(Path("/elsewhere")) == path
+    path.derivatives([2])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "cannot read '.*wave.csv': No such file"),
+        ("", "no column 't'; there are none"),
+        ("t,x\n0,1\n1,2\n", "no column 'y'; .*there are t, x"),
+        ("t,y\n0,1\n", "has 1 rows of numbers, 2 are needed"),
+        ("t,y\n0,1\n1,two\n", "row 3, y: expected a number, got 'two'"),
+        ("t,y\n0,1\n1\n", "row 3, y: expected a number, got ''"),
+        ("t,y\n0,1\n1,inf\n", "row 3, y: expected a number, got 'inf'"),
+        ("t,y\n0,1\n1,2\n1,3\n", "t must increase, row 4 has 1 after 1"),
+        (b"\xff\xfe\x00", "cannot read"),
+    ],
+)
+def test_what_is_wrong_with_a_file(text, message, tmp_path):
+    file = tmp_path / "wave.csv"
+    if text is not None:
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ReferenceSignalError, match=message):
+        CsvReference(str(file), ["y"], "t").derivatives([0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"columns": []}, "columns: empty"),
+        ({"smoothing": -1.0}, "smoothing must be positive, got -1"),
+        ({"order": 1}, "order must be from 2 to 12"),
+        ({"smoothing": 1e-7}, "smoothing must be 5e-05 s or more for 5 s, got 1e-07 s"),
+    ],
+)
+def test_refusals(changes, message, tmp_path):
+    given = {"file": str(wave(tmp_path)), "columns": ["y"], "time": "t", **changes}
+    with pytest.raises(ReferenceSignalError, match=message):
+        CsvReference(**given).derivatives([0])

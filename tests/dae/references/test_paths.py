@@ -1,0 +1,145 @@
+"""Lines, circles and spirals: where they go, how fast, and that they rest at both ends."""
+
+from math import factorial
+
+import numpy as np
+import pytest
+
+from drake_dae import CircleReference, LineReference, PathLimits, SpiralReference
+from drake_dae.errors import ReferenceSignalError
+
+LIMITS = PathLimits(0.2, 1.0, 8.0)
+
+MEMBERS = {
+    "long line": LineReference([0.1, 0.2], [0.7, -0.6], LIMITS, 0.3),
+    "short line": LineReference([0.0], [0.004], LIMITS, 0.3),
+    "steep line": LineReference([0.0], [0.1], PathLimits(0.2, 1.0), 0.3, order=2),
+    "smooth line": LineReference([0.0], [0.1], LIMITS, 0.3, order=7),
+    "turns": CircleReference([0.5, 0.1], 0.1, limits=LIMITS, turns=-1.5, phase=0.4, start_time=0.3),
+    "tight turn": CircleReference([0.5, 0.1], 0.01, limits=LIMITS, start_time=0.3, order=6),
+    "outward": SpiralReference([0.5, 0.1], 0.0, 0.1, 0.03, LIMITS, 0.4, 0.3),
+    "inward": SpiralReference([0.5, 0.1], 0.1, 0.02, 0.03, LIMITS, 0.4, 0.3, order=3),
+}
+
+
+@pytest.fixture(params=MEMBERS)
+def path(request):
+    return MEMBERS[request.param]
+
+
+def course(path, count=3001):
+    """r, r', r'', r''' at times of the whole motion, shape (count, size, 4)."""
+    degree = min(3, path.order)
+    function = path.derivatives([degree] * path.size)
+    times = path.start_time + np.linspace(0.0, path.travel.duration, count)
+    return np.array([np.reshape(function(t), (path.size, -1)).copy() for t in times])
+
+
+def test_limits_are_kept_and_one_is_reached(path):
+    """The sampled peak of the binding one is off by less than 1 %: of the steps, and of curves."""
+    peaks = np.linalg.norm(course(path), axis=1).max(axis=0)[1:]
+    share = peaks / np.array(path.limits.values)[: peaks.size]
+    assert np.all(share <= 1.0 + 1e-9)
+    assert share.max() > 0.99
+
+
+def test_it_rests_at_both_ends(path):
+    """Just inside of them the last derivative enters with the slope that the next one has there.
+
+    With m = order - 1 that is speed / ramp^order (2 m + 1)! / m!; round-off adds 1e-9.
+    """
+    function = path.derivatives([path.order] * path.size)
+    begin, end = path.start_time, path.start_time + path.travel.duration
+    for inside, outside, far in (
+        (begin + 1e-9, begin - 1e-9, -7.0),
+        (end - 1e-9, end + 1e-9, 99.0),
+    ):
+        within, out, away = (
+            np.array(function(t)).reshape(path.size, -1) for t in (inside, outside, far)
+        )
+        np.testing.assert_allclose(out, away, rtol=0, atol=1e-12)
+        assert not out[:, 1:].any()
+        np.testing.assert_allclose(within[:, 0], out[:, 0], rtol=0, atol=1e-12)
+        m, travel = path.order - 1, path.travel
+        slope = travel.speed / travel.ramp**path.order * factorial(2 * m + 1) / factorial(m)
+        assert np.abs(within[:, 1:]).max() < 1.01e-9 * slope + 1e-9
+
+
+def test_a_line_takes_as_long_as_by_hand():
+    """Order 2: the speed goes as 3 x^2 - 2 x^3, with peaks of 3/2 and 6 for its derivatives."""
+    path = LineReference([0.0, 0.0], [0.3, 0.4], PathLimits(0.2, 1.0, 5.0), order=2)
+    ramp = max(1.5 * 0.2 / 1.0, np.sqrt(6 * 0.2 / 5.0))
+    assert path.travel.duration == pytest.approx(0.5 / 0.2 + ramp, rel=1e-14)
+    middle = path.derivatives([0, 0])(path.travel.duration / 2)
+    np.testing.assert_allclose(middle, [0.15, 0.2], atol=1e-15)
+    quarter = path.derivatives([1, 1])(ramp / 2)
+    np.testing.assert_allclose(quarter[1::2], [0.06, 0.08], atol=1e-15)
+
+
+def test_lines_stay_on_a_line():
+    path = MEMBERS["long line"]
+    points = course(path)[:, :, 0]
+    share = (points[:, 0] - 0.1) / 0.6
+    np.testing.assert_allclose(points[:, 1], 0.2 - 0.8 * share, atol=1e-15)
+    assert np.all(np.diff(share) >= 0)
+    np.testing.assert_allclose(points[[0, -1]], [[0.1, 0.2], [0.7, -0.6]], atol=1e-15)
+
+
+def test_circles_stay_on_a_circle():
+    path = MEMBERS["turns"]
+    points = course(path)[:, :, 0] - [0.5, 0.1]
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.1, rtol=1e-14)
+    angle = np.unwrap(np.arctan2(points[:, 1], points[:, 0]))
+    assert angle[0] == pytest.approx(0.4)
+    assert angle[-1] - angle[0] == pytest.approx(-3 * np.pi)
+
+
+def test_a_circle_with_a_period_goes_on():
+    function = CircleReference([1.0, 2.0], 0.5, period=-4.0, phase=0.3).derivatives([1, 2])
+    for time in (-3.0, 0.0, 1.7, 40.0):
+        angle, rate = 0.3 - np.pi / 2 * time, -np.pi / 2
+        cos, sin = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
+        expected = [1 + cos, -rate * sin, 2 + sin, rate * cos, -(rate**2) * sin]
+        np.testing.assert_allclose(function(time), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["outward", "inward"])
+def test_turns_of_a_spiral_are_a_pitch_apart(name):
+    path = MEMBERS[name]
+    points = course(path)[:, :, 0] - [0.5, 0.1]
+    radius = np.linalg.norm(points, axis=1)
+    assert radius[0] == pytest.approx(path.start_radius, abs=1e-14)
+    assert radius[-1] == pytest.approx(path.end_radius, abs=1e-14)
+    shown = radius > 1e-6  # At the center there is no angle.
+    angle = np.unwrap(np.arctan2(points[shown, 1], points[shown, 0]))
+    np.testing.assert_allclose(np.ptp(radius[shown] - 0.03 * angle / (2 * np.pi)), 0, atol=1e-12)
+    speed = np.linalg.norm(course(path)[:, :, 1], axis=1)
+    even = speed[speed.size // 4 : -speed.size // 4]
+    assert even.min() > 0.7 * even.max()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PathLimits(0.0, 1.0), "speed must be positive, got 0"),
+        (lambda: PathLimits(1.0, 1.0, -1.0), "jerk must be positive, got -1"),
+        (lambda: LineReference([1.0, 2.0], [1.0, 2.0], LIMITS), "start and end must differ"),
+        (lambda: LineReference([1.0, 2.0], [1.0], LIMITS), "start has 2, end has 1"),
+        (lambda: LineReference([1.0], [2.0], LIMITS, order=1), "order must be from 2 to 12, got 1"),
+        (lambda: CircleReference([0, 0], 1.0), "either a period, .* got none"),
+        (lambda: CircleReference([0, 0], 1.0, 2.0, LIMITS), "either a period, .* got both"),
+        (lambda: CircleReference([0, 0, 0], 1.0, 2.0), r"center must be .* shape \(2,\)"),
+        (lambda: CircleReference([0, 0], -1.0, 2.0), "radius must be positive, got -1"),
+        (lambda: CircleReference([0, 0], 1.0, 0.0), "period and turns must not be zero"),
+        (lambda: SpiralReference([0, 0], 1.0, 1.0, 0.1, LIMITS), "must differ and not be negative"),
+        (lambda: SpiralReference([0, 0], 0.0, 1.0, 0.0, LIMITS), "pitch must be positive, got 0"),
+        (lambda: CircleReference([0, 0], 1.0, 2.0).travel, "no limits: it moves all the time"),
+        (
+            lambda: LineReference([1.0], [2.0], LIMITS, order=3).derivatives([4]),
+            "LineReference has 3 continuous derivatives, the law needs 4: pass order=4",
+        ),
+    ],
+)
+def test_refusals(make, message):
+    with pytest.raises(ReferenceSignalError, match=message):
+        make()

@@ -1,0 +1,95 @@
+"""B-splines in time: against SciPy's, along edges, at corners, within limits."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+from drake_dae import PathLimits, PolylineReference
+from drake_dae.dae.references.splines import TimeSpline, basis_pieces
+from drake_dae.errors import ReferenceSignalError
+
+LIMITS = PathLimits(0.2, 2.0, 40.0)
+POINTS = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.1], [0.05, 0.1], [0.15, 0.1]]  # It turns back at the end.
+PATH = PolylineReference(POINTS, LIMITS, 0.02, start_time=0.5, order=3)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 5, 8])
+def test_pieces_are_those_of_another_source(degree):
+    x = np.linspace(0.0, 1.0, 7)
+    found = np.vander(x, degree + 1, increasing=True) @ basis_pieces(degree)
+    element = BSpline.basis_element(np.arange(degree + 2))
+    expected = np.column_stack([element(x + degree - k) for k in range(degree + 1)])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+
+
+def test_a_spline_is_that_of_another_source():
+    """With the same points and knots; the ends are held by repeated points."""
+    random = np.random.default_rng(1)
+    spline = TimeSpline(random.normal(size=(9, 2)), 0.25, 1.0, 3)
+    held = np.pad(spline.points, ((3, 3), (0, 0)), mode="edge")
+    knots = 1.0 + 0.25 * np.arange(-4, len(held) + 1)
+    other = BSpline(knots, held, 4)
+    function = spline.at([3, 1])
+    for time in (1.0, 1.1, 2.3, 3.5, 3.7):
+        table = [other(time, nu=k) for k in range(4)]
+        expected = [*(row[0] for row in table), table[0][1], table[1][1]]
+        np.testing.assert_allclose(function(time), expected, rtol=1e-11, atol=1e-12)
+
+
+def test_limits_are_kept():
+    """Derivatives are averages of differences of points: below the limits, and not far below."""
+    function = PATH.derivatives([3, 3])
+    times = 0.5 + np.linspace(0.0, PATH.spline.duration, 20_001)
+    found = np.array([function(t).reshape(2, 4) for t in times])
+    share = np.linalg.norm(found, axis=1).max(axis=0)[1:] / LIMITS.values
+    assert np.all(share <= 1.0)
+    assert share.max() > 0.5
+
+
+def test_off_the_corners_it_is_on_the_edges():
+    function = PATH.derivatives([0, 0])
+    times = 0.5 + np.linspace(-0.1, PATH.spline.duration + 0.1, 4001)
+    points = np.array([function(t) for t in times])
+    np.testing.assert_allclose(points[[0, -1]], [POINTS[0], POINTS[-1]], atol=1e-15)
+    corners = np.array(POINTS)
+    near = np.linalg.norm(points[:, None] - corners, axis=2).min(axis=1) < 0.02
+    x, y = points[~near].T
+    on_edge = (np.abs(y) < 1e-14) | (np.abs(x - 0.2) < 1e-14) | (np.abs(y - 0.1) < 1e-14)
+    assert on_edge.all()
+    # No point of a right angle is as far from it as half of where the rounding begins.
+    distance = np.linalg.norm(points[:, None] - corners[1:3], axis=2).min(axis=0)
+    assert np.all((distance > 1e-3) & (distance < 0.01))
+
+
+def test_a_smaller_corner_is_nearer_and_slower():
+    near = PolylineReference(POINTS, LIMITS, 0.005, order=3)
+    assert near.spline.duration > 1.5 * PATH.spline.duration
+
+
+def test_long_ones_are_tables():
+    """And short ones are expressions: both have the same values, so says their contract."""
+    time = ca.SX.sym("t")
+    assert PATH.expression([2, 2], time) is not None
+    long = PolylineReference(POINTS, LIMITS, 0.002)
+    assert long.expression([2, 2], time) is None
+
+
+@pytest.mark.parametrize(
+    ("points", "corner", "message"),
+    [
+        ([[0.0, 0.0]], 0.1, r"two or more, .* got shape \(1, 2\)"),
+        ([[0.0], [1.0], [1.0]], 0.1, r"points 1 and 2 are the same, \(1\.0,\)"),
+        ([[0.0], [1.0]], 0.0, "corner must be positive, got 0"),
+        ([[0.0], [1.0]], 1e-6, "corner must be 2e-05 or more for a path of length 1, got 1e-06"),
+        ([[0.0], [1.0, 2.0]], 0.1, "points must be real numbers"),
+    ],
+)
+def test_refusals(points, corner, message):
+    with pytest.raises(ReferenceSignalError, match=message):
+        PolylineReference(points, LIMITS, corner)
+
+
+def test_an_order_that_is_too_low_is_refused():
+    with pytest.raises(ReferenceSignalError, match=r"3 continuous derivatives, .* pass order=4"):
+        PATH.derivatives([2, 4])

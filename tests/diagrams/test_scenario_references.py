@@ -1,0 +1,134 @@
+"""References in scenarios: each kind as a file says it, what is refused, and a run behind them."""
+
+import jsonschema
+import numpy as np
+import pytest
+from runs import run_scenario, scenario
+
+from drake_dae import (
+    CircleReference,
+    CsvReference,
+    LineReference,
+    PathLimits,
+    PolylineReference,
+    SpiralReference,
+    TextReference,
+    build_scenario,
+    load_scenario,
+)
+from drake_dae.diagrams.scenario import save_scenario, scenario_data, scenario_schema
+from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.errors import ScenarioError
+
+GENTLE = "limits: {speed: 0.2, acceleration: 1}"
+LIMITS = PathLimits(0.2, 1.0)
+FORMS = {
+    f"!Line {{start: [0, 1], end: [1, 2], {GENTLE}}}": LineReference([0, 1], [1, 2], LIMITS),
+    "!Circle {center: [0, 1], radius: 0.1, period: 3}": CircleReference([0, 1], 0.1, 3.0),
+    f"!Circle {{center: [0, 1], radius: 0.1, turns: -2, phase: 0.5, {GENTLE}}}": CircleReference(
+        [0, 1], 0.1, limits=LIMITS, turns=-2.0, phase=0.5
+    ),
+    f"!Spiral {{center: [0, 1], start_radius: 0, end_radius: 0.1, pitch: 0.02, {GENTLE}}}": (
+        SpiralReference([0, 1], 0.0, 0.1, 0.02, LIMITS)
+    ),
+    f"!Polyline {{points: [[0, 0], [1, 0], [1, 1]], corner: 0.1, order: 3, {GENTLE}}}": (
+        PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3)
+    ),
+    "!Csv {file: /a.csv, columns: [y, z], smoothing: 0.1, start_time: 2}": CsvReference(
+        "/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0
+    ),
+    f"!Text {{text: A B, origin: [0, 0], height: 0.1, along: [-1, 0], press: [9, 1], {GENTLE}}}": (
+        TextReference("A B", [0, 0], 0.1, LIMITS, along=[-1, 0], press=[9, 1])
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_form_is_its_reference_and_is_written_as_such(form, tmp_path):
+    chosen = scenario("two_link_wall", f"references={{tool: {form}}}")
+    assert chosen.references == {"tool": FORMS[form]}
+    save_scenario(chosen, tmp_path / "copy.yaml")
+    assert load_scenario(tmp_path / "copy.yaml").references == chosen.references
+
+
+def test_the_schema_knows_all():
+    forms = ", ".join(f"'{place}': {form}" for place, form in enumerate([*FORMS, "2.0"]))
+    data = scenario_data(scenario("two_link_wall", f"references={{{forms}}}"))
+    jsonschema.validate(data, scenario_schema())
+    data["references"]["0"]["limit"] = {}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, scenario_schema())
+
+
+def refusal(form):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(scenario("two_link_wall", f"references.tool.z={form}"))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ("!Line {start: [0.2], end: [0.3], limits: {speed: 1}}", ".limits: needs the key 'accele"),
+        (
+            "!Line {start: [0.2], end: [0.3], limits: {speed: 1, acceleration: 0}}",
+            ".limits: acceleration must be positive, got 0",
+        ),
+        (
+            "!Line {start: [0.2], end: [0.3], limits: {speed: 1, acelleration: 1}}",
+            ".limits: has no key 'acelleration'; did you mean 'acceleration'?",
+        ),
+        (
+            "!Line {start: [0.2], end: [0.3], limits: 3}",
+            ".limits: expected keys speed, acceleration, jerk, got 3",
+        ),
+        (f"!Line {{start: [0.2], end: 1, {GENTLE}}}", ".end: expected a list, got 1"),
+        (f"!Line {{start: [0.2], end: [0.2], {GENTLE}}}", ": start and end must differ"),
+        (f"!Line {{start: [0.2], end: [1], order: 99, {GENTLE}}}", ": order must be from 2 to 12"),
+        ("!Circle {center: [0, 0], radius: 1}", ": a circle takes either a period"),
+        ("!Circle {center: [0, 0], radius: 1, period: 2}", ": 2 values for 1 output: tool.z"),
+        ("!Circle {center: [0], radius: 1, period: 2}", ": center must be finite and of shape (2,"),
+        (
+            f"!Spiral {{center: [0, 0], start_radius: 1, end_radius: 1, pitch: 1, {GENTLE}}}",
+            ": start_radius and end_radius must differ",
+        ),
+        (f"!Polyline {{points: [0, 1], corner: 1, {GENTLE}}}", ".points.0: expected a list, got 0"),
+        (
+            f"!Polyline {{points: [[0], [0]], corner: 0.1, {GENTLE}}}",
+            ": points 0 and 1 are the same, (0.0,)",
+        ),
+        ("!Csv {file: none.csv, columns: [z]}", "scenarios/none.csv': No such file"),
+        ("!Csv {file: 'a\0b', columns: [z]}", ""),
+        ("!Csv {file: biped.yaml, columns: [z]}", "no column 'time'; "),
+        ("!Csv {file: a.csv, columns: z}", ".columns: expected a list, got 'z'"),
+        (f"!Text {{text: é, origin: [0, 0], height: 1, {GENTLE}}}", ": text: no letter 'É'; there"),
+        (
+            f"!Text {{text: A, origin: [0, 0], height: 1, press: 3, {GENTLE}}}",
+            ".press: expected a list",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_key(form, message):
+    found = refusal(form)
+    assert found.startswith("references.tool.z")
+    assert message in found
+
+
+@pytest.mark.slow
+def test_a_robot_follows_what_a_file_tells(tmp_path):
+    """The file lies beside the scenario. The law's model is exact: accuracy 1e-8 leaves 1e-7."""
+    times = np.arange(0.0, 1.01, 0.05)
+    lines = [f"{t},{0.3 + 0.1 * np.sin(2 * t)},{20 + 5 * t}" for t in times]
+    (tmp_path / "way.csv").write_text("\n".join(["time,z,push", *lines]))
+    text = find_scenario("two_link_wall").read_text()
+    before, after = text.split("references:")[0], text[text.index("start:") :]
+    form = "{'tool.z, wall.force': !Csv {file: way.csv, columns: [z, push]}}"
+    (tmp_path / "own.yaml").write_text(f"{before}references: {form}\n{after}")
+    chosen = load_scenario(tmp_path / "own.yaml", ["duration=1", "start.errors={}"])
+    assert chosen.references["tool.z, wall.force"].file == str(tmp_path / "way.csv")
+    loop, _, record = run_scenario(chosen)
+    predicted = loop.predicted_error(record)
+    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-6)
+    middle = (record.time > 0.2) & (record.time < 0.8)
+    wanted = 0.3 + 0.1 * np.sin(2 * record.time[middle])
+    np.testing.assert_allclose(record["desired_output"][middle, 0], wanted, atol=5e-4)
