@@ -175,7 +175,8 @@ def _write(run: _Run) -> bool:
         predicted = loop.predicted_error(record)
         limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
         config = run.scenario.integrator
-        accuracy = config.accuracy if config.use_error_control else None
+        fixed = loop.plant.time_step or not config.use_error_control
+        accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, record)
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if write.record:
