@@ -2,7 +2,10 @@
 
 import html
 import json
+import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,10 +45,7 @@ class AnimationPage(str):
 
     def _repr_html_(self) -> str:
         page = html.escape(str(self), quote=True)
-        return (
-            f'<iframe srcdoc="{page}" style="width: 100%; height: 500px; border: 0" '
-            'sandbox="allow-scripts"></iframe>'
-        )
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 500px; border: 0"></iframe>'
 
 
 @checked(ModelError)
@@ -80,7 +80,9 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
         title: The title of the page; the robot's name if empty.
     """
     # A server of its own, made only now: a run that nobody watches opens no port.
-    plant, acting, meshcat = course.plant, course.acting, start_meshcat()
+    with _quiet():
+        meshcat = start_meshcat()
+    plant, acting = course.plant, course.acting
     model = plant.model
     arrows = draw_scene(plant, meshcat)
     links = view_of_links(plant, scene_graph, meshcat)
@@ -110,6 +112,18 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
     recording.set_repetitions(_FOREVER)
     meshcat.PublishRecording()
     return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, title or model.dae.name))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Drake from telling where a server listens that nobody shall open."""
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 def _draw_paths(
