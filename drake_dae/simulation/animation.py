@@ -17,7 +17,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.surface import tangents
-from drake_dae.simulation.constraint_forces import ConstraintLoads, path_of
+from drake_dae.simulation.constraint_forces import PATH_COLOR, ConstraintLoads, path_of
 from drake_dae.simulation.course import Course, Loop, follow
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import (
@@ -29,7 +29,7 @@ from drake_dae.simulation.view import (
     view_of_links,
 )
 
-_DESIRED, _ACTUAL = Rgba(0.1, 0.6, 0.2, 1.0), Rgba(0.1, 0.2, 0.8, 1.0)
+_DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 
 _FOREVER = 2**31 - 1
 """How often the animation is repeated."""
@@ -91,7 +91,7 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
     # What stands still: what it touches, where it went, and where the reference wanted it.
     draw_surroundings(meshcat, model, acting, course.states[0], course.parameters[0])
     _, size = scene_extent(model, acting, course.states[0])
-    _draw_paths(meshcat, acting, course.points, "actual", _ACTUAL, 0.003 * size)
+    _draw_paths(meshcat, acting, course.points, "actual", PATH_COLOR, 0.003 * size)
     _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
 
     # What moves: the links and the arrows, frame by frame.
