@@ -16,6 +16,7 @@ from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import listed
 from drake_dae.dae import references
 from drake_dae.diagrams import contact_material
 from drake_dae.diagrams import scenario_parts as parts
@@ -122,7 +123,7 @@ _INTEGRATOR_TEXTS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scenario:
     """A robot in contact, what it shall do, and how to simulate it.
 
@@ -203,6 +204,14 @@ class Scenario:
     ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
     write: parts.Write = field(default_factory=parts.Write)
     compiled: Compiled = "auto"
+
+    def __repr__(self) -> str:
+        names = listed(constraint.name for constraint in self.constraints)
+        file = Path(self.robot.file).name
+        return (
+            f"Scenario('{self.description}', robot='{file}', constraints={names}, "
+            f"duration={self.duration:g} s)"
+        )
 
     def __eq__(self, other: object) -> bool:
         # Arrays, and Drake's SimulatorConfig, do not compare as a whole.

@@ -122,6 +122,13 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
     return f"no {kind} '{name}'; {hint}there are {', '.join(names) or 'none'}"
 
 
+def listed(names: Iterable[str], most: int = 8) -> str:
+    """Names for a line of text, as "[a, b]"; of many the first ones, and how many more."""
+    every = list(names)
+    more = [f"... {len(every) - most} more"] if len(every) > most else []
+    return f"[{', '.join([*every[:most], *more])}]"
+
+
 _BRIEF = Repr()
 _BRIEF.maxlevel, _BRIEF.maxlist, _BRIEF.maxtuple, _BRIEF.maxdict, _BRIEF.maxset = 3, 6, 6, 4, 4
 _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60

@@ -37,7 +37,8 @@ CLAIMS = {
 
 
 def test_every_example_has_its_claim():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(CLAIMS)
+    stems = {path.stem for path in EXAMPLES.glob("*.py")}
+    assert {stem for stem in stems if not stem.startswith("notebook_")} == set(CLAIMS)
 
 
 @pytest.mark.slow

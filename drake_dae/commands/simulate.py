@@ -27,6 +27,7 @@ from drake_dae.simulation.animation import animate
 from drake_dae.simulation.course import Course, contact_paths, follow
 from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
+from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
 from drake_dae.simulation.run_folder import (
@@ -102,6 +103,7 @@ class _Run:
 
 def _step(run: _Run) -> RunStatistics:
     """Runs by Drake's Simulator."""
+    _tell_rate(run)
     return simulate(
         run.loop.diagram,
         run.context,
@@ -110,6 +112,21 @@ def _step(run: _Run) -> RunStatistics:
         progress=True,
         after_step=run.writer.update if run.scenario.write.record else None,
     )
+
+
+def _tell_rate(run: _Run) -> None:
+    """Says before a run in real time that it will not keep up."""
+    scenario, config = run.scenario, run.scenario.integrator
+    wanted = config.target_realtime_rate
+    if not wanted:
+        return
+    rate = attainable_rate(run.loop.diagram, run.context, scenario.duration, config)
+    if rate is not None and rate < wanted:
+        print(
+            f"runs at about {rate:.2g} times real time here, not at {wanted:g}: the view is slow "
+            "motion. Machine code (--compiled true, with a C compiler) and larger steps are faster",
+            flush=True,
+        )
 
 
 def _roll(run: _Run) -> RunStatistics:
@@ -166,7 +183,8 @@ def _write(run: _Run) -> bool:
         predicted = loop.predicted_error(record)
         limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
         config = run.scenario.integrator
-        accuracy = config.accuracy if config.use_error_control else None
+        fixed = loop.plant.time_step or not config.use_error_control
+        accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, record)
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if write.record:

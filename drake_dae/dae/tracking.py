@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked, result_of
-from drake_dae.arrays import FloatArray, brief, numbers, vector
+from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
 from drake_dae.dae.constraint_damping import damped
 from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.integral import IntegralAction
@@ -92,6 +92,14 @@ class TrackingLaw:
         self.gains = self.design(gains)
         self._error_coordinates = self._trace_error_coordinates()
         self.function = self._trace()
+
+    def __repr__(self) -> str:
+        outputs = listed(signal.name for signal in self.system.output_signals)
+        force = ", measured_force" if self.measured_force else ""
+        return (
+            f"TrackingLaw('{self.system.name}', outputs={outputs}, "
+            f"degrees={list(self.degrees)}{force})"
+        )
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.shared_forces import share_forces
 from drake_dae.dae.system import DaeSystem
@@ -192,6 +192,16 @@ class RobotModel:
             compliances,
             control_weights,
             compiled,
+        )
+
+    def __repr__(self) -> str:
+        constraints = listed(constraint.name for constraint in self.constraints)
+        stages = listed(type(stage).__name__ for stage in self.stages) if self.stages else ""
+        return (
+            f"RobotModel('{self.name}', positions={self.links.q.numel()}, "
+            f"constraints={constraints}, "
+            + (f"actuation={stages}, " if stages else "")
+            + f"outputs={listed(signal.name for signal in self.dae.output_signals)})"
         )
 
     @property

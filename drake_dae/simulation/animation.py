@@ -2,7 +2,10 @@
 
 import html
 import json
+import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +17,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.surface import tangents
-from drake_dae.simulation.constraint_forces import ConstraintLoads, path_of
+from drake_dae.simulation.constraint_forces import PATH_COLOR, ConstraintLoads, path_of
 from drake_dae.simulation.course import Course, Loop, follow
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import (
@@ -26,7 +29,7 @@ from drake_dae.simulation.view import (
     view_of_links,
 )
 
-_DESIRED, _ACTUAL = Rgba(0.1, 0.6, 0.2, 1.0), Rgba(0.1, 0.2, 0.8, 1.0)
+_DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 
 _FOREVER = 2**31 - 1
 """How often the animation is repeated."""
@@ -42,10 +45,7 @@ class AnimationPage(str):
 
     def _repr_html_(self) -> str:
         page = html.escape(str(self), quote=True)
-        return (
-            f'<iframe srcdoc="{page}" style="width: 100%; height: 500px; border: 0" '
-            'sandbox="allow-scripts"></iframe>'
-        )
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 500px; border: 0"></iframe>'
 
 
 @checked(ModelError)
@@ -80,7 +80,9 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
         title: The title of the page; the robot's name if empty.
     """
     # A server of its own, made only now: a run that nobody watches opens no port.
-    plant, acting, meshcat = course.plant, course.acting, start_meshcat()
+    with _quiet():
+        meshcat = start_meshcat()
+    plant, acting = course.plant, course.acting
     model = plant.model
     arrows = draw_scene(plant, meshcat)
     links = view_of_links(plant, scene_graph, meshcat)
@@ -89,7 +91,7 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
     # What stands still: what it touches, where it went, and where the reference wanted it.
     draw_surroundings(meshcat, model, acting, course.states[0], course.parameters[0])
     _, size = scene_extent(model, acting, course.states[0])
-    _draw_paths(meshcat, acting, course.points, "actual", _ACTUAL, 0.003 * size)
+    _draw_paths(meshcat, acting, course.points, "actual", PATH_COLOR, 0.003 * size)
     _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
 
     # What moves: the links and the arrows, frame by frame.
@@ -110,6 +112,18 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
     recording.set_repetitions(_FOREVER)
     meshcat.PublishRecording()
     return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, title or model.dae.name))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Drake from telling where a server listens that nobody shall open."""
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
 
 
 def _draw_paths(

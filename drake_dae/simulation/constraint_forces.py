@@ -23,6 +23,11 @@ from drake_dae.trace.functions import TracedFunction
 _FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
 _MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
 
+PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
+
+_PIECE = 32
+"""How many points a piece of a path has that grows."""
+
 LEAST_SCALE = 1e-3
 """How much of its length an arrow keeps where nothing acts: no transformation survives zero."""
 
@@ -172,8 +177,42 @@ class ForceArrows:
         self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
 
 
+class GrowingPaths:
+    """Draws where constraints act, further with each moment.
+
+    Args:
+        meshcat: Where to draw.
+        constraints: The constraints that act at a point.
+    """
+
+    def __init__(self, meshcat: Meshcat, constraints: Sequence[Constraint]) -> None:
+        self._meshcat, self._constraints = meshcat, constraints
+        self._piece: list[FloatArray] = []
+        self._number, self._time = 0, -np.inf
+
+    def add(self, points: FloatArray, time: float) -> None:
+        """Goes on to where they act now; a time before the last one begins anew.
+
+        Args:
+            points: Where they act, m, shape (k, 3).
+            time: The time in s.
+        """
+        if time < self._time:
+            self._meshcat.Delete("/paths")
+            self._piece, self._number = [], 0
+        self._time = time
+        self._piece.append(points)
+        line = np.array(self._piece)
+        for row, constraint in enumerate(self._constraints):
+            path = f"/paths/{constraint.name}/actual/{self._number}"
+            self._meshcat.SetLine(path, np.asfortranarray(line[:, row].T), 4.0, PATH_COLOR)
+        # In pieces: a line is sent as a whole with each of its points.
+        if len(self._piece) > _PIECE:
+            self._piece, self._number = [points], self._number + 1
+
+
 class ConstraintForceVisualizer(LeafSystem):
-    """Draws the constraint forces of a robot while it runs.
+    """Draws the constraint forces of a robot while it runs, and the paths of their points.
 
     Input ports:
         link_state: (q, v).
@@ -182,6 +221,7 @@ class ConstraintForceVisualizer(LeafSystem):
 
     Args:
         arrows: What draws them.
+        meshcat: Where to draw the paths.
         model: The robot.
         places: Where the entries of `exogenous` stand among the parameters.
         period: Time between pictures in s.
@@ -190,12 +230,18 @@ class ConstraintForceVisualizer(LeafSystem):
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
-        self, arrows: ForceArrows, model: RobotModel, places: Sequence[int], period: float
+        self,
+        arrows: ForceArrows,
+        meshcat: Meshcat,
+        model: RobotModel,
+        places: Sequence[int],
+        period: float,
     ) -> None:
         super().__init__()
         self.set_name("constraint_force_visualizer")
         self._model = model
         self._arrows, self._loads = arrows, ConstraintLoads(model)
+        self._paths = GrowingPaths(meshcat, self._loads.constraints)
         self._values, self._places = model.dae.parameter_values, list(places)
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
@@ -213,7 +259,9 @@ class ConstraintForceVisualizer(LeafSystem):
         if self._places and self._exogenous.HasValue(context):
             self._values[self._places] = self._exogenous.Eval(context)
             self._arrows.place(self._values, time)
-        self._arrows.draw(self._loads(state, force, self._values), time)
+        loads = self._loads(state, force, self._values)
+        self._arrows.draw(loads, time)
+        self._paths.add(loads.points, time)
         return EventStatus.Succeeded()
 
 

@@ -183,12 +183,14 @@ def _desired_states(
         states, desired, values: x, z and the parameters at each moment, one row each.
     """
     nq, nv = model.links.q.numel(), model.links.v.numel()
-    guess, found = states[0, :nq], []
+    q, found = states[0, :nq], []
+    # Where rolling leaves open how a robot stands, it goes as it went.
+    moves = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
     try:
         wanted = desired[:, : len(model.position_signals)]
-        for row, own in zip(wanted, values, strict=True):
-            guess = model.configuration(row, guess, own)
-            found.append(np.concatenate([guess, np.zeros(nv)]))
+        for row, own, move in zip(wanted, values, moves, strict=True):
+            q = model.configuration(row, q + move, own)
+            found.append(np.concatenate([q, np.zeros(nv)]))
     except InconsistentStateError:
         pass  # The reference leaves what the robot can reach: its path ends there.
     return np.array(found).reshape(-1, nq + nv)

@@ -264,7 +264,9 @@ def _grid(
     rows = -(-count // columns)
     width = 6.0 * columns if count or not notes else 12.0
     top = _TITLE + (_LINE * _legend_shape(labels, width)[0] + 0.15 if labels else 0.1)
-    text = fill(noted + ", ".join(notes), int(width / _LETTER) - 6) if notes else ""
+    # An entry is not broken at the end of a line.
+    entries = ", ".join(note.replace(" ", "\u00a0") for note in notes)
+    text = fill(noted + entries, int(width / _LETTER) - 6) if notes else ""
     below = (_BOTTOM if count else 0.1) + _LINE * len(text.splitlines())
     height = below + rows * _AXES + max(rows - 1, 0) * _GAP + top
     figure = Figure(figsize=(width, height))

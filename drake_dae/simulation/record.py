@@ -1,10 +1,13 @@
 """What a run leaves: every signal over time, with names and units."""
 
+import csv
+import html
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 from zipfile import BadZipFile
 
 import numpy as np
@@ -12,7 +15,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 
@@ -74,6 +77,27 @@ class Record:
             raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
         return self.signals[name].values
 
+    def __repr__(self) -> str:
+        found = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
+        return f"Record({self._extent()}, signals={found})"
+
+    def _repr_html_(self) -> str:
+        """A table of the signals, as a notebook shows it."""
+        rows = "".join(
+            f"<tr><td>{html.escape(name)}</td><td>{len(recorded.signals)}</td>"
+            f"<td>{html.escape(listed(map(_label, recorded.signals))[1:-1])}</td></tr>"
+            for name, recorded in self.signals.items()
+        )
+        return (
+            f"<p>Record: {self._extent()}</p><table><thead><tr><th>signal</th><th>size</th>"
+            f"<th>names and units</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+    def _extent(self) -> str:
+        if not self.time.size:
+            return "empty"
+        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s"
+
     def while_finite(self) -> Self:
         """The record up to the first moment at which some signal is not finite."""
         finite = [np.isfinite(recorded.values).all(axis=1) for recorded in self.signals.values()]
@@ -131,6 +155,62 @@ class Record:
             arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
+    def to_csv(self, path: str | Path) -> None:
+        """Writes the record as text: a line of names with units, then one line for each time.
+
+        The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
+        """
+        columns = [
+            f"{name}.{_label(signal)}"
+            for name, recorded in self.signals.items()
+            for signal in recorded.signals
+        ]
+        rows = np.column_stack([self.time, *(r.values for r in self.signals.values())])
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time [s]", *columns])
+            writer.writerows(rows.tolist())
+
+    def to_dataframe(self) -> Any:
+        """The record as a pandas DataFrame, one row for each time, "time [s]".
+
+        Its columns have two levels, the signal and the name with its unit:
+        `frame["control"]` are all controls, and `frame["control"].plot()` draws them.
+
+        Raises:
+            ModelError: pandas is not installed.
+        """
+        pandas = _needed("pandas", "to_dataframe")
+        pairs = [
+            (name, _label(signal))
+            for name, recorded in self.signals.items()
+            for signal in recorded.signals
+        ]
+        return pandas.DataFrame(
+            np.hstack([np.zeros((self.time.size, 0)), *(r.values for r in self.signals.values())]),
+            index=pandas.Index(self.time, name="time [s]"),
+            columns=pandas.MultiIndex.from_tuples(pairs, names=["signal", "name"]),
+        )
+
+    def to_xarray(self) -> Any:
+        """The record as an xarray Dataset, one variable for each signal.
+
+        Its dimensions are "time" in s and "<signal>.name"; the units stand beside the names, as the
+        coordinate "<signal>.unit": `data["control"].sel({"control.name": "joint1_motor"})`.
+
+        Raises:
+            ModelError: xarray is not installed.
+        """
+        xarray = _needed("xarray", "to_xarray")
+        variables: dict[str, Any] = {}
+        coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
+        for name, recorded in self.signals.items():
+            along = f"{name}.name"
+            variables[name] = (("time", along), recorded.values)
+            coordinates[along] = [signal.name for signal in recorded.signals]
+            coordinates[f"{name}.unit"] = (along, [signal.unit for signal in recorded.signals])
+        return xarray.Dataset(variables, coordinates)
+
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Reads what `save` or a `RecordWriter` wrote, the latter as far as it came.
@@ -157,6 +237,22 @@ class Record:
             BadZipFile,
         ) as error:
             raise ModelError(f"{path} is not a record of a run: {error}") from None
+
+
+def _label(signal: Signal) -> str:
+    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
+
+
+def _needed(module: str, asked: str) -> Any:
+    """A module that only some need.
+
+    Raises:
+        ModelError: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise ModelError(f"{asked} needs {module}: pip install 'drake_dae[data]'") from None
 
 
 def _read_rows(file: BinaryIO) -> tuple[FloatArray, dict[str, Recorded]]:

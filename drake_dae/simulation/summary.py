@@ -13,7 +13,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, output_sizes, sizes
+from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 
 _PROJECTED = "before each step's projection"
 
@@ -114,13 +114,8 @@ def _errors(record: Record, predicted: FloatArray) -> list[str]:
     signals = record.signals["tracking_error"].signals
     if not signals:
         return []
-    columns = zip(
-        signals,
-        record["tracking_error"].T,
-        predicted.T,
-        output_sizes(record, predicted),
-        strict=True,
-    )
+    sizes = unit_sizes(record)
+    columns = zip(signals, record["tracking_error"].T, predicted.T, strict=True)
     return [
         *Table(
             ["tracking error", "unit", "start", "largest", "final", "off prediction by"],
@@ -128,12 +123,12 @@ def _errors(record: Record, predicted: FloatArray) -> list[str]:
                 [
                     signal.name,
                     signal.unit or "1",
-                    _number(error[0], size, 3),
-                    _number(np.max(np.abs(error)), size, 3),
-                    _number(error[-1], size, 3),
-                    _number(np.max(np.abs(error - theory)), size, 2),
+                    _number(error[0], sizes[signal.unit], 3),
+                    _number(np.max(np.abs(error)), sizes[signal.unit], 3),
+                    _number(error[-1], sizes[signal.unit], 3),
+                    _number(np.max(np.abs(error - theory)), sizes[signal.unit], 2),
                 ]
-                for signal, error, theory, size in columns
+                for signal, error, theory in columns
             ],
             left=2,
         ).lines(),
@@ -146,18 +141,18 @@ def _forces(record: Record, limits: Limits) -> list[str]:
     forces = record.signals["constraint_force"]
     if not forces.signals:
         return []
-    scales = sizes(forces.signals, forces.values)
+    sizes = unit_sizes(record)
     return Table(
         ["constraint force", "unit", "least", "largest", ""],
         [
             [
                 signal.name,
                 signal.unit or "1",
-                _number(np.min(values), size, 4),
-                _number(np.max(values), size, 4),
+                _number(np.min(values), sizes[signal.unit], 4),
+                _number(np.max(values), sizes[signal.unit], 4),
                 "pulls: a real contact would open" if _pulls(signal, values, limits) else "",
             ]
-            for signal, values, size in zip(forces.signals, forces.values.T, scales, strict=True)
+            for signal, values in zip(forces.signals, forces.values.T, strict=True)
         ],
         left=2,
     ).lines()
@@ -167,20 +162,20 @@ def _controls(record: Record, limits: Limits) -> list[str]:
     controls = record.signals["control"]
     if not controls.signals:
         return []
-    scales = sizes(controls.signals, controls.values)
+    sizes = unit_sizes(record)
     largest = _largest_controls(record, limits)
     # A sample tells of the step that it ends.
     excess = record["excess"] if "excess" in record.signals else np.zeros_like(controls.values)
     cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
-    columns = zip(controls.signals, controls.values.T, scales, largest, cut_off, strict=True)
+    columns = zip(controls.signals, controls.values.T, largest, cut_off, strict=True)
     return Table(
         ["control", "unit", "least", "largest", "limit", ""],
         [
             [
                 signal.name,
                 signal.unit or "1",
-                _number(np.min(values), size, 4),
-                _number(np.max(values), size, 4),
+                _number(np.min(values), sizes[signal.unit], 4),
+                _number(np.max(values), sizes[signal.unit], 4),
                 f"{limit:.4g}" if np.isfinite(limit) else "none",
                 f"cut off for {time:.3g} s"
                 if time
@@ -188,7 +183,7 @@ def _controls(record: Record, limits: Limits) -> list[str]:
                 if np.max(np.abs(values)) > limit
                 else "",
             ]
-            for signal, values, size, limit, time in columns
+            for signal, values, limit, time in columns
         ],
         left=2,
     ).lines()

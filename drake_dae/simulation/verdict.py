@@ -48,35 +48,43 @@ class Verdict:
     share: float = 0.0
 
 
-def sizes(signals: Sequence[Signal], *courses: FloatArray) -> FloatArray:
-    """How large the numbers of each signal are: the largest value of all that have its unit.
-
-    Angles and pure numbers are of size one at least. So an output that is held at zero is compared
-    with those that move, in any unit.
+def unit_sizes(record: Record) -> dict[str, float]:
+    """Unit -> the largest number that a record has in it; angles and pure numbers are one at least.
 
     Args:
-        signals: Names and units, p of them.
-        courses: Values over time, shape (k, p) each.
-
-    Returns:
-        The sizes, shape (p,), zero where all with a unit are zero.
+        record: A record; what it has of state, control, constraint_force and desired_output counts.
     """
-    largest = np.zeros(len(signals))
-    for values in courses:
-        largest = np.maximum(largest, np.max(np.abs(values), axis=0, initial=0.0))
-    units = [signal.unit for signal in signals]
-    least = {"": 1.0, "rad": 1.0}
-    found = {
-        unit: max(least.get(unit, 0.0), *largest[[u == unit for u in units]])
-        for unit in dict.fromkeys(units)
-    }
-    return np.array([found[unit] for unit in units])
+    found = {"": 1.0, "rad": 1.0}
+    for name in ("state", "control", "constraint_force", "desired_output"):
+        if name in record.signals:
+            largest = np.max(np.abs(record[name]), axis=0, initial=0.0)
+            for signal, size in zip(record.signals[name].signals, largest, strict=True):
+                found[signal.unit] = max(found.get(signal.unit, 0.0), float(size))
+    return found
 
 
 def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
-    """The sizes of the outputs of a run: of their references and of the predicted errors, (p,)."""
+    """How large the outputs of a run are, shape (p,), positive.
+
+    It is the largest value that a reference or a predicted error has in the unit of an output, so
+    that one that is held at zero is compared with those that move. Where all are zero it is the
+    largest value of the record in that unit, or one.
+
+    Args:
+        record: A record with desired_output.
+        predicted: The tracking error by theory, shape (k, p).
+    """
     signals = record.signals["desired_output"].signals
-    return sizes(signals, record["desired_output"], predicted)
+    courses = np.vstack([record["desired_output"], predicted])
+    largest = np.max(np.abs(courses), axis=0, initial=0.0)
+    anything = unit_sizes(record)
+    found: dict[str, float] = {"": 1.0, "rad": 1.0}
+    for signal, size in zip(signals, largest, strict=True):
+        found[signal.unit] = max(found.get(signal.unit, 0.0), float(size))
+    for unit, size in found.items():
+        if size <= ROUND_OFF * anything.get(unit, 0.0):
+            found[unit] = anything[unit] or 1.0
+    return np.array([found[signal.unit] for signal in signals])
 
 
 def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> Verdict:
@@ -91,8 +99,7 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     if not error.size:
         return Verdict(Tracking.AS_PREDICTED)
     signals = record.signals["tracking_error"].signals
-    size = np.maximum(output_sizes(record, predicted), np.finfo(float).tiny)
-    shares = np.abs(error - predicted) / size
+    shares = np.abs(error - predicted) / output_sizes(record, predicted)
     row, column = np.unravel_index(np.argmax(shares), shares.shape)
     share = float(shares[row, column])
     tracking = Tracking.OFF

@@ -95,7 +95,7 @@ def add_live_view(
     period = 1.0 / FRAME_RATE
     arrows = draw_scene(plant, meshcat)
     forces = builder.AddSystem(
-        ConstraintForceVisualizer(arrows, plant.model, plant.exogenous_places, period)
+        ConstraintForceVisualizer(arrows, meshcat, plant.model, plant.exogenous_places, period)
     )
     for name in ("link_state", "constraint_force"):
         builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))

@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, vector
+from drake_dae.arrays import FloatArray, listed, numbers, vector
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
@@ -46,6 +46,15 @@ class DifferentiableSystem(LeafSystem):
         converter = SystemScalarConverter()
         converter._AddConstructor[AutoDiffXd, float](_converted)
         super().__init__(converter)
+
+    def __repr__(self) -> str:
+        inputs = [self.get_input_port(i) for i in range(self.num_input_ports())]
+        outputs = [self.get_output_port(i) for i in range(self.num_output_ports())]
+        ports = [
+            f"{kind}={listed([f'{port.get_name()} ({port.size()})' for port in found])}"
+            for kind, found in (("inputs", inputs), ("outputs", outputs))
+        ]
+        return f"{type(self).__name__}('{self.get_name()}', {', '.join(ports)})"
 
     @cached_property
     def formulas(self) -> dict[str, Formula]:

@@ -38,7 +38,7 @@ from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact import surfaces
 from drake_dae.robots.contact.surface import tangents
-from drake_dae.simulation.constraint_forces import ConstraintLoads, ForceArrows
+from drake_dae.simulation.constraint_forces import ConstraintLoads, ForceArrows, GrowingPaths
 from drake_dae.simulation.course import contact_paths, follow, frame_times
 from drake_dae.simulation.record import Recorded
 from drake_dae.simulation.view import FRAME_RATE, draw_scene, scene_extent
@@ -338,6 +338,10 @@ def test_live_view_draws_while_it_runs():
     pose = plant.EvalBodyPoseInWorld(own, plant.GetBodyByName("link2")).GetAsMatrix4()
     link = transforms(page)["/drake/visualizer/two_link_arm/link2"]
     np.testing.assert_allclose(link, pose, atol=1e-9)
+    # The path so far: 17 points, the last where the tool is.
+    path = vertices(objects(page)["/paths/wall/actual/0"])
+    assert len(path) == 17
+    np.testing.assert_allclose(path[-1], tool, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -366,6 +370,22 @@ def test_only_this_machine_reaches_meshcat():
     # On Linux all of 127.0.0.0/8 is this machine, so that a server on all interfaces would answer.
     with pytest.raises(OSError, match=r"refused|timed out|assign|unreachable"):
         socket.create_connection(("127.0.0.2", url.port), timeout=5)
+
+
+def test_a_path_that_grows_is_in_pieces_that_meet_and_begins_anew():
+    meshcat = start_meshcat()
+    paths = GrowingPaths(meshcat, arm("two_link").model.constraints)
+    points = np.arange(150.0).reshape(50, 1, 3)
+    for time, point in enumerate(points):
+        paths.add(point, 0.1 * time)
+    drawn = {path: vertices(o) for path, o in objects(meshcat.StaticHtml()).items()}
+    first, second = (drawn[f"/paths/wall/actual/{number}"] for number in (0, 1))
+    np.testing.assert_array_equal(first[-1], second[0])
+    np.testing.assert_array_equal(np.vstack([first, second[1:]]), points[:, 0])
+    paths.add(points[0], 0.0)
+    things = objects(meshcat.StaticHtml())
+    assert [path for path in things if path.startswith("/paths")] == ["/paths/wall/actual/0"]
+    np.testing.assert_array_equal(vertices(things["/paths/wall/actual/0"]), points[0])
 
 
 # Arrows and surfaces.

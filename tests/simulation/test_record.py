@@ -1,5 +1,6 @@
 """The record of a run, in memory and on disk."""
 
+import csv
 import subprocess
 import sys
 
@@ -9,7 +10,16 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, T
 from pydrake.systems.primitives import LogVectorOutput
 from runs import run_scenario, scenario
 
-from drake_dae import Record, build_scenario, load_scenario, poles, simulate
+from drake_dae import (
+    NormalForm,
+    Record,
+    ZeroDynamics,
+    build_scenario,
+    load_scenario,
+    poles,
+    simulate,
+)
+from drake_dae.arrays import listed
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError, WiringError
@@ -219,3 +229,89 @@ def test_of_nothing():
     record = loop.record(context)
     assert record.time.size == 0
     assert record["tracking_error"].shape == (0, 2)
+
+
+# For other tools, and to look at.
+
+
+def test_a_dataframe_has_the_numbers_below_names_and_units(run):
+    _, _, record = run
+    frame = record.to_dataframe()
+    assert frame.index.name == "time [s]"
+    np.testing.assert_array_equal(frame.index, record.time)
+    assert list(frame.columns.levels[0]) == sorted(record.signals)
+    assert list(frame["control"].columns) == ["joint1_motor [N m]", "joint2_motor [N m]"]
+    assert list(frame["controlled_output"].columns) == ["tool.z [m]", "wall.force [N]"]
+    for name in record.signals:
+        np.testing.assert_array_equal(frame[name], record[name])
+    assert small().to_dataframe().shape == (3, 2)
+
+
+def test_a_dataset_has_the_numbers_with_names_and_units(run):
+    _, _, record = run
+    data = record.to_xarray()
+    np.testing.assert_array_equal(data["time"], record.time)
+    assert data["time"].attrs == {"units": "s"}
+    assert set(data.data_vars) == set(record.signals)
+    for name, recorded in record.signals.items():
+        assert data[name].dims == ("time", f"{name}.name")
+        np.testing.assert_array_equal(data[name], recorded.values)
+        assert list(data[f"{name}.unit"].values) == [s.unit for s in recorded.signals]
+    motor = data["control"].sel({"control.name": "joint1_motor"})
+    np.testing.assert_array_equal(motor, record["control"][:, 0])
+    assert small().to_xarray()["constraint_force"].shape == (3, 0)
+
+
+def test_csv_reads_back_to_the_last_digit(tmp_path):
+    small().to_csv(tmp_path / "record.csv")
+    with open(tmp_path / "record.csv", encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["time [s]", "state.q [rad]", "state.ß,'"]
+    np.testing.assert_array_equal(
+        np.array(rows, dtype=float), np.column_stack([small().time, small()["state"]])
+    )
+
+
+@pytest.mark.parametrize(("module", "method"), [("pandas", "dataframe"), ("xarray", "xarray")])
+def test_without_the_extra_it_says_what_to_install(module, method, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ModelError, match=rf"to_{method} needs {module}: pip install .*\[data\]"):
+        getattr(small(), f"to_{method}")()
+
+
+def test_what_a_notebook_shows():
+    record = small()
+    assert repr(record) == (
+        "Record(3 times from 0 to 0.3 s, signals=[state (2), constraint_force (0)])"
+    )
+    page = record._repr_html_()
+    assert "<td>state</td><td>2</td><td>q [rad], ß,&#x27;</td>" in page
+    assert repr(Record(np.zeros(0), {})) == "Record(empty, signals=[])"
+
+
+def test_one_line_says_names_and_sizes(run):
+    """The hidden words of a notebook: what the last line of a cell shows."""
+    loop, _, _ = run
+    plant, controller = loop.plant, loop.controller
+    outputs = "outputs=[tool.z, wall.force]"
+    assert repr(plant.model) == (
+        f"RobotModel('two_link_arm', positions=2, constraints=[wall], {outputs})"
+    )
+    assert repr(controller.law) == f"TrackingLaw('two_link_arm', {outputs}, degrees=[2, 0])"
+    assert repr(plant).startswith("RobotPlant('two_link_arm', inputs=[control (2)]")
+    assert "constraint_force (1)" in repr(plant)
+    assert "inputs=[estimated_state (4), reference (4)" in repr(controller)
+    assert repr(loop.reference) == (
+        "ReferenceGenerator('reference', inputs=[], outputs=[reference (4)])"
+    )
+    assert repr(scenario("two_link_wall")) == (
+        f"Scenario('{scenario('two_link_wall').description}', robot='two_link_arm.urdf', "
+        "constraints=[wall], duration=10 s)"
+    )
+    structure = controller.law.structure
+    zero = ZeroDynamics(plant.dae, structure=structure)
+    assert repr(zero) == "ZeroDynamics('two_link_arm', dimension=0)"
+    form = NormalForm(plant.dae, structure=structure)
+    names = "[wall.distance, wall.distance', tool.z, tool.z']"
+    assert repr(form) == f"NormalForm('two_link_arm', coordinates={names})"
+    assert listed("abcdefghij", 3) == "[a, b, c, ... 7 more]"

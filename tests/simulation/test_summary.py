@@ -149,6 +149,21 @@ def test_a_verdict_is_the_same_in_metres_and_millimetres(unit):
     assert found.share == pytest.approx(0.1)
 
 
+def test_round_off_of_an_output_that_is_zero_is_no_drift():
+    """A moment of 3e-15 N m beside motors of 7 N m is 0, and judged beside these."""
+    signals = [("tool.z", "m"), ("grasp.mx", "N m")]
+    noise = PREDICTED + np.array([0.0, 3e-15])
+    run = record(
+        tracking_error=(noise.tolist(), signals),
+        desired_output=([[0.5, 0.0], [0.25, 0.0], [0.0, 0.0]], signals),
+    )
+    text = summary(run, PREDICTED)
+    assert table(text, "tracking error  unit")[1] == ["grasp.mx", "N", "m", "0", "0", "0", "0"]
+    assert verdict(text).startswith("Tracked as predicted")
+    run["tracking_error"][1, 1] = 0.1
+    assert judge(run, PREDICTED).share == pytest.approx(0.1 / 7.25)
+
+
 def test_a_run_that_drifted_says_where_and_why():
     run = record(tracking_error=([[0.05, 0.0], [0.0, 0.0], [0.0, 0.0]], [("a", "m"), ("b", "")]))
     reasons = ["the law is sampled"]

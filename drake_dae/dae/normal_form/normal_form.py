@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dgetrf, dgetrs
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.normal_form.completion import check_completion, choose_completion
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure, structure_of
@@ -89,6 +89,10 @@ class NormalForm:
         )
         # Not that of `samples`: a state that is zero on N* is round-off there.
         self._scale = structure.scale
+
+    def __repr__(self) -> str:
+        names = listed(signal.name for signal in self.coordinate_signals)
+        return f"NormalForm('{self.system.name}', coordinates={names})"
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Phi(x) = (y, zeta, xi) of (20)-(22).

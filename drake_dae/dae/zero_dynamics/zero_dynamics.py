@@ -57,6 +57,9 @@ class ZeroDynamics:
         self._equilibria = Equilibria(self._pinned)
         self.residual_signals = self._pinned.residual_signals
 
+    def __repr__(self) -> str:
+        return f"ZeroDynamics('{self.system.name}', dimension={self.dimension})"
+
     def state(
         self,
         reference: ArrayLike,
