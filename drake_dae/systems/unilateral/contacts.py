@@ -148,15 +148,15 @@ class UnilateralContacts:
         )
 
 
-def subsystem(contacts: UnilateralContacts, closed: Sequence[bool], state: FloatArray) -> DaeSystem:
-    """The system in which some contacts are closed and the others are not there.
+def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
+    """The system in which some constraints hold and the others are not there.
 
     Args:
         contacts: The contacts.
-        closed: Which are closed.
+        rows: The constraints that hold.
         state: A state near which it is examined, shape (n,).
     """
-    dae, rows = contacts.dae, mode_rows(contacts, closed)
+    dae, rows = contacts.dae, list(rows)
     embed = ca.SX.eye(dae.num_constraints)[:, rows]
     whole = dae.implicit
 
@@ -175,15 +175,6 @@ def subsystem(contacts: UnilateralContacts, closed: Sequence[bool], state: Float
         implicit=None if whole is None or not rows else implicit,
         nominal_state=state,
     )
-
-
-def mode_rows(contacts: UnilateralContacts, closed: Sequence[bool]) -> list[int]:
-    """The rows of a mode among those of all constraints, in their order."""
-    found = set(contacts.kept.tolist())
-    for touch, is_closed in zip(contacts.touches, closed, strict=True):
-        if is_closed:
-            found.update(touch.rows.tolist())
-    return sorted(found)
 
 
 def _with_restitution(dae: DaeSystem, given: Sequence[tuple[str, float]]) -> DaeSystem:

@@ -6,7 +6,8 @@ b the accelerations without them. Kept rows have w = 0; each contact has
 
     y_n >= 0,    w_n >= 0,    y_n w_n = 0
 
-for its normal n, and w = 0 in its other rows if it pushes, y = 0 if not.
+for its normal n, and w = 0 in its other rows if it pushes, y = 0 if not. Without friction exactly
+one w fits, and exactly one y where rows are independent.
 """
 
 from collections.abc import Sequence
@@ -62,8 +63,6 @@ def complementary(
 ) -> Fit | None:
     """The y that fits, with as few contacts that push as do.
 
-    Rows that depend on each other push in no set: of a table with four feet three carry it.
-
     Args:
         matrix: A, shape (m, m).
         offset: b, shape (m,).
@@ -74,40 +73,59 @@ def complementary(
         What fits; None if nothing does.
     """
     length = np.sqrt(np.abs(np.diag(matrix)))
+    length[length == 0.0] = 1.0
     used = [*kept, *(row for touch in touches for row in touch.rows)]
-    size = max((abs(offset[i]) / length[i] for i in used if length[i] > 0.0), default=0.0)
+    size = float(np.max(np.abs(offset / length)[used], initial=0.0))
+    normals = [touch.normal for touch in touches]
     best, least = None, np.inf
     for count in range(len(touches) + 1):
         for pushing in combinations(range(len(touches)), count):
-            rows = np.array([*kept, *(r for i in pushing for r in touches[i].rows)], dtype=int)
-            values = solution(matrix, offset, rows)
-            if values is None:
+            rows = rows_of(matrix, kept, [touches[i] for i in pushing])
+            if rows is None:
                 continue
+            values = np.zeros(offset.size)
+            if rows.size:
+                values[rows] = np.linalg.solve(matrix[np.ix_(rows, rows)], -offset[rows])
             rates = matrix @ values + offset
-            normals = [touch.normal for touch in touches]
             amiss = [
-                -values[n] * length[n] if i in pushing else -rates[n] / (length[n] or 1.0)
+                -values[n] * length[n] if i in pushing else -rates[n] / length[n]
                 for i, n in enumerate(normals)
             ]
-            violation = max(amiss, default=0.0)
+            violation = max(0.0, *amiss) if amiss else 0.0
             if violation < least - TIE * size:
-                best, least = Fit(pushing, values), max(violation, 0.0)
+                best, least = Fit(pushing, values), violation
     return best if least <= FITS * size else None
 
 
-def solution(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArray | None:
-    """y with w = 0 in some rows, zero in the others, shape (m,); None if the rows are dependent."""
-    values = np.zeros(offset.size)
-    if rows.size:
-        part = matrix[np.ix_(rows, rows)]
+def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[Touch]) -> Indices | None:
+    """The rows that hold while some contacts push, kept ones first, then normals.
+
+    Of a table with four feet three carry it: normals that depend on each other are no set. Other
+    rows that depend on those before them, as of two feet that both stick, hold without a force.
+
+    Args:
+        matrix: A, shape (m, m).
+        kept: The rows that nothing opens.
+        pushing: The contacts.
+
+    Returns:
+        The rows; None if there is no such set.
+    """
+    first = [*kept, *(touch.normal for touch in pushing)]
+    others = [row for touch in pushing for row in touch.rows if row != touch.normal]
+    found: list[int] = []
+    for row in (*first, *others):
+        trial = [*found, row]
+        part = matrix[np.ix_(trial, trial)]
         length = np.sqrt(np.abs(np.diag(part)))
-        if not np.all(length > 0.0):
+        if length[-1] > 0.0:
+            scaled = part / length / length[:, None]
+            if np.linalg.svd(scaled, compute_uv=False)[-1] >= DEPENDENT:
+                found = trial
+                continue
+        if row in first:
             return None
-        scaled = part / length / length[:, None]
-        if np.linalg.svd(scaled, compute_uv=False)[-1] < DEPENDENT:
-            return None
-        values[rows] = np.linalg.solve(scaled, -offset[rows] / length) / length
-    return values
+    return np.array(found, dtype=int)
 
 
 def stopping(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArray:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.constrained import ConstraintStructure, find_constraint_structure
 from drake_dae.errors import DrakeDaeError, ModelError
-from drake_dae.systems.unilateral.contacts import UnilateralContacts, mode_rows, subsystem
+from drake_dae.systems.unilateral.contacts import UnilateralContacts, subsystem
+from drake_dae.systems.unilateral.impacts import rows_of
 from drake_dae.trace.functions import TracedFunction
 
 Closed = tuple[bool, ...]
@@ -22,7 +23,8 @@ class Mode:
     Attributes:
         closed: Which contacts are closed.
         structure: The structure of the system with their constraints alone.
-        rows: Where its constraints stand among all.
+        rows: Where its constraints stand among all; of contacts that stick, those that are
+            independent.
         dynamics: x', a function of state, control if there is one, and parameters.
         force: All constraint forces, zero where open, likewise.
         output: The controlled outputs, likewise.
@@ -69,17 +71,27 @@ class Modes:
 
     def _traced(self, closed: Closed, state: FloatArray) -> Mode:
         contacts = self._contacts
-        system = subsystem(contacts, closed, state)
+        names = [n for n, shut in zip(contacts.names, closed, strict=True) if shut]
+        dae = contacts.dae
+        terms = contacts.terms(state, np.zeros(dae.num_controls), dae.parameter_values)
+        pushing = [t for t, shut in zip(contacts.touches, closed, strict=True) if shut]
+        found = rows_of(terms.impulse_matrix, contacts.kept, pushing)
+        if found is None:
+            raise ModelError(
+                f"{dae.name}: {', '.join(names)} cannot be closed together at state {show(state)}: "
+                "the constraints depend on each other there"
+            )
+        rows = sorted(found.tolist())
+        system = subsystem(contacts, rows, state)
         try:
             structure = find_constraint_structure(system)
         except DrakeDaeError as error:
-            names = [n for n, shut in zip(contacts.names, closed, strict=True) if shut]
             note = f"While {', '.join(names) or 'no contact'} is closed: {error}"
             error.args = (note, *error.args[1:])
             raise
         if any(degree > 2 for degree in structure.constraint_degrees):
             raise ModelError(f"{system.name}: a contact that opens and closes has degree 2 at most")
-        rows, derivatives = mode_rows(contacts, closed), structure.derivatives
+        derivatives = structure.derivatives
         own = derivatives.expand(derivatives.constraint_input)
         force = ca.SX(contacts.dae.num_constraints, 1)
         force[rows] = own

@@ -42,9 +42,16 @@ MARGIN = 1e-13
 
 @dataclass
 class Log:
-    """The events of one run, in one context."""
+    """What is known of one run, in one context.
+
+    Attributes:
+        events: What happened to contacts.
+        time: When the step began that is being made, in s.
+        before: Time and state before the last reset.
+    """
 
     events: list[ContactEvent] = field(default_factory=list)
+    time: float = np.nan
     before: tuple[float, bytes] = (np.nan, b"")
 
 
@@ -167,6 +174,11 @@ class UnilateralRobotPlant(ParameterizedSystem):
         self._log_index = self.DeclareCacheEntry(
             "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
         ).cache_index()
+        self._margins_index = self.DeclareCacheEntry(
+            "margins",
+            ValueProducer(_no_margins, weakly(self._calc_margins)),
+            by_control if self._is_controlled else by_state,
+        ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
         self._witnesses = [
@@ -277,14 +289,32 @@ class UnilateralRobotPlant(ParameterizedSystem):
         return self._checked(function, context, x)[0]
 
     def _guard(self, place: int, context: Context) -> float:
-        """Positive while a contact stays as it is."""
-        if context.get_discrete_state_vector().value()[place] > 0.5:
+        """Positive while a contact stays as it is: Drake seeks where that ends."""
+        margin = float(self._margins(context)[place])
+        closed = context.get_discrete_state_vector().value()[place] > 0.5
+        # A control that jumped, as where it is sampled, pulls from the start of a step on. That is
+        # seen only if it was not so at the start.
+        if closed and margin <= 0.0 and context.get_time() == self._log(context).time:
+            return 1.0
+        return margin
+
+    def _margins(self, context: Context) -> FloatArray:
+        """For each contact: its force if it is closed; else positive until it would be pierced."""
+        found: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
+        return found
+
+    def _calc_margins(self, context: Context, value: AbstractValue) -> None:
+        closed = context.get_discrete_state_vector().value() > 0.5
+        margins = np.zeros(closed.size)
+        if not closed.all():
+            # A contact that leaves has a gap of round-off; one that is far away may approach.
+            state = context.get_continuous_state_vector().value()
+            gaps, rates = self._checked(self._contacts.state, context, state)
+            margins[:] = np.maximum(gaps, rates) + MARGIN
+        if closed.any():
             force = self._evaluated(self._mode(context).force, context)
-            return float(force[self._contacts.normals[place]])
-        # While it leaves the gap may be round-off; while the gap is open it may approach.
-        state = context.get_continuous_state_vector().value()
-        gaps, rates = self._checked(self._contacts.state, context, state)
-        return float(max(gaps[place], rates[place])) + MARGIN
+            margins[closed] = force[self._contacts.normals][closed]
+        value.set_value(margins)
 
     def _at_guard(
         self, context: Context, event: UnrestrictedUpdateEvent, state: State
@@ -292,7 +322,7 @@ class UnilateralRobotPlant(ParameterizedSystem):
         return self._advance(context, state)
 
     def _start(self, context: Context, state: State) -> EventStatus:
-        vars(self._log(context)).update(vars(Log()))
+        vars(self._log(context)).update(vars(Log(time=context.get_time())))
         if context.get_accuracy() is None:
             raise SimulationError(
                 f"{self.dae.name}: the context has no accuracy, and without one Drake does not "
@@ -325,9 +355,9 @@ class UnilateralRobotPlant(ParameterizedSystem):
         return status
 
     def _advance(self, context: Context, state: State) -> EventStatus:
-        for place in range(len(self.contacts)):
-            if self._guard(place, context) <= 0.0:
-                return self._reset(context, state)
+        self._log(context).time = context.get_time()
+        if (self._margins(context) <= 0.0).any():
+            return self._reset(context, state)
         x, values = self.state(context), self._values(context)
         try:
             x = self._mode(context).structure.manifold.projected(x, values)
@@ -381,6 +411,10 @@ class UnilateralRobotPlant(ParameterizedSystem):
 
 def _no_events() -> AbstractValue:
     return AbstractValue.Make(Log())
+
+
+def _no_margins() -> AbstractValue:
+    return AbstractValue.Make(np.zeros(0))
 
 
 def _keep(context: Context, value: AbstractValue) -> None:
