@@ -52,6 +52,7 @@ from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.simulation.course import Loop
 from drake_dae.simulation.record import Recorded
+from drake_dae.systems.unilateral.events import ContactChange
 
 FOLDER = Path(__file__).parent / "made"
 
@@ -169,6 +170,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.TrackingController: lambda: loop().controller,
     dd.TrackingLaw: lambda: law("two_link"),
     Constraint: lambda: arm("two_link").model.constraints[0],
+    ContactChange: lambda: ContactChange.IMPACT,
     Context: lambda: context_of(None),
     Frame: lambda: arm("two_link").plant.GetFrameByName("tool"),
     Frames: lambda: arm("two_link").model.links,
@@ -245,6 +247,9 @@ PLACES: dict[str, Callable[[], Any]] = {
     "name of DaePlant.set_parameter": lambda: "link1.mass",
     "name of RobotPlant.get_parameter": lambda: "link1.mass",
     "name of RobotPlant.set_parameter": lambda: "link1.mass",
+    "name of UnilateralRobotPlant.get_parameter": lambda: "link1.mass",
+    "name of UnilateralRobotPlant.set_parameter": lambda: "link1.mass",
+    "contacts of UnilateralRobotPlant": lambda: {"wall": 0.5},
     "name of StateRealization.get_parameter": lambda: "link1.mass",
     "name of StateRealization.set_parameter": lambda: "link1.mass",
     "name of TrackingController.get_parameter": lambda: "link1.mass",

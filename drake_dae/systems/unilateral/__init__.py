@@ -1,0 +1,1 @@
+"""Robots whose contacts open and close: modes, guards, resets, and the plant that runs them."""

@@ -1,0 +1,190 @@
+"""The contacts of a robot that open and close, and their numbers at a state."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray, number, unknown_name
+from drake_dae.dae.layout import Indices
+from drake_dae.dae.signals import Parameter
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.unilateral.impacts import Touch
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """What decides of contacts at one state, for all constraints, shape (m,) each.
+
+    Attributes:
+        rates: The rates c of the constraints: phi', or what restricts velocities alone.
+        accelerations: c' without constraint forces.
+        force_matrix: How constraint forces enter c', shape (m, m).
+        impulse_matrix: How impulses enter c, shape (m, m); the same without friction.
+        velocity_change: How impulses enter x, shape (n, m).
+    """
+
+    rates: FloatArray
+    accelerations: FloatArray
+    force_matrix: FloatArray
+    impulse_matrix: FloatArray
+    velocity_change: FloatArray
+
+
+class UnilateralContacts:
+    """Those constraints of a robot that open and close.
+
+    Args:
+        model: The robot.
+        restitution: Name of a constraint -> its coefficient of restitution e, 0 to 1.
+
+    Attributes:
+        names: The names of the contacts, in the order of the model's constraints.
+        dae: The system with all contacts closed, and with the parameters "<contact>.restitution".
+        touches: The rows of each contact.
+        kept: The rows of all other constraints.
+        normals: The row of each contact that can only push.
+        state: A function of state and parameters: the gaps, and their rates.
+
+    Raises:
+        ModelError: There is no such constraint, or it is none that can only push.
+    """
+
+    def __init__(self, model: RobotModel, restitution: Mapping[str, float]) -> None:
+        parts = {c.name: (c, part) for c, part in ConstraintSet(model.constraints).parts()}
+        fitting = [
+            name
+            for name, (constraint, _) in parts.items()
+            if sum(constraint.can_only_push) == 1
+            and constraint.can_only_push.index(True) < constraint.residual(model.links).numel()
+        ]
+        if not restitution:
+            raise ModelError(
+                f"{model.name}: no contact that opens and closes is given; those that can are "
+                f"{fitting}. Where none shall, take a RobotPlant"
+            )
+        for name in restitution:
+            if name not in parts:
+                raise ModelError(f"{model.name}: {unknown_name('constraint', name, parts)}")
+            if name not in fitting:
+                raise ModelError(
+                    f"{model.name}: '{name}' cannot open, since it has no single force that can "
+                    f"only push; those that have are {fitting}"
+                )
+        if model.dae.sharing is not None:
+            raise ModelError(
+                f"{model.name}: redundant constraints share their forces, which contacts that open "
+                "and close cannot; leave `compliances` out"
+            )
+        self.names = tuple(name for name in parts if name in restitution)
+        self.touches = []
+        for name in self.names:
+            constraint, part = parts[name]
+            normal = part.start + constraint.can_only_push.index(True)
+            self.touches.append(Touch(normal, np.arange(part.start, part.stop)))
+        own = {int(row) for touch in self.touches for row in touch.rows}
+        self.kept: Indices = np.array(
+            [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
+        )
+        self.normals = [touch.normal for touch in self.touches]
+        self.dae = _with_restitution(model.dae, [(n, restitution[n]) for n in self.names])
+        self._restitution = [self.dae.parameter_slice(f"{n}.restitution") for n in self.names]
+        dae, links = self.dae, model.links
+        rate = ca.jtimes(dae.k, dae.state, dae.f) + dae.exogenous.rate(dae.k)
+        rows = [
+            dae.k[i] if ca.depends_on(dae.k[i], links.v) else rate[i]
+            for i in range(dae.num_constraints)
+        ]
+        self.rates = ca.vertcat(ca.SX(0, 1), *rows)
+        self.drift = dae.exogenous.rate(self.rates)
+        found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
+        self.state = dae.trace("gaps", found)
+        positions, velocities = links.q.numel(), links.v.numel()
+        self._moved = slice(positions, positions + velocities)
+        control = ca.SX.sym("u", dae.num_controls)
+        self._control = bool(dae.num_controls)
+        self._terms = dae.trace(
+            "contacts",
+            {
+                "rates": self.rates,
+                "slope": ca.jacobian(self.rates, dae.state),
+                "drift": self.drift,
+                "mass": dae.mass_matrix,
+                "free": dae.f + ca.mtimes(dae.h, control),
+                "force": dae.g,
+            },
+            {"control": control},
+            often=False,
+        )
+
+    def restitution(self, parameters: FloatArray) -> FloatArray:
+        """e of each contact, shape (k,)."""
+        return np.array([parameters[part.start] for part in self._restitution])
+
+    def terms(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> Terms:
+        """The numbers at a state; nan where a function has no value."""
+        values = self._terms.evaluate(state, control, parameters)
+        n = state.size
+        rates, slope, drift, mass, free, force = (value.copy() for value in values)
+        m = rates.size
+        slope, mass, force = slope.reshape(m, n), mass.reshape(n, n), force.reshape(n, m)
+        push = np.zeros((n, m))
+        push[self._moved] = slope[:, self._moved].T
+        try:
+            solved = np.asarray(np.linalg.solve(mass, np.column_stack([free, force, push])), float)
+        except np.linalg.LinAlgError:
+            solved = np.full((n, 1 + 2 * m), np.nan)
+        moved = slope @ solved
+        return Terms(
+            rates=rates,
+            accelerations=moved[:, 0] + drift,
+            force_matrix=moved[:, 1 : m + 1],
+            impulse_matrix=moved[:, m + 1 :],
+            velocity_change=solved[:, m + 1 :],
+        )
+
+
+def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
+    """The system in which some constraints hold and the others are not there.
+
+    Args:
+        contacts: The contacts.
+        rows: The constraints that hold.
+        state: A state near which it is examined, shape (n,).
+    """
+    dae, rows = contacts.dae, list(rows)
+    embed = ca.SX.eye(dae.num_constraints)[:, rows]
+    whole = dae.implicit
+
+    def implicit(rate: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        assert whole is not None
+        balance, constraint_rate = whole(rate, ca.mtimes(embed, force))
+        return balance, constraint_rate[rows]
+
+    return replace(
+        dae,
+        g=dae.g[:, rows],
+        k=dae.k[rows],
+        m=dae.m[:, rows],
+        constraint_input_signals=tuple(dae.constraint_input_signals[i] for i in rows),
+        constraint_output_signals=tuple(dae.constraint_output_signals[i] for i in rows),
+        implicit=None if whole is None or not rows else implicit,
+        nominal_state=state,
+    )
+
+
+def _with_restitution(dae: DaeSystem, given: Sequence[tuple[str, float]]) -> DaeSystem:
+    added = []
+    for name, value in given:
+        e = number(f"{dae.name}: the coefficient of restitution of '{name}'", value)
+        if not 0.0 <= e <= 1.0:
+            raise ModelError(
+                f"{dae.name}: the coefficient of restitution of '{name}' must be between 0, no "
+                f"bounce, and 1, no loss; got {e:g}"
+            )
+        added.append(Parameter(f"{name}.restitution", np.array([e]), nonnegative=True))
+    return replace(dae, parameters=(*dae.parameters, *added))
