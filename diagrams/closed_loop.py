@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.multibody.meshcat import ContactVisualizer
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, TriggerType
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    OutputPort,
+    System,
+    TriggerType,
+)
 from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
@@ -26,7 +33,7 @@ from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.references import ReferenceGenerator
+from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
 
@@ -199,7 +206,7 @@ def can_be_fed_back(
 def make_closed_loop(
     system: DaePlant | ContactPlant,
     law: TrackingLaw,
-    references: Sequence[Reference] | Mapping[str, Reference | float],
+    references: Sequence[Reference] | Mapping[str, Reference | float] | System,
     *,
     exogenous: Sequence[Reference] = (),
     sensor: ForceSensor | None = None,
@@ -216,7 +223,8 @@ def make_closed_loop(
             at its steps.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
-            -> reference, as `references_by_name` takes them.
+            -> reference, as `references_by_name` takes them; or a Drake System that gives R(t), as
+            a `SystemReference` with all degrees of the law takes it.
         exogenous: The exogenous signals of the plant, which its law knows too, as references that
             together cover all entries of w, in their order; without any nothing moves.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
@@ -244,6 +252,8 @@ def make_closed_loop(
             close an algebraic loop, or a sampled loop that diverges; or no law uses the sensor.
     """
     check_sizes(system, law, sensor)
+    if isinstance(references, System):
+        references = [SystemReference(references, law.degrees)]
     if isinstance(references, Mapping):
         names = [signal.name for signal in law.system.output_signals]
         references = references_by_name(references, names, law.degrees)

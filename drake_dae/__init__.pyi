@@ -103,6 +103,7 @@ from .systems.limits import ControlLimits as ControlLimits
 from .systems.plant import DaePlant as DaePlant
 from .systems.realization import StateRealization as StateRealization
 from .systems.references import ReferenceGenerator as ReferenceGenerator
+from .systems.references import SystemReference as SystemReference
 from .systems.references import TrajectoryReference as TrajectoryReference
 from .systems.robot_plant import RobotPlant as RobotPlant
 from .systems.sampling import ControlHold as ControlHold

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import BasicVector, Context, System
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
@@ -95,6 +95,76 @@ class TrajectoryReference(Reference):
                             f"{after - before:.3g} at t = {time:g} s, but the law needs a "
                             f"reference with {degree} derivatives; use a smoother trajectory"
                         )
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True, eq=False)
+class SystemReference(Reference):
+    """A reference that a Drake System computes from the time alone, with its derivatives.
+
+    The system has one output port: r_1, r_1', ..., r_1^(nu_1), r_2, ..., output-major. A LeafSystem
+    may have any function there; that a value is the derivative of the one before it is its duty.
+
+    Attributes:
+        system: The system; it has no inputs and no state.
+        degrees: How many derivatives nu_1, ..., nu_k it gives of each output.
+
+    Raises:
+        ReferenceSignalError: The system has inputs, a state or another output; or, when
+            `derivatives` is called, too few derivatives.
+    """
+
+    system: System
+    degrees: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "degrees", tuple(self.degrees))
+        system, size = self.system, Layout(self.degrees).reference_size
+        if not self.degrees or min(self.degrees) < 0:
+            raise ReferenceSignalError(
+                f"degrees must be one whole number from 0 for each output, got {self.degrees}"
+            )
+        name = system.get_name() or type(system).__name__
+        context = system.CreateDefaultContext()
+        if system.num_input_ports() or not context.is_stateless():
+            raise ReferenceSignalError(
+                f"'{name}' has inputs or a state, so that its output does not follow from the time "
+                "alone. Wire it yourself: make a RobotPlant and a TrackingController(law), and "
+                f"builder.Connect its output, of size {size}, to "
+                'controller.GetInputPort("reference")'
+            )
+        ports = [system.get_output_port(index) for index in range(system.num_output_ports())]
+        if [port.size() for port in ports] != [size]:
+            found = ", ".join(f"{port.get_name()} ({port.size()})" for port in ports) or "none"
+            raise ReferenceSignalError(
+                f"'{name}' must have one output port, of size {size}: each output with its "
+                f"{', '.join(map(str, self.degrees))} derivatives, as r_1, r_1', ..., r_2, ...; it "
+                f"has {found}"
+            )
+
+    @property
+    def size(self) -> int:
+        return len(self.degrees)
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        for row, (needed, given) in enumerate(zip(degrees, self.degrees, strict=True)):
+            if needed > given:
+                raise ReferenceSignalError(
+                    f"the law needs {needed} derivatives of row {row}, its system gives {given}"
+                )
+        context, port = self.system.CreateDefaultContext(), self.system.get_output_port()
+        table = Layout(self.degrees)
+        places = [
+            first + k
+            for first, degree in zip(table.lowest, degrees, strict=True)
+            for k in range(degree + 1)
+        ]
+
+        def evaluate(time: float) -> FloatArray:
+            context.SetTime(time)
+            return np.asarray(port.Eval(context))[places]
+
+        return evaluate
 
 
 @checked(ReferenceSignalError)

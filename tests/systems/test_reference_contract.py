@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from members import subclasses
+from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import (
@@ -22,6 +23,7 @@ from drake_dae import (
     ReferenceRows,
     SinusoidReference,
     SpiralReference,
+    SystemReference,
     TextReference,
     TrajectoryReference,
 )
@@ -33,6 +35,20 @@ PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
 
 LIMITS = PathLimits(1.0, 2.0, 20.0)
 EDGES = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]
+
+
+class Swing(LeafSystem):
+    """sin(2 t) and t^2, with two and with two derivatives."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort("reference", 6, self._calc, {self.time_ticket()})
+
+    def _calc(self, context, output):
+        t = context.get_time()
+        sine = [np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)]
+        output.SetFromVector([*sine, t**2, 2 * t, 2.0])
+
 
 MEMBERS = {
     "constant": ConstantReference([0.3, -2.0]),
@@ -47,6 +63,7 @@ MEMBERS = {
     "polyline": PolylineReference(EDGES, LIMITS, 0.2),
     "text": TextReference("L", [0.0, 0.0], 1.0, LIMITS, press=[2.0, 1.0], corner=0.3),
     "file": CsvReference(str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3),
+    "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
 }
@@ -54,6 +71,7 @@ MEMBERS = {
 TIMES = (0.41, 0.93, 1.62)
 
 ROUGH = {
+    "system": SystemReference(Swing(), [2, 2]),
     "line": LineReference(0.0, 1.0, LIMITS, order=2),
     "polyline": PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),
@@ -118,9 +136,10 @@ def test_rule_4_a_value_depends_on_the_time_alone(reference):
 
 @pytest.mark.parametrize("name", ROUGH)
 def test_rule_5_what_is_too_rough_is_refused_before_it_is_used(name):
-    ROUGH[name].derivatives([0])
+    size = ROUGH[name].size
+    ROUGH[name].derivatives([0] * size)
     with pytest.raises(ReferenceSignalError, match="needs"):
-        ROUGH[name].derivatives([3])
+        ROUGH[name].derivatives([3] * size)
 
 
 def test_rule_6_traced_together_the_values_are_the_same(reference):

@@ -5,7 +5,9 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
+from pydrake.common import RandomDistribution
 from pydrake.math import BsplineBasis
+from pydrake.systems.primitives import ConstantVectorSource, Integrator, RandomSource
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
 
 from drake_dae import (
@@ -14,6 +16,7 @@ from drake_dae import (
     PointToPointReference,
     ReferenceGenerator,
     SinusoidReference,
+    SystemReference,
     TrajectoryReference,
 )
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
@@ -102,6 +105,29 @@ def test_drake_trajectories():
             np.testing.assert_allclose(
                 found[:, order], path.EvalDerivative(time, order)[:, 0], rtol=1e-12
             )
+
+
+@pytest.mark.parametrize("symbol", [ca.SX, ca.MX])
+def test_functions_of_casadi(symbol):
+    time = symbol.sym("t")
+    function = ca.Function("f", [time], [ca.sin(time), time**3])
+    signal = ExpressionReference(function)
+    expected = [[np.sin(0.7), np.cos(0.7), -np.sin(0.7)], [0.343, 1.47, 4.2]]
+    np.testing.assert_allclose(table(signal, 2, 0.7), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("system", "degrees", "message"),
+    [
+        (Integrator(1), [0], r"'Integrator' has inputs or a state, .* controller\.GetInputPort"),
+        (ConstantVectorSource([1.0, 2.0]), [2], r"of size 3: .*; it has y0 \(2\)"),
+        (ConstantVectorSource([1.0]), [], r"degrees must be one whole number .*, got \(\)"),
+        (RandomSource(RandomDistribution.kGaussian, 1, 0.1), [0], "has inputs or a state"),
+    ],
+)
+def test_systems_that_are_no_references(system, degrees, message):
+    with pytest.raises(ReferenceSignalError, match=message):
+        SystemReference(system, degrees)
 
 
 def test_trajectories_and_expressions_stack():
