@@ -155,6 +155,9 @@ def _write(run: _Run) -> bool:
         predicted = loop.predicted_error(record)
         limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
         text = summary(record, predicted, limits, run.statistics, run.failure)
+        if isinstance(loop.plant, RobotBlock):
+            remarks = [one.remark for one in loop.plant.model.constraints if one.remark]
+            text = "\n".join([text, *remarks])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)

@@ -192,6 +192,11 @@ class Constraint(ABC):
         """What it has along its one coordinate; None if it is no joint."""
         return None
 
+    @property
+    def remark(self) -> str:
+        """What of what it touches is approximate, and how much; empty if nothing is."""
+        return ""
+
     def placement(self, values: FloatArray) -> RigidTransform:
         """Where what the robot touches stands in the world.
 
