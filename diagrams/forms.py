@@ -7,6 +7,7 @@ that is no data is `written` as another one; a member of a family is chosen by a
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
+from pathlib import Path
 from sys import float_info
 from types import UnionType
 from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -57,11 +58,11 @@ class Form:
         entries = {
             name: core_schema.typed_dict_field(
                 handler.generate_schema(
-                    Annotated[self._type_in_data(hint), _Explained(texts.get(name, ""))]
+                    Annotated[self._type_in_data(hint), _Explained(texts.get(name, ""), default)]
                 ),
-                required=required and name not in self.defaults,
+                required=default is MISSING,
             )
-            for name, hint, required in _fields_of(source)
+            for name, hint, default in self._fields(source)
         }
         names, tag = list(entries), {TAG: self.tag} if self.tag else {}
         if tag:
@@ -87,6 +88,10 @@ class Form:
             serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=data),
         )
 
+    def _fields(self, source: type[Any]) -> Iterator[tuple[str, Any, Any]]:
+        for name, hint, default in _fields_of(source):
+            yield name, hint, self.defaults.get(name, default)
+
     def _type_in_data(self, hint: Any) -> Any:
         """What stands in data for a field with an annotation."""
         if is_dataclass(hint):
@@ -101,28 +106,39 @@ class Form:
 
 @dataclass(frozen=True)
 class _Explained:
-    """Puts what a field means before what the JSON Schema says of its type."""
+    """Puts what a field means before what the JSON Schema says of its type, and its default."""
 
     text: str
+    default: Any
 
     def __get_pydantic_json_schema__(
         self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
     ) -> dict[str, Any]:
         schema = dict(handler(source))
         told = "\n\n".join(filter(None, (self.text, schema.get("description"))))
-        return {**schema, "description": told} if told else schema
+        schema.update({"description": told} if told else {})
+        schema.update({"default": self.default} if _is_plain(self.default) else {})
+        return schema
 
 
-def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, bool]]:
-    """The name and the annotation of each field, and whether it has no default."""
+def _is_plain(value: Any) -> bool:
+    """Whether a default is plain data; an object has defaults of its own."""
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_plain, value))
+    return value is None or value == {} or isinstance(value, (bool, int, float, str))
+
+
+def _fields_of(source: type[Any]) -> Iterator[tuple[str, Any, Any]]:
+    """The name, the annotation and the default of each field, `MISSING` where it has none."""
     if not is_dataclass(source):
-        yield from ((item.name, item.type, False) for item in source.__fields__)
+        made: Any = source()
+        yield from ((item.name, item.type, getattr(made, item.name)) for item in made.__fields__)
         return
     hints = get_type_hints(source, include_extras=True)
     for item in fields(source):
         if item.init:
-            required = item.default is MISSING and item.default_factory is MISSING
-            yield item.name, hints[item.name], required
+            factory = item.default_factory
+            yield item.name, hints[item.name], item.default if factory is MISSING else factory()
 
 
 def _members(hint: Any) -> set[Any]:
@@ -200,8 +216,30 @@ Numbers = Annotated[
 ]
 """A number, a list of numbers, or a matrix row by row."""
 
+
+def _file(value: Any, info: pydantic.ValidationInfo) -> Path:
+    """A file, where a relative path starts in the folder that the reader was given."""
+    if not isinstance(value, (str, Path)) or not str(value):
+        raise ValueError(f"expected the name of a file, got {_show(value)}")
+    try:
+        return (info.context or Path()) / value
+    except ValueError:  # A null byte.
+        raise ValueError(f"expected the name of a file, got {_show(value)}") from None
+
+
+FileName = Annotated[
+    Any,
+    pydantic.PlainValidator(_file),
+    pydantic.PlainSerializer(str),
+    pydantic.WithJsonSchema({"type": "string"}),
+]
+"""The name of a file."""
+
 Row = Annotated[tuple[float, ...], pydantic.Strict(False)]
 """A list of numbers."""
+
+Pair = Annotated[Row, pydantic.Field(min_length=2, max_length=2)]
+"""Two numbers."""
 
 Triple = Annotated[Row, pydantic.Field(min_length=3, max_length=3)]
 """Three numbers."""
@@ -216,14 +254,18 @@ class Reader(Generic[T]):
         #: Dotted keys of the dictionaries with any names.
         self.free_names = set(_free_names(self.schema, ""))
 
-    def read(self, data: Any) -> T:
+    def read(self, data: Any, folder: Path | None = None) -> T:
         """The dataclass that plain data describe.
+
+        Args:
+            data: The plain data.
+            folder: Where relative names of files start; None for the working directory.
 
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all of them are told.
         """
         try:
-            return self._adapter.validate_python(data)
+            return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:
             # Each member of a Union says the same.
             problems = dict.fromkeys(self._problem(details, data) for details in error.errors())

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+from casadi import SX
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
@@ -20,11 +21,11 @@ from drake_dae.arrays import listed
 from drake_dae.dae import references
 from drake_dae.diagrams import contact_material
 from drake_dae.diagrams import scenario_parts as parts
-from drake_dae.diagrams.forms import Choice, Form, Numbers, Reader, Row, Triple
+from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
-from drake_dae.robots.contact import surface, surfaces
+from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
 from drake_dae.systems import sampling
 from drake_dae.trace.compiled import Compiled
@@ -36,11 +37,18 @@ T = TypeVar("T")
 # file as `_WRITTEN` tells; numbers, text, truth values, Literals, dataclasses, tuples, and lists
 # and dictionaries of these stand for themselves.
 
-_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers}
+_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, maps.Pair: Pair}
 
 Surface = Annotated[
-    surfaces.Plane | surfaces.Sphere | surfaces.Cylinder | surfaces.Ellipsoid | surfaces.Torus,
-    Choice(_WRITTEN),
+    surfaces.Plane
+    | surfaces.Sphere
+    | surfaces.Cylinder
+    | surfaces.Ellipsoid
+    | surfaces.Torus
+    | surfaces.ImplicitSurface
+    | maps.HeightMap
+    | maps.MeshSurface,
+    Choice({**_WRITTEN, Callable[..., SX] | str: str}),
 ]
 Constraint = Annotated[
     contact.PointOnSurface
@@ -245,13 +253,17 @@ def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return varied
 
 
-def read_scenario(data: Mapping[str, Any]) -> Scenario:
-    """The scenario that plain data describe, its paths as they are.
+def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
+    """The scenario that plain data describe, the paths of its robot as they are.
+
+    Args:
+        data: Plain data.
+        folder: Where the names of other files start; None for the working directory.
 
     Raises:
         ScenarioError: Keys are unknown or missing, or values cannot be used; all are told at once.
     """
-    return _reader().read(data)
+    return _reader().read(data, folder)
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -281,7 +293,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
     for setting in settings:
         set_entry(data, setting, _reader().free_names)
-    scenario = _reader().read(data)
+    scenario = _reader().read(data, path.absolute().parent)
     # Absolute, so that the scenario as run means the same wherever it is written.
     robot = scenario.robot
     file = robot.file

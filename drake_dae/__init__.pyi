@@ -64,6 +64,8 @@ from .robots.contact.alignment import AxisNormalToSurface as AxisNormalToSurface
 from .robots.contact.couplers import JointCoupler as JointCoupler
 from .robots.contact.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
 from .robots.contact.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
+from .robots.contact.maps import HeightMap as HeightMap
+from .robots.contact.maps import MeshSurface as MeshSurface
 from .robots.contact.points import CoincidentPoints as CoincidentPoints
 from .robots.contact.points import FixedDistance as FixedDistance
 from .robots.contact.points import PointOnSurface as PointOnSurface

@@ -8,11 +8,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from drake_dae.diagrams.scenario import read_scenario, scenario_data, scenario_schema
+from drake_dae.diagrams.scenario import scenario_schema
 from drake_dae.diagrams.typed_yaml import TAG, load_yaml
 
 NOTHING = object()
 """The default of a key that must be given."""
+
+OWN = object()
+"""The default of a key that has a form with defaults of its own."""
 
 EXAMPLES = Path(__file__).parent / "examples.yaml"
 
@@ -35,7 +38,8 @@ class Key:
         text: What it means.
         takes: Which values it takes, in words.
         unit: The unit of its numbers; empty for none.
-        default: Its value where it is left out, as plain data; `NOTHING` if it must be given.
+        default: Its value where it is left out, as plain data, `OWN`, or `NOTHING` if it must be
+            given.
         is_number: Whether it takes numbers.
     """
 
@@ -108,18 +112,14 @@ def _entries(
     given = tuple({**tag, **example} for example in (given if isinstance(given, list) else [given]))
     shown = {name: value for example in reversed(given) for name, value in example.items()}
     required = [name for name in schema.get("required", ()) if name != TAG]
-    least = {**tag, **{name: shown.get(name) for name in required}}
-    whole = _with(data, path, least)
-    written: Any = scenario_data(read_scenario(whole))
-    for part in path:
-        written = written[part]
+    around = {**tag, **{name: shown.get(name) for name in required}}
     keys = tuple(
         Key(
             name,
             inner.get("description", ""),
             _takes(inner),
             unit_of(inner.get("description", "")) if _is_number(inner) else "",
-            NOTHING if name in required else written[name],
+            NOTHING if name in required else inner.get("default", OWN),
             _is_number(inner),
         )
         for name, inner in properties.items()
@@ -129,7 +129,7 @@ def _entries(
     yield Entry(title, where, schema["description"], keys, given, data, path)
     for name, inner in properties.items():
         if name != TAG:
-            inside = _with(whole, (*path, name), None)
+            inside = _with(data, path, {**around, name: None})
             yield from _entries(inner, inside, (*path, name), examples, seen)
 
 

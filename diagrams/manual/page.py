@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from drake_dae.diagrams.manual.entries import NOTHING, Entry, Key, entries
+from drake_dae.diagrams.manual.entries import NOTHING, OWN, Entry, Key, entries
 from drake_dae.diagrams.manual.schema import custom_tags
 from drake_dae.diagrams.typed_yaml import dump_yaml
 
@@ -53,8 +53,11 @@ def _row(key: Key) -> str:
 def _default(value: Any) -> str:
     if value is NOTHING:
         return "must be given"
+    if value is OWN:
+        return "all of its defaults"
     if value is None or value == "":
         return "nothing"
+    value = list(value) if isinstance(value, tuple) else value
     text = dump_yaml(value, on_one_line=True).removesuffix("...\n")
     return f"`{text.strip()}`"
 

@@ -187,6 +187,9 @@ def _write(run: _Run) -> bool:
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, record)
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
+        if isinstance(loop.plant, RobotBlock):
+            remarks = [one.remark for one in loop.plant.model.constraints if one.remark]
+            text = "\n".join([text, *remarks])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)

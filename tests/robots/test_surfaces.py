@@ -1,13 +1,20 @@
 """The rules of `Surface` on every member, and distances against brute force."""
 
+import atexit
+import shutil
+import tempfile
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
 from members import Saddle, subclasses
+from meshes import obj_of_grid
 from pydrake import geometry
 
 from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
+from drake_dae.robots.contact.maps import HeightMap, MeshSurface
 from drake_dae.robots.contact.surface import Surface, tangents
 from drake_dae.robots.contact.surfaces import (
     Cylinder,
@@ -18,6 +25,12 @@ from drake_dae.robots.contact.surfaces import (
     Torus,
 )
 from drake_dae.trace.functions import TracedFunction
+
+FOLDER = Path(tempfile.mkdtemp(prefix="drake_dae_surfaces_"))
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
+WAVES = 0.1 * np.sin(np.linspace(-4.0, 4.0, 41)) * np.cos(np.linspace(-2.0, 2.0, 31))[:, None]
+SIDE = np.linspace(-0.6, 0.6, 49)
+BELL = 0.3 * np.exp(-2.0 * (SIDE**2 + SIDE[:, None] ** 2))
 
 SURFACES = {
     "plane": Plane((0.3, -0.2, 0.5), (1.0, -2.0, 0.5)),
@@ -31,6 +44,15 @@ SURFACES = {
         lambda p: 7.0 * (p[2] - 0.3 * ca.sin(2.0 * p[0]) - 0.2 * p[1] ** 2), (0.5, 0.0, 0.1)
     ),
     "saddle": Saddle((0.3, 0.1, -0.2), 0.6),
+    "formula": ImplicitSurface("a*cos(3*x) + exp(y/l) - z", (0.5, 0.0, 0.1), {"a": 0.2, "l": 2.0}),
+    "height map": HeightMap((2.4, 2.0), WAVES, point=(0.1, 0.2, 0.3), normal=(0.1, -1.0, 0.3)),
+    "mesh": MeshSurface(
+        obj_of_grid(FOLDER / "bell.obj", SIDE, SIDE, BELL),
+        point=(0.1, 0.2, 0.3),
+        normal=(0.0, 0.2, 1.0),
+        middle=(0.0, 0.0),
+        size=(1.0, 1.0),
+    ),
 }
 
 

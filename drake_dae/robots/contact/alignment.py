@@ -9,7 +9,13 @@ from drake_dae.arguments import checked
 from drake_dae.dae.signals import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint
-from drake_dae.robots.contact.surface import Surface, Vector, axes_along, unit_vector
+from drake_dae.robots.contact.surface import (
+    Surface,
+    Vector,
+    axes_along,
+    unit_vector,
+    with_parameters,
+)
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 
 
@@ -50,7 +56,9 @@ class AxisNormalToSurface(Constraint):
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", unit_vector("axis", self.axis))
         position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
-        object.__setattr__(self, "parameters", (position,))
+        surface, shape = with_parameters(self.name, self.surface)
+        object.__setattr__(self, "surface", surface)
+        object.__setattr__(self, "parameters", (position, *shape))
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:

@@ -216,6 +216,11 @@ class Constraint(ABC):
         """Where it touches what has a free side; None if there is no such side."""
         return None
 
+    @property
+    def remark(self) -> str:
+        """What of what it touches is approximate, and how much; empty if nothing is."""
+        return ""
+
     def placement(self, values: FloatArray) -> RigidTransform:
         """Where what the robot touches stands in the world.
 

@@ -14,7 +14,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.contact.constraint import Application, Constraint, Touch
 from drake_dae.robots.contact.friction import Friction, friction_parameters
 from drake_dae.robots.contact.picture import Picture
-from drake_dae.robots.contact.surface import Surface, Vector, rotation_of
+from drake_dae.robots.contact.surface import Surface, Vector, rotation_of, with_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
@@ -26,7 +26,8 @@ class PointOnSurface(Constraint):
     The constraint force is the normal force of the surface on the robot in N; positive pushes the
     robot to the free side, and a unilateral contact can only push. The parameter "<name>.position"
     is where the surface stands, and "<name>.rpy" how it is turned about that place; where they are
-    exogenous (see `RobotModel`), the surface moves.
+    exogenous (see `RobotModel`), the surface moves. Numbers of the surface's `shape` are parameters
+    "<name>.<number>".
 
     With friction the surface also pulls the point back as it slides, by the velocity v_t in m/s
     relative to the surface, which may move:
@@ -81,7 +82,9 @@ class PointOnSurface(Constraint):
         rubbing = friction_parameters(
             self.name, self.friction, self.stiction_tolerance, self.viscous_friction
         )
-        object.__setattr__(self, "parameters", (position, *turns, *rubbing))
+        surface, shape = with_parameters(self.name, self.surface)
+        object.__setattr__(self, "surface", surface)
+        object.__setattr__(self, "parameters", (position, *turns, *rubbing, *shape))
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -169,13 +172,18 @@ class PointOnSurface(Constraint):
         point = kinematics.position(self.frame, self.point)
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
 
+    @property
+    def remark(self) -> str:
+        return f"{self.name}: {self.surface.remark}" if self.surface.remark else ""
+
     def placement(self, values: FloatArray) -> RigidTransform:
         turn = np.zeros(3) if self.rpy is None else values[3:6]
         return RigidTransform(RollPitchYaw(turn), values[:3])
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
         stands = self.placement(values)
-        picture = self.surface.picture(stands.inverse() @ point, size)
+        surface = self.surface.shaped(ca.SX(values[len(values) - len(self.surface.shape) :]))
+        picture = surface.picture(stands.inverse() @ point, size)
         return None if picture is None else picture.moved(stands)
 
     def solid(self, values: FloatArray) -> Picture | None:

@@ -2,7 +2,8 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -11,7 +12,7 @@ from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.picture import Picture, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
@@ -41,8 +42,11 @@ class Surface(ABC):
        long there. Balls roll on such surfaces alone.
     5. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
        with a shape of its own gives that.
-    6. `solid` is what fills the side that is not free, as a shape of Drake, for its own contact. A
+    6. `shape` are numbers of its form that a study may change, by names; most surfaces have none.
+       `shaped` is the same surface with others, numbers or symbols.
+    7. `solid` is what fills the side that is not free, as a shape of Drake, for its own contact. A
        surface may have none.
+    8. `remark` says what of it is approximate, if anything is.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
@@ -71,6 +75,20 @@ class Surface(ABC):
             f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "
             "expression"
         )
+
+    @property
+    def shape(self) -> Mapping[str, float]:
+        """The numbers of its form that may vary: name -> default."""
+        return {}
+
+    def shaped(self, values: ca.SX) -> Self:
+        """The same surface with other numbers of `shape`, numbers or symbols, shape (k, 1)."""
+        return self
+
+    @property
+    def remark(self) -> str:
+        """What of it is approximate, and how much; empty if nothing is."""
+        return ""
 
     def unit_normal(self, offset: ca.SX) -> ca.SX:
         """The gradient of the distance at such a point, shape (3, 1): one long on the surface."""
@@ -135,6 +153,21 @@ class Surface(ABC):
         first, second = tangents(normal / np.linalg.norm(normal))
         steps = size * np.linspace(-0.5, 0.5, CELLS + 1)
         return np.array([[foot(middle + a * first + b * second) for b in steps] for a in steps])
+
+
+def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Parameter, ...]]:
+    """A surface whose numbers of shape are symbols, and these as parameters "<name>.<number>".
+
+    Args:
+        name: The name of the constraint that has the parameters.
+        surface: The surface.
+    """
+    made = tuple(
+        Parameter(f"{name}.{key}", np.array([value])) for key, value in surface.shape.items()
+    )
+    if not made:
+        return surface, ()
+    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in made))), made
 
 
 def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:

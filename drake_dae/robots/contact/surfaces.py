@@ -1,8 +1,10 @@
 """The surfaces: planes, spheres, cylinders, ellipsoids, tori, and any F(p) = 0."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -24,6 +26,18 @@ from drake_dae.robots.contact.surface import (
     triple,
     unit_vector,
 )
+from drake_dae.trace.formula import check_names, parse_formula
+
+_TAKEN = (
+    "position",
+    "rpy",
+    "force",
+    "distance",
+    "friction",
+    "stiction_tolerance",
+    "viscous_friction",
+)
+"""What constraints call parameters and signals of their own."""
 
 
 @checked(ModelError)
@@ -260,29 +274,65 @@ class ImplicitSurface(Surface):
     The gradient has length one on the surface itself.
 
     Attributes:
-        function: F of a CasADi column p of shape (3, 1), relative to `point`; positive on the
-            free side, of any scale, with a gradient that does not vanish on the surface.
+        function: F relative to `point` in the world's axes, positive on the free side, of any
+            scale, with a gradient that does not vanish on the surface. A formula of x, y, z in m,
+            pi and the parameters, as "z - a*sin(x)**2" (see `parse_formula`); or a function of a
+            CasADi column p of shape (3, 1), and of a namespace of the parameters if there are any.
         point: Where the origin of p stands in the world, m, shape (3,).
+        parameters: Name -> number in F, in the unit that F takes it in. A constraint has them as
+            its parameters "<constraint>.<name>".
+
+    Raises:
+        ModelError: The formula cannot be read; the message tells where.
     """
 
-    function: Callable[[ca.SX], ca.SX]
+    function: Callable[..., ca.SX] | str
     point: Vector = (0.0, 0.0, 0.0)
+    parameters: Mapping[str, float] = field(default_factory=dict, hash=False)
+    _shape: ca.SX = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "point", triple("point", self.point))
+        object.__setattr__(self, "parameters", dict(self.parameters))
+        object.__setattr__(self, "_shape", ca.SX(ca.DM(list(self.parameters.values()))))
+        check_names(self.parameters, (*"xyz", *_TAKEN))
+        if isinstance(self.function, str):
+            value = self._function(ca.SX.sym("p", 3))
+            if value.is_constant():
+                raise ModelError(f"formula '{self.function}' has none of x, y and z: no surface")
 
     @property
     def position(self) -> Vector:
         return self.point
 
+    @property
+    def shape(self) -> Mapping[str, float]:
+        return self.parameters
+
+    def shaped(self, values: ca.SX) -> Self:
+        changed = copy(self)
+        object.__setattr__(changed, "_shape", values)
+        return changed
+
     def distance(self, offset: ca.SX) -> ca.SX:
-        return _normalized(self.function, offset)
+        return _normalized(self._function, offset)
+
+    def _function(self, p: ca.SX) -> ca.SX:
+        """F at a point."""
+        names = dict(zip(self.parameters, ca.vertsplit(self._shape), strict=True))
+        if isinstance(self.function, str):
+            return parse_formula(
+                self.function, {**dict(zip("xyz", ca.vertsplit(p), strict=True)), **names}
+            )
+        if not names:
+            return result_of("function", self.function, p)
+        return result_of("function", self.function, p, SimpleNamespace(**names))
 
 
 def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
     """F / |grad F| at a point."""
     p = ca.SX.sym("p", 3)
-    value = as_expression("an ImplicitSurface", "its function", result_of("function", function, p))
+    value = as_expression("an ImplicitSurface", "its function", function(p))
     if value.shape != (1, 1):
         raise ModelError(f"a surface function returns one number, this one has {value.shape}")
     quotient = value / ca.norm_2(ca.gradient(value, p))

@@ -1,0 +1,151 @@
+"""Heights over a plane as a smooth function: fitted to a grid of data, written in SX."""
+
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_dae.arrays import FloatArray
+
+CELLS = 16
+"""How many bells stand along the longer side, unless asked otherwise."""
+
+_BEYOND = 3
+"""How many bells stand beyond each edge, so that the edge is fitted as well as the middle."""
+
+_LEAST = np.logspace(-8, -2, 7)
+"""Singular values below this, relative to the largest, are those of heights that no data show. The
+rougher the data, the more are: the least is taken by which the surface stays calm beyond its edges.
+"""
+
+_CALM = 1.5
+"""How far off the plane it may be there, relative to the range of the heights over the plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Bells:
+    """Bell curves g_j(x) = exp(-(x - x_j)^2 / 2 d^2) whose distance d is their width.
+
+    At this width they span all polynomials to 1e-8 of their size, and are still far from being
+    alike: the fit is well conditioned.
+
+    Attributes:
+        places: x_j in m, shape (k,).
+        width: d in m.
+    """
+
+    places: NDArray[np.floating[Any]]
+    width: float
+
+    @classmethod
+    def between(cls, low: float, high: float, distance: float) -> "_Bells":
+        """Bells over an interval, no further apart than a distance."""
+        count = max(ceil((high - low) / distance - 1e-9), 1)
+        width = float((high - low) / count)
+        return cls(low + width * np.arange(-_BEYOND, count + _BEYOND + 1), width)
+
+    @property
+    def around(self) -> FloatArray:
+        """Places from well before the first bell to well behind the last, m, shape (l,)."""
+        return np.linspace(
+            self.places[0] - 3 * self.width, self.places[-1] + 3 * self.width, 3 * self.places.size
+        )
+
+    def at(self, values: FloatArray) -> FloatArray:
+        """All bells at some places, shape (values, bells)."""
+        return np.exp(-(((values[:, None] - self.places) / self.width) ** 2) / 2)
+
+    def of(self, value: ca.SX) -> ca.SX:
+        """All bells of an expression, and their derivatives, shape (k, 2)."""
+        off = (value - ca.DM(self.places)) / self.width
+        bells = ca.exp(-(off**2) / 2)
+        return ca.horzcat(bells, -off / self.width * bells)
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """Heights over a rectangle, with derivatives of all orders:
+
+        h(x, y) = c_0 + c_1 x + c_2 y + sum_r a_r(x) b_r(y),
+
+    a plane, and sums a_r and b_r of bell curves along x and y. SX has no branches, which a spline
+    needs to find its cell; bells reach the same accuracy without any. Beyond the rectangle h goes
+    over to the plane, off it by no more than 1.5 times the range of the heights.
+
+    Attributes:
+        x: The sides of the rectangle along x, m, shape (2,).
+        y: The same along y.
+        plane: c_0 in m, c_1, c_2.
+        bells: Those along x and along y.
+        factors: The factors of the bells in a_r, shape (kx, r), and b_r, shape (ky, r).
+        largest: The largest distance of a height in the data from h, m.
+        rms: The root of the mean of its square, m.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    plane: FloatArray
+    bells: tuple[_Bells, _Bells]
+    factors: tuple[FloatArray, FloatArray]
+    largest: float
+    rms: float
+
+    def height(self, x: ca.SX, y: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """h at a place, dh/dx and dh/dy."""
+        (along, across), (factors_a, factors_b) = self.bells, self.factors
+        a, da = ca.horzsplit(ca.mtimes(ca.DM(factors_a.T), along.of(x)))
+        b, db = ca.horzsplit(ca.mtimes(ca.DM(factors_b.T), across.of(y)))
+        base, slope_x, slope_y = (float(c) for c in self.plane)
+        height = base + slope_x * x + slope_y * y + ca.dot(a, b)
+        return height, slope_x + ca.dot(da, b), slope_y + ca.dot(a, db)
+
+    def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """h on a grid, shape (len(y), len(x))."""
+        (along, across), (a, b) = self.bells, self.factors
+        flat = self.plane[0] + self.plane[1] * x + self.plane[2] * y[:, None]
+        return flat + (across.at(y) @ b) @ (along.at(x) @ a).T
+
+
+def fit_relief(x: FloatArray, y: FloatArray, heights: FloatArray, resolution: float) -> Relief:
+    """The relief closest to a grid of heights, by least squares.
+
+    Args:
+        x: Where the columns are, m, shape (c,), increasing.
+        y: Where the rows are, m, shape (r,), increasing.
+        heights: Heights in m, shape (r, c), finite.
+        resolution: How far apart the bells stand at most, m: what is finer is smoothed away.
+    """
+    flat = np.stack([np.ones_like(heights), 0 * heights + x, 0 * heights + y[:, None]], axis=-1)
+    plane = np.linalg.lstsq(flat.reshape(-1, 3), heights.ravel())[0].astype(float)
+    rest = heights - flat @ plane
+    along, across = (_Bells.between(side[0], side[-1], resolution) for side in (x, y))
+    at_x, at_y = along.at(x), across.at(y)
+    beyond_x, beyond_y = along.at(along.around), across.at(across.around)
+    for least in _LEAST:
+        to_x, to_y = (np.linalg.pinv(bells, rcond=least) for bells in (at_x, at_y))
+        factors = to_y @ rest @ to_x.T
+        if np.max(np.abs(beyond_y @ factors @ beyond_x.T)) <= _CALM * np.ptp(rest):
+            break
+    left, sizes, right = np.linalg.svd(factors, full_matrices=False)
+    a, b = right.T, left * sizes
+    terms_a, terms_b = at_x @ a, at_y @ b
+
+    # A few terms often do: a wave along one axis takes one. What the others add is less than how
+    # far the data are from the fit, or less than a double tells.
+    rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
+    negligible = max(0.1 * rms, 1e-10 * float(np.ptp(rest)))
+    added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
+    count = int(np.sum(np.cumsum(added[::-1])[::-1] > negligible))
+    error = rest - terms_b[:, :count] @ terms_a[:, :count].T
+    return Relief(
+        x[[0, -1]],
+        y[[0, -1]],
+        plane,
+        (along, across),
+        (a[:, :count], b[:, :count]),
+        float(np.max(np.abs(error))),
+        float(np.sqrt(np.mean(error**2))),
+    )

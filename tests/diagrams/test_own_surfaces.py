@@ -1,0 +1,134 @@
+"""Surfaces of a user's own in scenarios: formulas, height maps and meshes, held as predicted."""
+
+import json
+
+import numpy as np
+import pytest
+from meshes import obj_of_grid
+from runs import run_scenario, scenario
+
+from drake_dae import load_scenario
+from drake_dae.cli import main
+from drake_dae.diagrams.scenario import save_scenario
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.errors import ScenarioError
+from drake_dae.trace.functions import TracedFunction
+
+SHORT = ["duration=0.3", "integrator.max_step_size=0.005", "integrator.use_error_control=false"]
+CYLINDER = "constraints.0.surface=!Cylinder {point: [1.7, 0, 0.3], axis: [0, 1, 0], radius: 0.5}"
+FORMULA = (
+    "constraints.0.surface=!ImplicitSurface {function: sqrt(x**2 + z**2) - r, "
+    "parameters: {r: 0.5}, point: [1.7, 0, 0.3]}"
+)
+
+
+PLACE = "size: [0.8, 0.8], point: [1.2, 0, 0.3], normal: [-1, 0, 0]"
+
+
+def bump(folder):
+    """Writes a table of a bump of 3 cm."""
+    y, z = np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 41)
+    heights = 0.03 * np.exp(-8.0 * z**2)[:, None] + 0.0 * y
+    np.savetxt(folder / "bump.csv", heights, delimiter=",")
+
+
+def test_a_formula_runs_as_the_built_in_surface():
+    """The same numbers up to round-off, which error feedback does not let grow."""
+    records = [
+        run_scenario(scenario("two_link_wall", one, *SHORT))[2] for one in (CYLINDER, FORMULA)
+    ]
+    for name in ("state", "control", "constraint_force", "tracking_error"):
+        np.testing.assert_allclose(records[0][name], records[1][name], rtol=1e-9, atol=1e-9)
+
+
+def test_the_number_of_a_formula_is_one_of_the_model():
+    """It may move: the law knows its derivatives, and the tool is where the cylinder has grown."""
+    model = scenario_model(scenario("two_link_wall", FORMULA))
+    assert "wall.r" in [parameter.name for parameter in model.dae.parameters]
+    moving = "exogenous.wall.r=[!Sinusoids {offset: 0.5, amplitudes: [0.02], frequencies: [3]}]"
+    loop, _, record = run_scenario(scenario("two_link_wall", FORMULA, moving, *SHORT))
+    predicted = loop.predicted_error(record)
+    assert np.max(np.abs(predicted[:, 0])) > 0.01
+    np.testing.assert_allclose(record["tracking_error"], predicted, rtol=0, atol=1e-8)
+    links = loop.plant.model.links
+    tip = TracedFunction("tip", {"q": links.q}, {"p": links.position("tool")})
+    center = np.array([1.7, 0.0, 0.3])
+    radius = [np.linalg.norm(tip(state[:2])[0] - center) for state in record["state"]]
+    grown = 0.5 + 0.02 * np.sin(3.0 * record.time)
+    np.testing.assert_allclose(radius, grown, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_link_wall", "two_link_flexible"])
+def test_a_height_map_is_held_as_predicted(name, tmp_path):
+    """Four derivatives of the map behind springs; the tool follows the bump, not the wall."""
+    bump(tmp_path)
+    file = json.dumps(str(tmp_path / "bump.csv"))
+    surface = f"constraints.0.surface=!HeightMap {{file: {file}, {PLACE}}}"
+    loop, _, record = run_scenario(scenario(name, surface, *SHORT))
+    predicted = loop.predicted_error(record)
+    # Behind springs the integrator's own error, 1e-5 N, is amplified.
+    np.testing.assert_allclose(record["tracking_error"], predicted, rtol=0, atol=2e-4)
+    assert np.max(np.abs(predicted)) > 0.01
+    assert np.max(np.abs(record["constraint_residual"])) < 1e-7
+
+
+def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summary(
+    tmp_path, monkeypatch, capsys
+):
+    bump(tmp_path)
+    text = find_scenario("two_link_wall").read_text()
+    old = text[text.index("  surface: !Plane") : text.index("outputs:")]
+    new = f"  surface: !HeightMap {{file: bump.csv, {PLACE}}}\n"
+    (tmp_path / "mine.yaml").write_text(text.replace(old, new))
+    monkeypatch.chdir("/")
+    options = [f"--set={one}" for one in (*SHORT, "duration=0.01", "write.plots=false")]
+    assert (
+        main(["simulate", str(tmp_path / "mine.yaml"), "--out", str(tmp_path / "run"), *options])
+        == 0
+    )
+    told = "wall: HeightMap 'bump.csv': the surface is off the data by "
+    assert told in capsys.readouterr().out
+    assert told in (tmp_path / "run" / "summary.txt").read_text()
+    assert (tmp_path / "run" / "animation.html").stat().st_size > 0
+    # As run it means the same file from anywhere.
+    again = load_scenario(tmp_path / "run" / "scenario.yaml")
+    assert again.constraints[0].surface.file == tmp_path / "bump.csv"
+    save_scenario(again, tmp_path / "run" / "again.yaml")
+    assert load_scenario(tmp_path / "run" / "again.yaml") == again
+
+
+def test_a_mesh_in_a_scenario(tmp_path):
+    side = np.linspace(-0.4, 0.4, 41)
+    bell = 0.05 * np.exp(-8.0 * (side**2 + side[:, None] ** 2))
+    file = json.dumps(str(obj_of_grid(tmp_path / "bell.obj", side, side, bell)))
+    mesh = f"constraints.0.surface=!MeshSurface {{file: {file}, point: [1.2, 0, 0]}}"
+    assert scenario("two_link_wall", mesh).constraints[0].surface.relief.largest < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("surface", "key", "words"),
+    [
+        ("!ImplicitSurface {function: z - q}", "", "column 5: no name 'q'"),
+        ("!ImplicitSurface {function: 3}", ".function", "expected text, got 3"),
+        ("!ImplicitSurface {function: z, parameters: [1]}", ".parameters", "names with values"),
+        ("!ImplicitSurface {function: z, parameters: {a: x}}", ".parameters.a", "a number"),
+        ("!ImplicitSurface {expression: z}", "", "needs the key 'function'"),
+        ("!HeightMap {size: [1, 1]}", "", "give either heights"),
+        ("!HeightMap {size: [1], heights: [[0, 1], [1, 2]]}", ".size", "expected 2 numbers"),
+        ("!HeightMap {size: [1, 1], heights: [[0, a], [1, 2]]}", ".heights", "a list of rows"),
+        ("!HeightMap {size: [1, 1], heights: [[0, 1], [1]]}", ".heights", "different lengths"),
+        ("!HeightMap {size: [1, 1], heights: 3}", "", "two rows of two heights are the least"),
+        ("!HeightMap {size: [1, 1], file: 3}", ".file", "expected the name of a file, got 3"),
+        ("!HeightMap {size: [1, 1], file: none.csv}", "", "no file '"),
+        ("!MeshSurface {file: none.stl}", "", "no file '"),
+        ("!MeshSurface {}", "", "needs the key 'file'"),
+        ("!MeshSurface {file: a.obj, normal: up}", ".normal", "expected 3 numbers"),
+    ],
+)
+def test_wrong_surfaces_are_told_at_their_key(surface, key, words):
+    with pytest.raises(ScenarioError) as caught:
+        scenario("two_link_wall", f"constraints.0.surface={surface}")
+    ((found, _),) = [p for p in caught.value.problems if words in p[1]]
+    assert found == f"constraints.0.surface{key}"
