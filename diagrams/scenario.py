@@ -162,7 +162,7 @@ class Scenario:
         compliances: Constraint force -> its compliance relative to the others, where constraints
             are redundant: their forces are shared by least squares. {} is all alike; left out, no
             constraint may be redundant.
-        gains: The gains of the tracking law (28).
+        gains: The gains of the tracking law (28); poles at -4 1/s where left out.
         integral: Names of outputs whose errors are integrated as well, which take a pole more:
             positions, and forces where `force` is measured.
         constraint_damping: What the law's model demands of constraints that give way, written as
@@ -196,7 +196,7 @@ class Scenario:
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
-    gains: Gains = field(default_factory=parts.Poles)
+    gains: Gains = field(default_factory=lambda: parts.Poles(all=[-4.0]))
     integral: list[str] = field(default_factory=list)
     constraint_damping: Gains | None = None
     plant: Plant = field(default_factory=parts.IdealConstraints)

@@ -57,6 +57,8 @@ _LEAST_FORCE = 0.02  # No arrow for what is less, beside the largest force of th
 ACTUAL, DESIRED, FORCE = "#1f3fbf", "#2e9d4a", "#d12b1f"
 """Colors of the path so far, of the one that is wanted, and of forces."""
 
+_PLACES = 12  # So many states of a run tell how much room it takes.
+
 Pixels = NDArray[np.uint8]
 
 
@@ -139,7 +141,7 @@ class _Scene:
         model, links = course.plant.model, course.plant.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")
-        middle, self._size = scene_extent(model, course.acting, course.states[0])
+        middle, self._size = _extent(course)
         eye = middle + self._size * np.array([-1.55, -1.1, 0.8])
         self._camera = _Camera(eye, middle, 10.0 * self._size)
         self._course, self._points, self._wanted = course, course.points, course.wanted_points
@@ -218,16 +220,33 @@ class _Scene:
         return np.array(image.data[:, :, :3])
 
 
+def _extent(course: Course) -> tuple[FloatArray, float]:
+    """The middle and the size, in m, of the box around all places of the robot."""
+    some = course.states[:: max(1, len(course.states) // _PLACES)]
+    boxes = [scene_extent(course.plant.model, course.acting, state) for state in some]
+    half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
+    middles = np.array([middle for middle, _ in boxes])
+    low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low))
+
+
 def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:
     """A form as what is rendered: a mesh as the text of an .obj file."""
     if isinstance(form, Shape):
         return form
-    points = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in form.vertices()]
-    faces = [
-        "f " + " ".join(str(1 + triangle.vertex(corner)) for corner in range(3))
-        for triangle in form.triangles()
+    points = np.array(form.vertices())
+    faces = np.array([[triangle.vertex(k) for k in range(3)] for triangle in form.triangles()])
+    # The renderer asks for normals at the corners: the mean of those around.
+    corners, normals = points[faces], np.zeros_like(points)
+    for k in range(3):
+        edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        np.add.at(normals, faces[:, k], np.cross(*edges))
+    rows = [
+        *("v {:.9g} {:.9g} {:.9g}".format(*point) for point in points),
+        *("vn {:.9g} {:.9g} {:.9g}".format(*normal) for normal in normals),
+        *("f " + " ".join(f"{k}//{k}" for k in face) for face in faces + 1),
     ]
-    text = "\n".join([*points, *faces])
+    text = "\n".join(rows)
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "surface")))
 
 
