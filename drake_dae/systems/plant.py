@@ -40,6 +40,8 @@ from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 
+_CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
+
 
 class _FedBack(NamedTuple):
     """What a plant's derivative needs besides time and state; it never changes.
@@ -473,12 +475,14 @@ class DaePlant(ParameterizedSystem):
         )
 
     def _project(self, context: Context, state: State) -> EventStatus:
-        x = context.get_continuous_state_vector().CopyToVector()
+        x = context.get_continuous_state_vector().value()
         try:
-            x = self.structure.manifold.projected(
+            found = self.structure.manifold.projected(
                 x, self._values(context), lambda near: self._crosses(near, context)
             )
         except InconsistentStateError as error:
-            raise off_manifold(context.get_time(), x, error) from error
-        state.get_mutable_continuous_state().SetFromVector(x)
-        return EventStatus.Succeeded()
+            raise off_manifold(context.get_time(), x.copy(), error) from error
+        if found is x:
+            return _UNCHANGED
+        state.get_mutable_continuous_state().SetFromVector(found)
+        return _CHANGED
