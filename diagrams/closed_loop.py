@@ -107,7 +107,9 @@ class ClosedLoop:
             values["exogenous"] = self.plant_exogenous.along(times)
         values["reference"] = self.reference.along(times)
         if "control" not in known:
-            gains = self._parameters_along(self.controller, context, times)
+            gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
+            if gains is None:
+                gains = self._parameters_along(self.controller, context, times)
             given = {**known, "reference": values["reference"], "parameters": gains}
             law = self.controller.law
             if law.measured_force and "measured_force" not in known:
@@ -254,8 +256,13 @@ def make_closed_loop(
         outputs = None  # A trajectory that begins later.
     period = plant.time_step if sampling is None else sampling.period
     is_fed_back = plant.HasInputPort("feedback") and can_be_fed_back(law, sampling, control_limits)
-    own = reference if is_fed_back else None
-    controller = TrackingController(law, outputs, sample_period=period, references=own)
+    controller = TrackingController(
+        law,
+        outputs,
+        sample_period=period,
+        references=reference if is_fed_back else None,
+        feedback=is_fed_back,
+    )
     builder.AddSystem(controller)
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     held = None if sampling is None else _hold_before(plant, sampling)

@@ -30,7 +30,7 @@ class Feedback(Immutable):
     Args:
         function: The law, of state, reference and parameters; its first output is the control.
         reference: R(t), at a time in s.
-        parameters: What the law takes as parameters; not to be changed.
+        parameters: What the law takes as parameters; not to be changed, also an attribute.
         signals: Name of an input of the law -> names of its entries, for messages.
     """
 
@@ -42,7 +42,7 @@ class Feedback(Immutable):
         signals: Mapping[str, Sequence[Signal]],
     ) -> None:
         self._function, self._reference = function, reference
-        self._parameters, self._signals = parameters, signals
+        self.parameters, self._signals = parameters, signals
 
     def control(self, time: float, state: FloatArray) -> FloatArray | None:
         """u, shape (p,), overwritten by the next call; None where it has no value.
@@ -57,7 +57,7 @@ class Feedback(Immutable):
         x, r, parameters = self._function.arguments
         r[...] = self._reference(time)
         x[...] = state
-        parameters[...] = self._parameters
+        parameters[...] = self.parameters
         return self._function.outputs[0] if self._function.run() else None
 
     def error(self, time: float, state: FloatArray) -> SimulationError:

@@ -18,7 +18,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, unknown_name
+from drake_dae.arrays import FloatArray, show, unknown_name, vector
 from drake_dae.dae.contacts import jam
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.passage import Passage
@@ -228,6 +228,8 @@ class DaePlant(ParameterizedSystem):
     def _calc_fed_back(self, context: Context, value: AbstractValue) -> None:
         is_fed_back = not self._control_port.HasValue(context)
         feedback = self._feedback_port.Eval(context) if is_fed_back else None
+        if feedback is not None:
+            self._steps.note_law(context, feedback.parameters)
         value.set_value(_FedBack(feedback, np.array(self._values(context))))
 
     def state(self, context: Context) -> FloatArray:
@@ -293,16 +295,28 @@ class DaePlant(ParameterizedSystem):
 
     def _control(self, context: Context) -> FloatArray | None:
         """u; None where the law that is fed back has no value at a trial."""
-        if self._fed_back is not None:
-            feedback = self.get_cache_entry(self._fed_back).Eval(context).feedback
-            if feedback is not None:
-                time, state = context.get_time(), self.state(context)
-                control = feedback.control(time, state)
-                if control is None:
-                    self._steps.tolerate(context, feedback.error(time, state))
-                    return None
-                return np.array(control)
-        return np.array(self._control_port.Eval(context))
+        feedback = self._feedback(context)
+        if feedback is None:
+            given: FloatArray = self._control_port.Eval(context)
+            return given
+        time, state = context.get_time(), self.state(context)
+        control = feedback.control(time, state)
+        if control is None:
+            self._steps.tolerate(context, feedback.error(time, state))
+            return None
+        return control.copy()
+
+    def _feedback(self, context: Context) -> Feedback | None:
+        """The law that is fed back; None where the control has a wire or a fixed value."""
+        if self._fed_back is None:
+            return None
+        found: _FedBack = self.get_cache_entry(self._fed_back).Eval(context)
+        return found.feedback
+
+    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
+        """The parameters of the law that was fed back, as `parameters_along`; None if none was."""
+        self.check_context(context)
+        return self._steps.laws_along(context, vector("times", times, None))
 
     def _otherwise(
         self,
@@ -430,6 +444,9 @@ class DaePlant(ParameterizedSystem):
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
+        feedback = self._feedback(context)
+        if feedback is not None:
+            self._steps.note_law(context, feedback.parameters, begins=True)
         return EventStatus.DidNothing()
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
