@@ -108,6 +108,7 @@ class ClosedLoop:
         values["reference"] = self.reference.along(times)
         if "control" not in known:
             gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
+            is_fed_back = gains is not None
             if gains is None:
                 gains = self._parameters_along(self.controller, context, times)
             given = {**known, "reference": values["reference"], "parameters": gains}
@@ -119,9 +120,22 @@ class ClosedLoop:
                     if law.control_takes_force
                     else np.zeros((times.size, plant.dae.num_constraints))
                 )
-            values["control"] = known["control"] = function_along(law.function, given)
+            motion = plant.motion_under(law.function) if is_fed_back else None
+            if motion is not None and motion.is_machine_code:
+                # Machine code that is there, in place of some for the law alone.
+                given |= {"law": gains, "plant": known["parameters"]}
+                control = function_along(motion, given, self._control_alone)
+            else:
+                control = function_along(law.function, given)
+            values["control"] = known["control"] = control
         values |= {port: plant.along(port, known) for port in plant.functions}
         return Record(times, {n: Recorded(values[n], tuple(self.signals[n])) for n in self.signals})
+
+    def _control_alone(self, moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
+        """The control where the plant has no value with it."""
+        law = self.controller.law.function
+        values = law.evaluate(*moment[:3])
+        return values if law.is_valid else None
 
     def with_errors(self, record: Record) -> Record:
         """A record with `desired_output` and `tracking_error` besides."""

@@ -34,7 +34,7 @@ from drake_dae.errors import (
 from drake_dae.systems.along import function_along
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.failures import off_manifold
-from drake_dae.systems.feedback import Feedback, nothing
+from drake_dae.systems.feedback import Feedback, motion_under, nothing
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
@@ -49,10 +49,12 @@ class _FedBack(NamedTuple):
     Attributes:
         feedback: The law that is fed back; None where the control has a wire or a fixed value.
         parameters: Values of all parameters.
+        motion: The plant under that law; None without it.
     """
 
     feedback: Feedback | None
     parameters: FloatArray
+    motion: TracedFunction | None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
         return self
@@ -211,6 +213,7 @@ class DaePlant(ParameterizedSystem):
         """Declares the input port `feedback`, and what u depends on besides time and state."""
         self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
         self._fed_back: CacheIndex | None = None
+        self._motion: tuple[TracedFunction, TracedFunction] | None = None
         if not wanted:
             return
         if not self._is_controlled or self._exogenous is not None:
@@ -228,9 +231,17 @@ class DaePlant(ParameterizedSystem):
     def _calc_fed_back(self, context: Context, value: AbstractValue) -> None:
         is_fed_back = not self._control_port.HasValue(context)
         feedback = self._feedback_port.Eval(context) if is_fed_back else None
+        motion = None
         if feedback is not None:
             self._steps.note_law(context, feedback.parameters)
-        value.set_value(_FedBack(feedback, np.array(self._values(context))))
+            motion = self.motion_under(feedback.function)
+        value.set_value(_FedBack(feedback, np.array(self._values(context)), motion))
+
+    def motion_under(self, law: TracedFunction) -> TracedFunction:
+        """Law and plant as one function; see `feedback.motion_under`."""
+        if self._motion is None or self._motion[0] is not law:
+            self._motion = law, motion_under(law, self.dynamics, self.dae.compiled)
+        return self._motion[1]
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
@@ -261,26 +272,27 @@ class DaePlant(ParameterizedSystem):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         # What an integrator calls most: without a call more where the values are of use.
-        dynamics = self.dynamics
-        if self._is_controlled and self._exogenous is None:
-            x, u, parameters = dynamics.arguments
-            if self._fed_back is None:
-                feedback, given = None, context.get_numeric_parameter(0).value()
-            else:
-                feedback, given = self.get_cache_entry(self._fed_back).Eval(context)
-            state = context.get_continuous_state_vector().value()
-            if feedback is None:
-                control = self._control_port.Eval(context)
-            else:
-                control = feedback.control(context.get_time(), state)
-            if control is not None:
-                x[...] = state
-                u[...] = control
-                parameters[...] = given
-                if dynamics.run():
-                    derivatives.SetFromVector(dynamics.outputs[0])
+        if self._fed_back is not None:
+            feedback, given, motion = self.get_cache_entry(self._fed_back).Eval(context)
+            if feedback is not None:
+                x, r, of_law, of_plant = motion.arguments
+                r[...] = feedback.reference(context.get_time())
+                x[...] = context.get_continuous_state_vector().value()
+                of_law[...] = feedback.parameters
+                of_plant[...] = given
+                if motion.run():
+                    derivatives.SetFromVector(motion.outputs[1])
                     return
-        derivatives.SetFromVector(self._evaluate(dynamics, context, self._is_controlled))
+        elif self._is_controlled and self._exogenous is None:
+            control = self._control_port.Eval(context)
+            x, u, parameters = self.dynamics.arguments
+            x[...] = context.get_continuous_state_vector().value()
+            u[...] = control
+            parameters[...] = context.get_numeric_parameter(0).value()
+            if self.dynamics.run():
+                derivatives.SetFromVector(self.dynamics.outputs[0])
+                return
+        derivatives.SetFromVector(self._evaluate(self.dynamics, context, self._is_controlled))
 
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool
