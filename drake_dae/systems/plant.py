@@ -1,7 +1,8 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
+from weakref import ref
 
 import casadi as ca
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
+    CacheEntry,
     CacheIndex,
     Context,
     ContinuousState,
@@ -50,11 +52,13 @@ class _FedBack(NamedTuple):
         feedback: The law that is fed back; None where the control has a wire or a fixed value.
         parameters: Values of all parameters.
         motion: The plant under that law; None without it.
+        entry: The cache entry that this is the value of: to find it again takes longer.
     """
 
     feedback: Feedback | None
     parameters: FloatArray
     motion: TracedFunction | None
+    entry: CacheEntry
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
         return self
@@ -213,6 +217,8 @@ class DaePlant(ParameterizedSystem):
         """Declares the input port `feedback`, and what u depends on besides time and state."""
         self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
         self._fed_back: CacheIndex | None = None
+        # Whoever holds an entry holds its system: a context may, but not the system itself.
+        self._entry: Callable[[], CacheEntry | None] = lambda: None
         self._motion: tuple[TracedFunction, TracedFunction] | None = None
         if not wanted:
             return
@@ -235,7 +241,9 @@ class DaePlant(ParameterizedSystem):
         if feedback is not None:
             self._steps.note_law(context, feedback.parameters)
             motion = self.motion_under(feedback.function)
-        value.set_value(_FedBack(feedback, np.array(self._values(context)), motion))
+        entry = self.get_cache_entry(self._fed_back)
+        self._entry = ref(entry)
+        value.set_value(_FedBack(feedback, np.array(self._values(context)), motion, entry))
 
     def motion_under(self, law: TracedFunction) -> TracedFunction:
         """Law and plant as one function; see `feedback.motion_under`."""
@@ -273,7 +281,8 @@ class DaePlant(ParameterizedSystem):
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         # What an integrator calls most: without a call more where the values are of use.
         if self._fed_back is not None:
-            feedback, given, motion = self.get_cache_entry(self._fed_back).Eval(context)
+            entry = self._entry() or self.get_cache_entry(self._fed_back)
+            feedback, given, motion, _ = entry.Eval(context)
             if feedback is not None:
                 x, r, of_law, of_plant = motion.arguments
                 r[...] = feedback.reference(context.get_time())
@@ -505,9 +514,13 @@ class DaePlant(ParameterizedSystem):
 
     def _project(self, context: Context, state: State) -> EventStatus:
         x = context.get_continuous_state_vector().value()
+        if self._exogenous is None:
+            parameters = context.get_numeric_parameter(0).value()
+        else:
+            parameters = self._values(context)
         try:
             found = self.structure.manifold.projected(
-                x, self._values(context), lambda near: self._crosses(near, context)
+                x, parameters, lambda near: self._crosses(near, context)
             )
         except InconsistentStateError as error:
             raise off_manifold(context.get_time(), x.copy(), error) from error
