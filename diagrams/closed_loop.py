@@ -114,7 +114,10 @@ class ClosedLoop:
             values["exogenous"] = self.plant_exogenous.along(times)
         values["reference"] = self.reference.along(times)
         if "control" not in known:
-            gains = self._parameters_along(self.controller, context, times)
+            gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
+            is_fed_back = gains is not None
+            if gains is None:
+                gains = self._parameters_along(self.controller, context, times)
             given = {**known, "reference": values["reference"], "parameters": gains}
             law = self.controller.law
             if law.measured_force and "measured_force" not in known:
@@ -124,9 +127,22 @@ class ClosedLoop:
                     if law.control_takes_force
                     else np.zeros((times.size, plant.dae.num_constraints))
                 )
-            values["control"] = known["control"] = function_along(law.function, given)
+            motion = plant.motion_under(law.function) if is_fed_back else None
+            if motion is not None and motion.is_machine_code:
+                # Machine code that is there, in place of some for the law alone.
+                given |= {"law": gains, "plant": known["parameters"]}
+                control = function_along(motion, given, self._control_alone)
+            else:
+                control = function_along(law.function, given)
+            values["control"] = known["control"] = control
         values |= {port: plant.along(port, known) for port in plant.functions}
         return Record(times, {n: Recorded(values[n], tuple(self.signals[n])) for n in self.signals})
+
+    def _control_alone(self, moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
+        """The control where the plant has no value with it."""
+        law = self.controller.law.function
+        values = law.evaluate(*moment[:3])
+        return values if law.is_valid else None
 
     def with_errors(self, record: Record) -> Record:
         """A record with `desired_output` and `tracking_error` besides."""
@@ -268,8 +284,13 @@ def make_closed_loop(
         outputs = None  # A trajectory that begins later.
     period = plant.time_step if sampling is None else sampling.period
     is_fed_back = plant.HasInputPort("feedback") and can_be_fed_back(law, sampling, control_limits)
-    own = reference if is_fed_back else None
-    controller = TrackingController(law, outputs, sample_period=period, references=own)
+    controller = TrackingController(
+        law,
+        outputs,
+        sample_period=period,
+        references=reference if is_fed_back else None,
+        feedback=is_fed_back,
+    )
     builder.AddSystem(controller)
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     held = None if sampling is None else _hold_before(plant, sampling)

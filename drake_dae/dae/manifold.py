@@ -34,6 +34,9 @@ STEPS = 6
 """So many Newton steps are one function: one or two to N* from where a step of a simulation ends,
 the others polish; one projection in a thousand takes more."""
 
+STAYS, FOUND, NOT_FOUND = 0.0, 1.0, 2.0
+"""What a projection's first steps lead to: the state itself, another one, or not yet to one."""
+
 FLOOR = 1e-12
 """A distance from N* that is round-off of states that are zero."""
 
@@ -99,26 +102,28 @@ class Manifold:
         return positive(rows), rows
 
     def _trace_projection(
-        self, gradient: ca.SX, heads: Sequence[int], lengths: FloatArray
+        self, gradient: ca.SX, heads: Sequence[int], usual: FloatArray
     ) -> TracedFunction:
-        """The first Newton steps from a state, all by the gradients there, as one function.
+        """Where the first Newton steps from a state lead, all by the gradients there.
 
-        Before them stand their lengths, in states over their scale, and the sizes of the first two,
-        relative to the state as in `newton`. They are doubted where gradients nearly depend on each
-        other.
+        First stand their lengths, in states over their scale, and what `_followed` says; then the
+        first step. They are doubted where gradients nearly depend on each other.
         """
         state, p, scale = self.system.state, self.system.parameter_symbol, ca.SX(self._scale)
         residual = ca.Function("residual", [state, p], [self.residual_expression])
-        (step_for, pivots), steps = _shortest_step(gradient, scale), {}
-        for number in range(STEPS):
-            steps[f"step {number}"] = step = scale * step_for(residual(state, p))
-            state += step
-        unit = ca.fmax(scale, ca.fabs(self.system.state))
-        reaches = [ca.norm_2(step / scale) for step in steps.values()]
-        sizes = [ca.norm_2(steps[f"step {number}"] / unit) for number in (0, 1)]
-        outputs = {"sizes": ca.vertcat(*reaches, *sizes), **steps}
+        (step_for, pivots), steps = _shortest_step(gradient, scale), []
+        for _ in range(STEPS):
+            steps.append(scale * step_for(residual(state, p)))
+            state += steps[-1]
+        start = self.system.state
+        unit = ca.fmax(scale, ca.fabs(start))
+        lengths = [ca.norm_2(step / scale) for step in steps]
+        size, left = (ca.norm_2(step / unit) for step in steps[:2])
+        found, outcome = _followed(start, steps, lengths, size, left)
+        sizes = ca.vertcat(outcome, *lengths)
+        outputs = {"sizes": sizes, "found": found, "step": steps[0]}
         # For next to nothing, like the sines, which are looked at where this fails.
-        doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / lengths[i] for i in heads])) - DOUBT
+        doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / usual[i] for i in heads])) - DOUBT
         return self.system.trace("projection onto the manifold", outputs, doubt=doubt)
 
     @cached_property
@@ -164,7 +169,7 @@ class Manifold:
         The arguments are those of `residual`.
         """
         x, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = float(self._projection.evaluate(x, p)[0][0])
+        reach = float(self._projection.evaluate(x, p)[0][1])
         if isfinite(reach) and reach > 0.0:
             return reach <= CONSISTENT * norm(x / self._scale) + FLOOR
         # Gradients that depend on each other; or nothing is left, or what no state changes.
@@ -210,20 +215,25 @@ class Manifold:
         Returns:
             The consistent state, which is `start` itself if that is one.
         """
-        sizes, *steps = self._projection.evaluate(start, p)
-        is_finite, is_valid = self._projection.is_finite, self._projection.is_valid
-        *lengths, size, left = sizes.tolist()
+        function = self._projection
+        state, parameters = function.arguments
+        state[...] = start
+        parameters[...] = p
+        is_valid = function.run()
+        sizes, found, _ = function.outputs
+        outcome, length = sizes.item(0), sizes.item(1)
+        if is_valid and outcome == FOUND:
+            return found.copy()
+        is_finite = function.is_finite
         if is_finite and (
-            0.0 < lengths[0] <= ROUNDING
-            or (lengths[0] == 0.0 and not self.residual_function.evaluate(start, p)[0].any())
+            outcome == STAYS
+            or (length == 0.0 and not self.residual_function.evaluate(start, p)[0].any())
         ):
-            return start  # As in most steps of a simulation.
-        found = None
+            return start
+        known = found.copy() if is_finite and outcome == FOUND else None
         if crosses is not None and not is_valid and self._is_near(start, p, crosses):
-            found = self._nearly(start, p)
-        elif is_finite:
-            found = _followed(start, steps, lengths, size, left)
-        return self._searched(start, p) if found is None or found is start else found
+            known = self._nearly(start, p)
+        return self._searched(start, p) if known is None else known
 
     def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """The consistent state next to one, where the first few steps do not lead to it."""
@@ -385,37 +395,32 @@ def _shortest_step(
 
 
 def _followed(
-    start: FloatArray,
-    steps: Sequence[FloatArray],
-    lengths: Sequence[float],
-    size: float,
-    left: float,
-) -> FloatArray | None:
-    """What `newton` finds from a start by these first steps; None where it takes others.
+    start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """What `newton` finds from a start by these first steps, and STAYS, FOUND or NOT_FOUND.
 
     Args:
-        start: The state, shape (n,).
+        start: The state, shape (n, 1).
         steps: The Newton steps that follow each other from there.
         lengths: Their lengths, in states over their scale.
         size, left: The sizes of the first two, relative to the state.
     """
-    if size <= ROUNDING:
-        state, number = start, 0
-    elif left * left <= PRECISION * size:
-        state, number = start + steps[0], 1
-    else:
-        return None
-    length = lengths[number]
-    while length > 0.0:
-        state = state + steps[number]
-        number += 1
-        if number == len(steps):
-            return None
-        following = lengths[number]
-        if not following < 0.5 * length:
-            break
-        length = following
-    return state
+    # Newton's method ends at the start, or after its first step; then it is polished.
+    at_start = size <= ROUNDING
+    after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
+    goes_on = ca.logic_and(at_start, lengths[0] > 0)
+    found = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
+    for number in range(1, len(steps)):
+        shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
+        goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
+        goes_on = ca.logic_and(goes_on, lengths[number] > 0)
+        found += ca.if_else(goes_on, steps[number], 0)
+    ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
+    # What is at the start and has no length may be there, or nowhere.
+    moves = ca.logic_or(after_one, lengths[0] > 0)
+    outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
+    stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
+    return found, ca.if_else(stays, STAYS, outcome)
 
 
 def _levels(layout: Layout, gradient: ca.SX) -> list[tuple[Indices, Indices]]:

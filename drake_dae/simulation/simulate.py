@@ -98,17 +98,18 @@ def simulate(
     ApplySimulatorConfig(config, simulator)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
-    start = context.get_time()
+    start, going_on = context.get_time(), EventStatus.DidNothing()
     ending = Ending()
     with ending_signals(ending), _Progress(duration, progress) as shown:
 
         def monitor(current: Context) -> EventStatus:
-            shown.update(current.get_time() - start)
+            if progress:
+                shown.update(current.get_time() - start)
             if after_step is not None:
                 after_step(current)
             if ending.signal is not None:
                 return EventStatus.ReachedTermination(diagram, "interrupted")
-            return EventStatus.DidNothing()
+            return going_on
 
         began = None
         try:

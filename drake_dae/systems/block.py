@@ -114,12 +114,17 @@ class ParameterizedSystem(DifferentiableSystem):
         dae: The system.
         values: The default: `dae.parameter_values`, and what else the block appends.
         signals: Name of an input of the block's functions -> names of its entries, for messages.
+        sees_steps: Whether it sees the steps of a simulation; without, no state is a trial.
     """
 
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
-        self, dae: DaeSystem, values: FloatArray, signals: Mapping[str, Sequence[Signal]]
+        self,
+        dae: DaeSystem,
+        values: FloatArray,
+        signals: Mapping[str, Sequence[Signal]],
+        sees_steps: bool = True,
     ) -> None:
         super().__init__()
         self.dae = dae
@@ -127,7 +132,7 @@ class ParameterizedSystem(DifferentiableSystem):
         self._exogenous: InputPort | None = None
         self.exogenous_layout = Layout(())
         self.exogenous_places: list[int] = []
-        self._steps = StepWatch(self)
+        self._steps = StepWatch(self, sees_steps)
         self.DeclareNumericParameter(BasicVector(values))
 
     def _declare_exogenous(self, degrees: Sequence[int]) -> set[DependencyTicket]:

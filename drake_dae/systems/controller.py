@@ -50,7 +50,7 @@ class TrackingController(ParameterizedSystem):
             integral has come to its limit and its error would carry it on, it stays (anti-windup).
 
         feedback: The law with its references and parameters as a value, for the port `feedback` of
-            a `DaePlant`; if it has `references` and takes nothing but the state besides.
+            a `DaePlant`; if asked for.
 
     A law with integrals also has an input port `hold`, shape (k,): where it is not 0 that error is
     not integrated, as while a drive is at its limit or a contact is lost. Without a wire it is 0.
@@ -70,11 +70,15 @@ class TrackingController(ParameterizedSystem):
             of a `Sampling`, and do not convert; 0 for integrals by the integrator. An integrator
             has no use for a discrete plant, whose state jumps while time goes on.
         references: What R is where the port `reference` has no wire; None if it needs one.
+        feedback: Whether there is an output port `feedback`, for a law that takes the state and
+            `references` alone. The plant then sees what is a trial, and which parameters the law
+            had; the other ports are there to be looked at, and raise at trials too.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
+        ModelError: The law cannot be fed back, or a limit or period makes no sense.
         SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """
@@ -88,6 +92,7 @@ class TrackingController(ParameterizedSystem):
         integral_limits: ArrayLike = np.inf,
         sample_period: float = 0.0,
         references: ReferenceGenerator | None = None,
+        feedback: bool = False,
     ) -> None:
         dae = law.system
         signals = {
@@ -95,7 +100,7 @@ class TrackingController(ParameterizedSystem):
             "reference": law.reference_signals,
             "measured_force": dae.constraint_input_signals,
         }
-        super().__init__(dae, law.all_parameters(), signals)
+        super().__init__(dae, law.all_parameters(), signals, sees_steps=not feedback)
         _warn_of_zero_dynamics(law, outputs)
         self.law = law
         self.set_name("tracking_controller")
@@ -115,8 +120,8 @@ class TrackingController(ParameterizedSystem):
         self._is_plain = len(self._evaluators) == 2 and self._exogenous is None
         if references is not None:
             sources.add(self.time_ticket())
-            if self._is_plain:
-                self._declare_feedback()
+        if feedback:
+            self._declare_feedback()
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
@@ -234,6 +239,11 @@ class TrackingController(ParameterizedSystem):
         return self._checked(function, context, *inputs)
 
     def _declare_feedback(self) -> None:
+        if self._references is None or not self._is_plain:
+            raise ModelError(
+                f"{self.dae.name}: a law that is fed back needs references, and takes no measured "
+                "force, integral or exogenous signals"
+            )
         port = self.input_port_ticket(self._reference_port.get_index())
         self.DeclareAbstractOutputPort(
             "feedback", nothing, weakly(self._calc_feedback), {self.all_parameters_ticket(), port}

@@ -3,12 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
+import casadi as ca
 from pydrake.common.value import AbstractValue
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import SimulationError
 from drake_dae.systems.failures import simulation_error
+from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -27,10 +29,13 @@ def nothing() -> AbstractValue:
 class Feedback(Immutable):
     """A law with its references and parameters: the control as a function of time and state.
 
-    Args:
+    Attributes:
         function: The law, of state, reference and parameters; its first output is the control.
         reference: R(t), at a time in s.
         parameters: What the law takes as parameters; not to be changed.
+
+    Args:
+        function, reference, parameters: The attributes.
         signals: Name of an input of the law -> names of its entries, for messages.
     """
 
@@ -41,8 +46,8 @@ class Feedback(Immutable):
         parameters: FloatArray,
         signals: Mapping[str, Sequence[Signal]],
     ) -> None:
-        self._function, self._reference = function, reference
-        self._parameters, self._signals = parameters, signals
+        self.function, self.reference = function, reference
+        self.parameters, self._signals = parameters, signals
 
     def control(self, time: float, state: FloatArray) -> FloatArray | None:
         """u, shape (p,), overwritten by the next call; None where it has no value.
@@ -54,12 +59,36 @@ class Feedback(Immutable):
         Raises:
             NonFiniteError: The reference is not finite.
         """
-        x, r, parameters = self._function.arguments
-        r[...] = self._reference(time)
+        x, r, parameters = self.function.arguments
+        r[...] = self.reference(time)
         x[...] = state
-        parameters[...] = self._parameters
-        return self._function.outputs[0] if self._function.run() else None
+        parameters[...] = self.parameters
+        return self.function.outputs[0] if self.function.run() else None
 
     def error(self, time: float, state: FloatArray) -> SimulationError:
         """Why the last call had no value, at its time and state."""
-        return simulation_error(self._function.failure(), time, state, self._signals)
+        return simulation_error(self.function.failure(), time, state, self._signals)
+
+
+def motion_under(
+    law: TracedFunction, dynamics: TracedFunction, compiled: Compiled
+) -> TracedFunction:
+    """Law and plant as one function: what both compute of the state is computed once.
+
+    Args:
+        law: The law, of state, reference and its parameters.
+        dynamics: x', of state, control and the plant's parameters.
+        compiled: Whether it becomes machine code.
+
+    Returns:
+        A function of "state", "reference", and the parameters of "law" and "plant"; it returns the
+        control, x', and a number that is finite if both are of use.
+    """
+    names = ("state", "reference", "law", "plant")
+    sizes = (*law.sizes, dynamics.sizes[-1])
+    inputs = {name: ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)}
+    state, reference, of_law, of_plant = inputs.values()
+    control, *_, law_holds = law.function(state, reference, of_law)
+    rate, *_, plant_holds = dynamics.function(state, control, of_plant)
+    outputs = {"control": control, "rate": rate, "valid": law_holds + plant_holds}
+    return TracedFunction("motion under the law", inputs, outputs, compiled=compiled)

@@ -1,7 +1,8 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
+from weakref import ref
 
 import casadi as ca
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
+    CacheEntry,
     CacheIndex,
     Context,
     ContinuousState,
@@ -18,7 +20,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, unknown_name
+from drake_dae.arrays import FloatArray, show, unknown_name, vector
 from drake_dae.dae.contacts import jam
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.passage import Passage
@@ -34,11 +36,13 @@ from drake_dae.errors import (
 from drake_dae.systems.along import function_along
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.failures import off_manifold
-from drake_dae.systems.feedback import Feedback, nothing
+from drake_dae.systems.feedback import Feedback, motion_under, nothing
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
+
+_CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
 
 
 class _FedBack(NamedTuple):
@@ -47,10 +51,14 @@ class _FedBack(NamedTuple):
     Attributes:
         feedback: The law that is fed back; None where the control has a wire or a fixed value.
         parameters: Values of all parameters.
+        motion: The plant under that law; None without it.
+        entry: The cache entry that this is the value of: to find it again takes longer.
     """
 
     feedback: Feedback | None
     parameters: FloatArray
+    motion: TracedFunction | None
+    entry: CacheEntry
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
         return self
@@ -209,6 +217,9 @@ class DaePlant(ParameterizedSystem):
         """Declares the input port `feedback`, and what u depends on besides time and state."""
         self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
         self._fed_back: CacheIndex | None = None
+        # Whoever holds an entry holds its system: a context may, but not the system itself.
+        self._entry: Callable[[], CacheEntry | None] = lambda: None
+        self._motion: tuple[TracedFunction, TracedFunction] | None = None
         if not wanted:
             return
         if not self._is_controlled or self._exogenous is not None:
@@ -226,7 +237,19 @@ class DaePlant(ParameterizedSystem):
     def _calc_fed_back(self, context: Context, value: AbstractValue) -> None:
         is_fed_back = not self._control_port.HasValue(context)
         feedback = self._feedback_port.Eval(context) if is_fed_back else None
-        value.set_value(_FedBack(feedback, np.array(self._values(context))))
+        motion = None
+        if feedback is not None:
+            self._steps.note_law(context, feedback.parameters)
+            motion = self.motion_under(feedback.function)
+        entry = self.get_cache_entry(self._fed_back)
+        self._entry = ref(entry)
+        value.set_value(_FedBack(feedback, np.array(self._values(context)), motion, entry))
+
+    def motion_under(self, law: TracedFunction) -> TracedFunction:
+        """Law and plant as one function; see `feedback.motion_under`."""
+        if self._motion is None or self._motion[0] is not law:
+            self._motion = law, motion_under(law, self.dynamics, self.dae.compiled)
+        return self._motion[1]
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
@@ -257,26 +280,28 @@ class DaePlant(ParameterizedSystem):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         # What an integrator calls most: without a call more where the values are of use.
-        dynamics = self.dynamics
-        if self._is_controlled and self._exogenous is None:
-            x, u, parameters = dynamics.arguments
-            if self._fed_back is None:
-                feedback, given = None, context.get_numeric_parameter(0).value()
-            else:
-                feedback, given = self.get_cache_entry(self._fed_back).Eval(context)
-            state = context.get_continuous_state_vector().value()
-            if feedback is None:
-                control = self._control_port.Eval(context)
-            else:
-                control = feedback.control(context.get_time(), state)
-            if control is not None:
-                x[...] = state
-                u[...] = control
-                parameters[...] = given
-                if dynamics.run():
-                    derivatives.SetFromVector(dynamics.outputs[0])
+        if self._fed_back is not None:
+            entry = self._entry() or self.get_cache_entry(self._fed_back)
+            feedback, given, motion, _ = entry.Eval(context)
+            if feedback is not None:
+                x, r, of_law, of_plant = motion.arguments
+                r[...] = feedback.reference(context.get_time())
+                x[...] = context.get_continuous_state_vector().value()
+                of_law[...] = feedback.parameters
+                of_plant[...] = given
+                if motion.run():
+                    derivatives.SetFromVector(motion.outputs[1])
                     return
-        derivatives.SetFromVector(self._evaluate(dynamics, context, self._is_controlled))
+        elif self._is_controlled and self._exogenous is None:
+            control = self._control_port.Eval(context)
+            x, u, parameters = self.dynamics.arguments
+            x[...] = context.get_continuous_state_vector().value()
+            u[...] = control
+            parameters[...] = context.get_numeric_parameter(0).value()
+            if self.dynamics.run():
+                derivatives.SetFromVector(self.dynamics.outputs[0])
+                return
+        derivatives.SetFromVector(self._evaluate(self.dynamics, context, self._is_controlled))
 
     def _evaluate(
         self, function: TracedFunction, context: Context, needs_control: bool
@@ -291,16 +316,28 @@ class DaePlant(ParameterizedSystem):
 
     def _control(self, context: Context) -> FloatArray | None:
         """u; None where the law that is fed back has no value at a trial."""
-        if self._fed_back is not None:
-            feedback = self.get_cache_entry(self._fed_back).Eval(context).feedback
-            if feedback is not None:
-                time, state = context.get_time(), self.state(context)
-                control = feedback.control(time, state)
-                if control is None:
-                    self._steps.tolerate(context, feedback.error(time, state))
-                    return None
-                return np.array(control)
-        return np.array(self._control_port.Eval(context))
+        feedback = self._feedback(context)
+        if feedback is None:
+            given: FloatArray = self._control_port.Eval(context)
+            return given
+        time, state = context.get_time(), self.state(context)
+        control = feedback.control(time, state)
+        if control is None:
+            self._steps.tolerate(context, feedback.error(time, state))
+            return None
+        return control.copy()
+
+    def _feedback(self, context: Context) -> Feedback | None:
+        """The law that is fed back; None where the control has a wire or a fixed value."""
+        if self._fed_back is None:
+            return None
+        found: _FedBack = self.get_cache_entry(self._fed_back).Eval(context)
+        return found.feedback
+
+    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
+        """The parameters of the law that was fed back, as `parameters_along`; None if none was."""
+        self.check_context(context)
+        return self._steps.laws_along(context, vector("times", times, None))
 
     def _otherwise(
         self,
@@ -428,6 +465,9 @@ class DaePlant(ParameterizedSystem):
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
+        feedback = self._feedback(context)
+        if feedback is not None:
+            self._steps.note_law(context, feedback.parameters, begins=True)
         return EventStatus.DidNothing()
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
@@ -473,12 +513,18 @@ class DaePlant(ParameterizedSystem):
         )
 
     def _project(self, context: Context, state: State) -> EventStatus:
-        x = context.get_continuous_state_vector().CopyToVector()
+        x = context.get_continuous_state_vector().value()
+        if self._exogenous is None:
+            parameters = context.get_numeric_parameter(0).value()
+        else:
+            parameters = self._values(context)
         try:
-            x = self.structure.manifold.projected(
-                x, self._values(context), lambda near: self._crosses(near, context)
+            found = self.structure.manifold.projected(
+                x, parameters, lambda near: self._crosses(near, context)
             )
         except InconsistentStateError as error:
-            raise off_manifold(context.get_time(), x, error) from error
-        state.get_mutable_continuous_state().SetFromVector(x)
-        return EventStatus.Succeeded()
+            raise off_manifold(context.get_time(), x.copy(), error) from error
+        if found is x:
+            return _UNCHANGED
+        state.get_mutable_continuous_state().SetFromVector(found)
+        return _CHANGED

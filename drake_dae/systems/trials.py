@@ -9,6 +9,7 @@ and the time of every trial lies after that of the last accepted one. So a block
 each accepted step, and looks at it where a function has no value, and nowhere else.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from weakref import proxy
@@ -69,6 +70,7 @@ class Progress:
         steps: How many steps were accepted.
         mark: The time after the last thousand steps, in s.
         parameters: After which time, in s, the block had which numeric parameters.
+        laws: Likewise those of the law that is fed back to it, if any is.
     """
 
     time: float = inf
@@ -80,6 +82,7 @@ class Progress:
     steps: int = 0
     mark: float = 0.0
     parameters: list[tuple[float, FloatArray]] = field(default_factory=list)
+    laws: list[tuple[float, FloatArray]] = field(default_factory=list)
 
 
 class StepWatch:
@@ -87,9 +90,11 @@ class StepWatch:
 
     Args:
         system: The block; gets two events and a cache entry.
+        sees_steps: Whether it gets the events; without them no state is a trial, and parameters are
+            those of the context.
     """
 
-    def __init__(self, system: LeafSystem) -> None:
+    def __init__(self, system: LeafSystem, sees_steps: bool = True) -> None:
         self._system = proxy(system)
         # It is out of date where parameters have changed, and then they are noted; all else in it
         # is changed by the two events alone.
@@ -98,8 +103,9 @@ class StepWatch:
             ValueProducer(_no_simulation, _note_parameters),
             {system.all_parameters_ticket()},
         ).cache_index()
-        system.DeclareInitializationPublishEvent(weakly(self._begin))
-        system.DeclarePerStepPublishEvent(weakly(self._accept))
+        if sees_steps:
+            system.DeclareInitializationPublishEvent(weakly(self._begin))
+            system.DeclarePerStepPublishEvent(weakly(self._accept))
 
     def tolerate(self, context: Context, error: SimulationError) -> None:
         """Returns if the context holds a trial, at which a failure is an answer.
@@ -120,16 +126,33 @@ class StepWatch:
         if step > SHORTEST * abs(error.time) and progress.failures < FAILURES:
             return
         raise no_step_leads_on(
-            self._system.get_name(), progress.time, progress.state, error, progress.reason
+            self._system.get_name(), progress.time, progress.state.copy(), error, progress.reason
         ) from None
 
     def parameters_along(self, context: Context, times: FloatArray) -> FloatArray:
         """The numeric parameters that the block had at accepted times, in s, one row for each."""
-        seen = self._progress(context).parameters
-        if not seen:
-            return np.tile(_parameters(context), (times.size, 1))
-        last = np.searchsorted([time for time, _ in seen], times) - 1
-        return np.array([values for _, values in seen])[np.maximum(last, 0)]
+        return _along(self._progress(context).parameters or [(0.0, _parameters(context))], times)
+
+    def note_law(self, context: Context, parameters: FloatArray, begins: bool = False) -> None:
+        """Notes the parameters of the law that the block has from the last accepted state on.
+
+        Args:
+            context: The context.
+            parameters: The parameters; not to be changed.
+            begins: Whether a simulation begins there; nothing is noted without one.
+        """
+        progress = self._progress(context)
+        if begins:
+            before = float(np.nextafter(context.get_time(), -inf))
+            progress.laws = [entry for entry in progress.laws if entry[0] < before]
+            progress.laws.append((before, parameters))
+        elif progress.laws:
+            progress.laws.append((progress.time, parameters))
+
+    def laws_along(self, context: Context, times: FloatArray) -> FloatArray | None:
+        """The parameters of the law at accepted times, in s, one row for each; None if unknown."""
+        seen = self._progress(context).laws
+        return _along(seen, times) if seen else None
 
     def _progress(self, context: Context) -> Progress:
         # The object stays the same, and is ours to change.
@@ -143,21 +166,23 @@ class StepWatch:
         seen = [entry for entry in progress.parameters if entry[0] < before]
         if context.num_numeric_parameter_groups():
             seen.append((before, _parameters(context)))
-        vars(progress).update(vars(Progress(time=time, start=time, mark=time, parameters=seen)))
+        begun = Progress(time=time, start=time, mark=time, parameters=seen, laws=progress.laws)
+        vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
         return EventStatus.DidNothing()
 
     def _accept(self, context: Context) -> EventStatus:
-        progress = self._progress(context)
+        progress = self._system.get_cache_entry(self._index).Eval(context)
         time = context.get_time()
         if progress.state.size:
-            state = context.get_continuous_state_vector().value().copy()
-            # The sum takes a fifth of the time, and may overflow.
-            if not (isfinite(sum(state.tolist())) or np.isfinite(state).all()):
+            state = context.get_continuous_state_vector().value()
+            # The square takes a fifth of the time, and may overflow.
+            if not (isfinite(state.dot(state)) or np.isfinite(state).all()):
                 name = self._system.get_name()
-                raise spoilt_step(name, progress.time, time, progress.state, progress.reason)
-            progress.state = state
+                known = progress.state.copy()
+                raise spoilt_step(name, progress.time, time, known, progress.reason)
+            progress.state[...] = state
             progress.steps += 1
             if progress.steps % STEPS == 0:
                 self._check_pace(progress, time)
@@ -170,7 +195,13 @@ class StepWatch:
         before, progress.mark = progress.mark, time
         if time - before < SLOWEST * (time - progress.start):
             name = self._system.get_name()
-            raise endless_steps(name, STEPS, before, time, progress.state)
+            raise endless_steps(name, STEPS, before, time, progress.state.copy())
+
+
+def _along(seen: Sequence[tuple[float, FloatArray]], times: FloatArray) -> FloatArray:
+    """What was seen from after some times on, at other times, one row for each."""
+    last = np.searchsorted([time for time, _ in seen], times) - 1
+    return np.array([values for _, values in seen])[np.maximum(last, 0)]
 
 
 def _no_simulation() -> AbstractValue:

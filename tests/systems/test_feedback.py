@@ -146,6 +146,24 @@ def test_the_value_on_the_wire_depends_on_parameters_and_a_fixed_reference_alone
     assert port.Eval(own) is not changed
 
 
+def test_a_record_knows_when_gains_and_masses_changed():
+    """As in the loop with wires, which notes them at each block."""
+    records = []
+    for each, context in zip(loops(), contexts(), strict=True):
+        for gain, mass in ((-4.0, 12.0), (-9.0, 8.0), (-6.0, 10.0)):
+            own = each.controller.GetMyMutableContextFromRoot(context)
+            each.controller.set_gains(own, poles(gain))
+            own = each.plant.GetMyMutableContextFromRoot(context)
+            each.plant.set_parameter(own, "link1.mass", mass)
+            config = arms.fixed_step()
+            config.start_time = context.get_time()
+            simulate(each.diagram, context, 0.01, config)
+        records.append(each.record(context))
+    assert np.abs(np.diff(records[0]["control"], axis=0)).max() > 1.0
+    for name in records[0].signals:
+        np.testing.assert_array_equal(records[0][name], records[1][name])
+
+
 def test_gradients_are_those_of_the_loop_with_wires():
     """By time, state and all parameters, those of the law too."""
     found = []
@@ -241,3 +259,5 @@ def test_what_cannot_be_fed_back_is_refused():
     free = DaeSystem.from_functions(["a"], f=lambda x: [-x[0]], name="decay")
     with pytest.raises(ModelError, match="decay has no control: no law can be fed back to it"):
         DaePlant(free, feedback=True)
+    with pytest.raises(ModelError, match="a law that is fed back needs references"):
+        TrackingController(arms.law("two_link"), feedback=True)

@@ -30,12 +30,13 @@ from drake_dae import (
 from drake_dae.systems.references import ReferenceGenerator
 
 
-def plant() -> RobotPlant:
-    return RobotPlant(arms.arm("two_link").model, structure=arms.arm("two_link").structure)
+def plant(feedback: bool = False) -> RobotPlant:
+    arm = arms.arm("two_link")
+    return RobotPlant(arm.model, structure=arm.structure, feedback=feedback)
 
 
-def loop() -> ClosedLoop:
-    return make_closed_loop(plant(), arms.law("two_link"), [ConstantReference([0.3, 15.0])])
+def loop(feedback: bool = False) -> ClosedLoop:
+    return make_closed_loop(plant(feedback), arms.law("two_link"), [ConstantReference([0.3, 15.0])])
 
 
 SYSTEMS = {
@@ -65,8 +66,9 @@ def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], Lea
     assert last() is None
 
 
-def test_a_loop_that_ran_is_freed_with_its_context_and_logs():
-    made = loop()
+@pytest.mark.parametrize("feedback", [False, True])
+def test_a_loop_that_ran_is_freed_with_its_context_and_logs(feedback: bool):
+    made = loop(feedback)
     context = made.diagram.CreateDefaultContext()
     simulate(made.diagram, context, 0.02, arms.fixed_step())
     made.record(context)
