@@ -130,6 +130,27 @@ def test_error_control_agrees(name, compiled):
     assert np.max(np.abs(found.record["constraint_residual"])) < 1e-13
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize("mass", [None, 11.0])
+def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass):
+    """To 1e-9, as long as the steps do; also where the plant is not what the law takes it for."""
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6", "compiled=false")
+    loop, context = build_scenario(chosen)
+    if mass is not None:
+        loop.plant.set_parameter(
+            loop.plant.GetMyMutableContextFromRoot(context), "link1.mass", mass
+        )
+    start, parameters = start_values(loop, context)
+    times = [0.0, 0.05, 0.051, 0.4, 1.0]
+    one, other = (
+        rollout(loop, start, parameters, times, config=chosen.integrator, compiled=compiled)[0]
+        for compiled in (False, True)
+    )
+    assert one.steps == other.steps
+    for name, recorded in one.record.signals.items():
+        np.testing.assert_allclose(other.record[name], recorded.values, rtol=1e-9, atol=1e-9)
+
+
 @both
 @pytest.mark.parametrize(
     "settings",
