@@ -49,8 +49,8 @@ class Called:
 class Fused:
     """Plant, law, references and sensor as one function.
 
-    All functions take the time, the state with that of the sensor, what the sensor holds (or its
-    noise), and the parameters of plant and law.
+    All functions take the time, the state with that of the sensor and the law's integrals, what the
+    sensor holds (or its noise), and the parameters of plant and law.
 
     Attributes:
         functions: The closed loop.
@@ -61,7 +61,7 @@ class Fused:
     def __init__(self, functions: LoopFunctions) -> None:
         self.functions = functions
         loop, dae = functions.loop, functions.loop.plant.dae
-        size = dae.num_states + functions.num_lags
+        size = functions.size
         self._sizes = sizes = (
             1,
             size,
@@ -84,6 +84,7 @@ class Fused:
         rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
         valid += checks[-1] + of_rest[-1]
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
+        row = ca.vertcat(row, state[size - functions.num_integrals :])
         self._rows = Many(ca.Function("rows", inputs, [row, valid], options))
         self._projection = self._project_function()
         self._projections = Many(self._projection)
@@ -114,7 +115,7 @@ class Fused:
         if sensor is None or not sensor.sample_period:
             return noise
         if self.functions.num_lags:
-            force = state[-self.functions.num_lags :]
+            force = self.functions.felt(state)
         else:
             rate = self.rate(time, state, hold, plant, law)
             force = self._called.results[1] + rate[0] * 0.0
@@ -243,7 +244,7 @@ class Fused:
         """(t, state, the plant's parameters) -> the state after two Newton steps, and the last."""
         functions, loop = self.functions, self.functions.loop
         dae = loop.plant.dae
-        sizes = [1, dae.num_states + functions.num_lags, functions.plant.sizes[-1]]
+        sizes = [1, functions.size, functions.plant.sizes[-1]]
         symbols = [ca.SX.sym("x", size) for size in sizes]
         time, state, plant = symbols
         x, left = state[: dae.num_states], ca.SX(0.0)

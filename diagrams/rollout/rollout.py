@@ -118,7 +118,8 @@ def run_loop(
     check_choice("rollout", choice)
     moments = _times(times)
     functions = functions_of(loop)
-    scale = np.concatenate([loop.plant.dae.scale, np.ones(functions.num_lags)])
+    scale = np.ones(functions.size)
+    scale[: loop.plant.dae.num_states] = loop.plant.dae.scale
     settings = Settings.of(config, scale)
     problems = _problems(functions, starts, parameters, moments, seeds)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
@@ -163,19 +164,19 @@ def start_values(loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatA
         context: Its context.
 
     Returns:
-        The state x, then of a force sensor its state, if it has a lag, and what it holds, if it
-        samples, shape (n,); and the parameters of the plant, then the model's of the law and its
-        gains, shape (m,).
+        The state x, then of a force sensor its state, if it has a lag, the integrals of the law,
+        and what the sensor holds, if it samples, shape (n,); and the parameters of the plant, then
+        the model's of the law and its gains, shape (m,).
     """
-    plant, controller, sensor = loop.plant, loop.controller, loop.sensor
-    own = plant.GetMyContextFromRoot(context)
+    plant, sensor = loop.plant, loop.sensor
+    own, law = (block.GetMyContextFromRoot(context) for block in (plant, loop.controller))
+    felt = sensor.GetMyContextFromRoot(context) if sensor is not None else None
     parts = [plant.state(own)]
-    if sensor is not None:
-        felt = sensor.GetMyContextFromRoot(context)
-        parts.append(felt.get_continuous_state_vector().CopyToVector())
-        if felt.num_discrete_state_groups():
-            parts.append(felt.get_discrete_state(0).value())
-    law = controller.GetMyContextFromRoot(context)
+    for each in (felt, law):
+        if each is not None:
+            parts.append(each.get_continuous_state_vector().CopyToVector())
+    if felt is not None and felt.num_discrete_state_groups():
+        parts.append(felt.get_discrete_state(0).value())
     values = [block.get_numeric_parameter(0).value() for block in (own, law)]
     return np.concatenate(parts), np.concatenate(values)
 
@@ -246,10 +247,13 @@ def _problems(
     seeds: Sequence[int] | None,
 ) -> list[Problem]:
     loop = functions.loop
-    default, values = start_values(loop, loop.diagram.CreateDefaultContext())
+    samples = Samples.of(loop, times)
+    size, split = functions.size, functions.plant.sizes[-1]
+    if parameters is None:
+        parameters = start_values(loop, loop.diagram.CreateDefaultContext())[1]
     hint = "see start_values"
-    states = _table("starts", starts, default.size, hint)
-    given = _table("parameters", values if parameters is None else parameters, values.size, hint)
+    states = _table("starts", starts, size + samples.holds * samples.size, hint)
+    given = _table("parameters", parameters, split + functions.law.sizes[-1], hint)
     count = len(states)
     if len(given) not in (1, count):
         raise ModelError(f"{len(given)} rows of parameters for {count} starts")
@@ -258,10 +262,7 @@ def _problems(
     bad = [seed for seed in seeds or () if not 0 <= seed < 2**32]
     if bad:
         raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
-    rows = np.broadcast_to(given, (count, values.size))
-    samples = Samples.of(loop, times)
-    size = loop.plant.dae.num_states + functions.num_lags
-    split = functions.plant.sizes[-1]
+    rows = np.broadcast_to(given, (count, given.shape[1]))
     problems, lock = [], Lock()
     for index, (start, row) in enumerate(zip(states, rows, strict=True)):
         plant, law = row[:split].copy(), row[split:].copy()
