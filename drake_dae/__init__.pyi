@@ -45,8 +45,8 @@ from .diagrams.closed_loop import make_closed_loop as make_closed_loop
 from .diagrams.contact_material import ContactMaterial as ContactMaterial
 from .diagrams.contact_plant import ContactPlant as ContactPlant
 from .diagrams.export.export import export_code as export_code
+from .diagrams.rollout.problems import start_values as start_values
 from .diagrams.rollout.rollout import rollout as rollout
-from .diagrams.rollout.rollout import start_values as start_values
 from .diagrams.scenario import load_scenario as load_scenario
 from .diagrams.scenario import scenario_schema as scenario_schema
 from .diagrams.scenario_model import complete_scenario as complete_scenario

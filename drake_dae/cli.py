@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--rollout",
         action="store_true",
         help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
-        "fast where it is machine code, twice as fast where not; the record has every fixed "
+        "fast where it is machine code, five times as fast where not; the record has every fixed "
         "step, or 1000 rows under error control",
     )
     shown = commands.add_parser("view", help="open the animation of a run in the browser")

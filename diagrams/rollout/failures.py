@@ -72,7 +72,9 @@ def _reason(
         law[loop.controller.exogenous_places] = of_law
     measured = [functions.measured(state, problem.hold)] if loop.sensor is not None else []
     control = np.zeros(dae.num_controls)
-    if functions.is_direct:
+    if functions.is_direct and not loop.controller.law.control_takes_force:
+        measured = [np.zeros(dae.num_constraints)]
+    elif functions.is_direct:
         measured = [functions.plant(x, control, plant)[1]]
     signals = {
         "state": dae.state_signals,
@@ -80,7 +82,8 @@ def _reason(
         "reference": loop.controller.law.reference_signals,
         "measured_force": dae.constraint_input_signals,
     }
-    control = functions.law(x, reference, *measured, law)[0]
+    integral = [functions.integral(state)] if functions.num_integrals else []
+    control = functions.law(x, reference, *measured, *integral, law)[0]
     if not functions.law.is_valid:
         return simulation_error(functions.law.failure(), time, x, signals)
     functions.plant(x, control, plant)

@@ -51,9 +51,10 @@ class LoopFunctions:
     def motion(self) -> ca.Function:
         """Plant, law and sensor at once: what both compute of the state is computed once.
 
-        A function of the state with that of the sensor, of R, of what the sensor holds (or its
-        noise), and of the parameters of plant and law. It returns the derivative, v, a number that
-        is finite if all have values and all matrices are regular, u, and the measured force.
+        A function of the state with that of the sensor and the law's integrals, of R, of what the
+        sensor holds (or its noise), and of the parameters of plant and law. It returns the
+        derivative, v, a number that is finite if all have values and all matrices are regular, u,
+        and the measured force.
         """
         return self._motions[0]
 
@@ -68,9 +69,9 @@ class LoopFunctions:
     @cached_property
     def _motions(self) -> tuple[ca.Function, ca.Function]:
         loop, dae = self.loop, self.loop.plant.dae
-        lags, sensor = self.num_lags, loop.sensor
+        lags, sensor, traced = self.num_lags, loop.sensor, loop.controller.law
         sizes = (
-            dae.num_states + lags,
+            self.size,
             self.law.sizes[1],
             dae.num_constraints,
             self.plant.sizes[-1],
@@ -81,20 +82,29 @@ class LoopFunctions:
         state, reference, hold, plant, law = inputs
         if self.is_model:
             plant, law = self._one_model(plant, law)
-        x, felt, measured = state[: dae.num_states], state[dae.num_states :], []
-        if self.is_direct:
+        places = np.cumsum([0, dae.num_states, lags, self.num_integrals]).tolist()
+        x, felt, sigma = ca.vertsplit(state, places)
+        measured, integral = [], [sigma] if self.num_integrals else []
+        if self.is_direct and not traced.control_takes_force:
+            measured = [ca.SX.zeros(dae.num_constraints)]
+        elif self.is_direct:
             measured = [self.plant.function(x, ca.SX.zeros(dae.num_controls), plant)[1]]
         elif sensor is not None and sensor.sample_period:
             measured = [hold]
         elif sensor is not None:
             measured = [felt + sensor.bias + sensor.noise_deviation * hold]
-        control, _, *of_law = self.law.function(x, reference, *measured, law)
+        given = [x, reference, *measured, *integral, law]
+        control, _, *of_law = self.law.function(*given)
         shown = [control, measured[0] if sensor is not None else ca.SX(0, 1)]
 
         def moved(by: TracedFunction, *arguments: ca.SX) -> list[ca.SX]:
             rate, force, *checks = by.function(*arguments)
             if lags and sensor is not None:
                 rate = ca.vertcat(rate, (force - felt) / sensor.time_constant)
+            if integral:
+                read = [force] if self.is_direct else measured
+                rates = self.law.function(x, reference, *read, *integral, law)[2]
+                rate = ca.vertcat(rate, rates)
             return [rate, force, checks[-1]]
 
         def function(values: list[ca.SX], *more: ca.SX) -> ca.Function:
@@ -103,9 +113,9 @@ class LoopFunctions:
             return ca.Function("motion", inputs, ca.cse(values), {"cse": False})
 
         both = function(moved(self.plant, x, control, plant), *shown)
-        under = self.loop.controller.law.trace_motion() if self.is_model else None
+        under = traced.trace_motion() if self.is_model else None
         if under is not None:
-            values = moved(under, x, reference, *measured, law)
+            values = moved(under, *given)
             if function(values).n_instructions() < 0.9 * both.n_instructions():
                 return function(values, *shown), function(values)
         return both, both
@@ -135,6 +145,25 @@ class LoopFunctions:
         sensor = self.loop.sensor
         return self.loop.plant.dae.num_constraints if sensor and sensor.time_constant else 0
 
+    @property
+    def num_integrals(self) -> int:
+        """How many errors the law integrates."""
+        return len(self.loop.controller.law.integral.outputs)
+
+    @property
+    def size(self) -> int:
+        """How many states there are: those of the plant, of the sensor, and of the law."""
+        return self.loop.plant.dae.num_states + self.num_lags + self.num_integrals
+
+    def integral(self, state: FloatArray) -> FloatArray:
+        """The integrals of the law, shape (k,), in a state."""
+        return state[self.size - self.num_integrals :]
+
+    def felt(self, state: FloatArray) -> FloatArray:
+        """The state of the sensor, shape (m,), in a state."""
+        first = self.loop.plant.dae.num_states
+        return state[first : first + self.num_lags]
+
     def plant_parameters(self, values: FloatArray) -> Callable[[float], FloatArray]:
         """The plant's parameters at a time in s, those that move as they are then.
 
@@ -156,13 +185,13 @@ class LoopFunctions:
         """What the sensor measures, shape (m,).
 
         Args:
-            state: x, and then the state of the sensor if it has a lag.
+            state: x, then the state of the sensor if it has a lag, and the integrals.
             hold: What it holds if it samples, else its noise.
         """
         sensor = self.loop.sensor
         if sensor is None or sensor.sample_period:
             return hold
-        return state[-self.num_lags :] + sensor.bias + sensor.noise_deviation * hold
+        return self.felt(state) + sensor.bias + sensor.noise_deviation * hold
 
     @property
     def num_operations(self) -> int:
@@ -185,6 +214,7 @@ class LoopFunctions:
             "reference": loop.controller.law.reference_signals,
             "exogenous": moving if "exogenous" in loop.signals else (),
             "measured_force": dae.constraint_input_signals if loop.sensor else (),
+            "integral": loop.controller.law.integral.signals,
         }
 
 
@@ -193,11 +223,10 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
 
     Raises:
         ModelError: A reference is no expression of time, or the loop has what no rollout has:
-            Drake's own contact, integrals of the law, a sampled law, or drives with limits.
+            Drake's own contact, a sampled law, or drives with limits.
     """
     plant, law = loop.plant, loop.controller.law
     unknown = "Drake's own contact" if not isinstance(plant, DaePlant) else ""
-    unknown = unknown or ("integrals" if law.integral.outputs else "")
     unknown = unknown or (
         "a sampled law, or drives with limits" if "control" in loop.loggers else ""
     )

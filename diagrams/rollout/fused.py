@@ -5,30 +5,70 @@ from math import isfinite
 
 import casadi as ca
 import numpy as np
+from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.rollout.functions import LoopFunctions
+from drake_dae.diagrams.rollout.many import Many
 from drake_dae.diagrams.rollout.run import Tableau
 
 CHUNK = 64
-"""So many evaluations are one call of CasADi."""
+"""So many fixed steps are one call of CasADi."""
+
+
+class Called:
+    """A CasADi function that is called on arrays of its own; a column of its is a row of these.
+
+    Args:
+        function: The function; its inputs and outputs are dense.
+
+    Attributes:
+        results: Its outputs, written over by each call, shapes (n,) or (k, n).
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        def array(shape: tuple[int, int]) -> FloatArray:
+            return np.zeros(shape[::-1] if shape[1] > 1 else shape[0])
+
+        self._arrays = [array(function.size_in(i)) for i in range(function.n_in())]
+        self.results = [array(function.size_out(i)) for i in range(function.n_out())]
+        self._buffer, self._evaluate = function.buffer()
+        for index, own in enumerate(self._arrays):
+            self._buffer.set_arg(index, own.reshape(-1).data)
+        for index, own in enumerate(self.results):
+            self._buffer.set_res(index, own.reshape(-1).data)
+
+    def __call__(self, *arguments: FloatArray | float) -> list[FloatArray]:
+        """The outputs."""
+        for array, given in zip(self._arrays, arguments, strict=True):
+            array[...] = given
+        self._evaluate()
+        return self.results
 
 
 class Fused:
     """Plant, law, references and sensor as one function.
 
-    All functions take the time, the state with that of the sensor, what the sensor holds (or its
-    noise), and the parameters of plant and law.
+    All functions take the time, the state with that of the sensor and the law's integrals, what the
+    sensor holds (or its noise), and the parameters of plant and law.
 
     Attributes:
         functions: The closed loop.
+        controlled: A step of DOP853, as `controlled_step` has it.
+        between: What lies between its ends, as `interpolant` has it.
     """
 
     def __init__(self, functions: LoopFunctions) -> None:
         self.functions = functions
         loop, dae = functions.loop, functions.loop.plant.dae
-        size = dae.num_states + functions.num_lags
-        sizes = (1, size, dae.num_constraints, functions.plant.sizes[-1], functions.law.sizes[-1])
+        size = functions.size
+        self._sizes = sizes = (
+            1,
+            size,
+            dae.num_constraints,
+            functions.plant.sizes[-1],
+            functions.law.sizes[-1],
+        )
         names = ("time", "state", "hold", "plant", "law")
         inputs = [ca.SX.sym(name, count) for name, count in zip(names, sizes, strict=True)]
         time, state, hold, plant, law = inputs
@@ -42,28 +82,22 @@ class Fused:
         self._rate = ca.Function("rate", inputs, [rate, force, valid + checks[-1]], options)
         _, force, valid, control, measured = functions.motion(state, reference, hold, plant, law)
         rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
-        valid += checks[-1]
+        valid += checks[-1] + of_rest[-1]
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
-        rows = ca.Function("rows", inputs, [row, valid + of_rest[-1]], options)
-        self._rows = rows.map(CHUNK)
+        row = ca.vertcat(row, state[size - functions.num_integrals :])
+        self._rows = Many(ca.Function("rows", inputs, [row, valid], options))
         self._projection = self._project_function()
-        self._projections = self._projection.map(CHUNK)
-        self._steps: dict[bytes, tuple[ca.Function, ca.Function]] = {}
-        self._arrays = [np.zeros(count) for count in sizes]
-        self._results = [np.zeros(size), np.zeros(dae.num_constraints), np.zeros(1)]
-        self._buffer, self._evaluate = self._rate.buffer()
-        for index, array in enumerate(self._arrays):
-            self._buffer.set_arg(index, array.data)
-        for index, array in enumerate(self._results):
-            self._buffer.set_res(index, array.data)
+        self._projections = Many(self._projection)
+        self._steps: dict[bytes, tuple[Called, Called]] = {}
+        self._called = Called(self._rate)
+        self.controlled = Called(self._controlled_step())
+        self.between = Called(self._interpolant())
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
         """The derivative of the state, a fresh array; nan where it has no value."""
-        for array, given in zip(self._arrays, arguments, strict=True):
-            array[...] = given
-        self._evaluate()
-        values = self._results[0].copy()
-        if not isfinite(self._results[2][0]):
+        rate, _, valid = self._called(*arguments)
+        values = rate.copy()
+        if not isfinite(valid[0]):
             values[:] = np.nan
         return values
 
@@ -81,28 +115,30 @@ class Fused:
         if sensor is None or not sensor.sample_period:
             return noise
         if self.functions.num_lags:
-            force = state[-self.functions.num_lags :]
+            force = self.functions.felt(state)
         else:
-            force = self._results[1] + self.rate(time, state, hold, plant, law)[0] * 0.0
+            rate = self.rate(time, state, hold, plant, law)
+            force = self._called.results[1] + rate[0] * 0.0
         return force + sensor.bias + sensor.noise_deviation * noise
 
     def rows(
         self,
-        moments: Sequence[tuple[float, FloatArray, FloatArray]],
+        times: FloatArray,
+        states: FloatArray,
+        holds: FloatArray,
         plant: FloatArray,
         law: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Rows of the record, and which of them have values.
 
         Args:
-            moments: Times, states, and what the sensor holds.
+            times: Their times, shape (k,).
+            states: The states, shape (k, n).
+            holds: What the sensor holds, shape (k, m).
             plant, law: The parameters.
         """
-        columns = [
-            np.array(values).reshape(len(moments), -1).T for values in zip(*moments, strict=True)
-        ]
-        rows, valid = _mapped(self._rows, columns, [plant, law])
-        return rows.T, np.isfinite(valid[0])
+        rows, valid = self._rows(times[:, None], states, holds, plant, law)
+        return rows, np.isfinite(valid[:, 0])
 
     def projections(
         self, times: FloatArray, states: FloatArray, plant: FloatArray
@@ -114,14 +150,11 @@ class Fused:
             states: The states, shape (k, n).
             plant: The plant's parameters.
         """
-        if len(times) == 1:
-            one, length = self._projection(times, states[0], plant)
-            return np.array(one).T, np.array(length)[0]
-        found, left = _mapped(self._projections, [times[None], states.T], [plant])
-        return found.T, left[0]
+        found, left = self._projections(times[:, None], states, plant)
+        return found, left[:, 0]
 
-    def steps(self, tableau: Tableau) -> tuple[ca.Function, ca.Function]:
-        """A fixed step, and many of them as one function.
+    def steps(self, tableau: Tableau) -> tuple[Called, Called]:
+        """A fixed step, as `_step` has it, and many of them as one function.
 
         Args:
             tableau: The method.
@@ -129,8 +162,11 @@ class Fused:
         key = tableau.a.tobytes() + tableau.b.tobytes()
         if key not in self._steps:
             one = self._step(tableau)
-            self._steps[key] = one, one.mapaccum("steps", CHUNK, 1)
+            self._steps[key] = Called(one), Called(one.mapaccum("steps", CHUNK, 1))
         return self._steps[key]
+
+    def _symbols(self) -> list[ca.MX]:
+        return [ca.MX.sym("x", size) for size in self._sizes]
 
     def _step(self, tableau: Tableau) -> ca.Function:
         """A fixed step: the projection by two Newton steps, then a Runge-Kutta step.
@@ -138,51 +174,95 @@ class Fused:
         A function of state, time, step, what is held, and parameters; it returns the state, and
         below each other what is finite if all has values, and the length of the last Newton step.
         """
-        time, state, hold, plant, law = (ca.MX.sym("x", each.size) for each in self._arrays)
+        time, state, hold, plant, law = self._symbols()
         step = ca.MX.sym("step")
         symbols = [state, time, step, hold, plant, law]
         state, left = self._projection(time, state, plant)
         rates: list[ca.MX] = []
         finite = ca.MX(0.0)
         for row, part in zip(tableau.a, tableau.c, strict=True):
-            change = sum((w * rate for w, rate in zip(row, rates, strict=False) if w), ca.MX(0.0))
-            stage = state + step * change
+            stage = state + step * _weighted(row, rates)
             rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
             rates.append(rate)
             finite += valid
-        reached = state + step * sum(w * rate for w, rate in zip(tableau.b, rates, strict=True))
+        reached = state + step * _weighted(tableau.b, rates)
         checks = ca.vertcat(finite + ca.sum1(reached), left)
         return ca.Function("step", symbols, [reached, checks])
+
+    def _controlled_step(self) -> ca.Function:
+        """A step of DOP853 from a state on N* to the next one.
+
+        A function of what all functions take, of the rate there, the step, and the absolute and the
+        relative error that it may make. It returns the state that is reached, on N*; the rate
+        there; below each other the squares of both error estimates over what they may be, what is
+        finite if all stages have values, the length of the last Newton step, and what is finite if
+        the rate has a value; and the rates of all stages side by side.
+        """
+        symbols = time, state, hold, plant, law = self._symbols()
+        first, step = ca.MX.sym("first", self._sizes[1]), ca.MX.sym("step")
+        absolute, relative = ca.MX.sym("absolute", self._sizes[1]), ca.MX.sym("relative")
+        rates, finite = [first], ca.MX(0.0)
+        for row, part in zip(DOP853.A[1:], DOP853.C[1:], strict=True):
+            stage = state + step * _weighted(row, rates)
+            rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
+            rates.append(rate)
+            finite += valid
+        reached = state + step * _weighted(DOP853.B, rates)
+        unit = absolute + ca.fmax(ca.fabs(state), ca.fabs(reached)) * relative
+        errors = [ca.sumsqr(_weighted(e, rates) / unit) for e in (DOP853.E5, DOP853.E3)]
+        found, left = self._projection(time + step, reached, plant)
+        last, _, valid = self._rate(time + step, found, hold, plant, law)
+        checks = ca.vertcat(*errors, finite, left, valid)
+        symbols = [*symbols, first, step, absolute, relative]
+        return ca.Function("controlled", symbols, [found, last, checks, ca.horzcat(*rates)])
+
+    def _interpolant(self) -> ca.Function:
+        """What lies between the ends of a step of DOP853.
+
+        A function of what all functions take, of the step, its stages, the state that it reached
+        and the rate there. It returns the coefficients of the interpolant side by side.
+        """
+        symbols = time, state, hold, plant, law = self._symbols()
+        size, step = self._sizes[1], ca.MX.sym("step")
+        stages = ca.MX.sym("stages", size, len(DOP853.B))
+        reached, last = ca.MX.sym("reached", size), ca.MX.sym("last", size)
+        rates = [*ca.horzsplit(stages), last]
+        for row, part in zip(DOP853.A_EXTRA, DOP853.C_EXTRA, strict=True):
+            stage = state + step * _weighted(row, rates)
+            rates.append(self._rate(time + part * step, stage, hold, plant, law)[0])
+        change = reached - state
+        parts = [
+            change,
+            step * rates[0] - change,
+            2.0 * change - step * (last + rates[0]),
+            *(step * _weighted(row, rates) for row in DOP853.D),
+        ]
+        symbols = [*symbols, step, stages, reached, last]
+        return ca.Function("between", symbols, [ca.horzcat(*parts)])
 
     def _project_function(self) -> ca.Function:
         """(t, state, the plant's parameters) -> the state after two Newton steps, and the last."""
         functions, loop = self.functions, self.functions.loop
         dae = loop.plant.dae
-        sizes = [1, dae.num_states + functions.num_lags, functions.plant.sizes[-1]]
-        symbols = [ca.MX.sym("x", size) for size in sizes]
+        sizes = [1, functions.size, functions.plant.sizes[-1]]
+        symbols = [ca.SX.sym("x", size) for size in sizes]
         time, state, plant = symbols
-        x, left = state[: dae.num_states], ca.MX(0.0)
+        x, left = state[: dae.num_states], ca.SX(0.0)
         if loop.plant.projects:
             moving, own = functions.signals.function(time)[1], plant
             if loop.exogenous is not None:
-                own = ca.MX(plant)
+                own = ca.SX(plant)
                 own[loop.plant.exogenous_places] = moving
             at = x
             for _ in range(2):
                 change = functions.newton.function(x, at, own)[0]
                 x, left = x + ca.DM(dae.scale) * change, ca.norm_2(change)
-        state = ca.vertcat(x, state[dae.num_states :])
-        return ca.Function("projection", symbols, [state, left])
+        # Gradients of both steps are those at the start: they are computed once.
+        values = ca.cse([ca.densify(ca.vertcat(x, state[dae.num_states :])), ca.densify(left)])
+        return ca.Function("projection", symbols, values, {"cse": False})
 
 
-def _mapped(
-    function: ca.Function, columns: Sequence[FloatArray], shared: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """A mapped function at any number of columns: the last one fills what is left."""
-    count = columns[0].shape[1]
-    parts = []
-    for first in range(0, count, CHUNK):
-        chosen = np.minimum(np.arange(first, first + CHUNK), count - 1)
-        values = function(*(values[:, chosen] for values in columns), *shared)
-        parts.append([np.array(value)[:, : count - first] for value in values])
-    return [np.hstack(values) for values in zip(*parts, strict=True)]
+def _weighted(weights: FloatArray, rates: Sequence[ca.MX]) -> ca.MX:
+    """The weighted sum of rates; weights that are zero, or too many, count for nothing."""
+    pairs = zip(weights.tolist(), rates, strict=False)
+    return sum((weight * rate for weight, rate in pairs if weight), ca.MX(0.0))

@@ -1,140 +1,20 @@
-"""A closed loop stepped without a compiler: CasADi maps fixed steps, SciPy controls the error."""
+"""A closed loop stepped without a compiler: a step, or many, are one call of CasADi."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from itertools import pairwise
+from math import isfinite, sqrt
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.rollout.course import REACHED, Course, Ended, Rows, Step
 from drake_dae.diagrams.rollout.fused import CHUNK, Fused
 from drake_dae.diagrams.rollout.run import Ending, Problem, Run, Settings, Tableau
-from drake_dae.errors import InconsistentStateError
-from drake_dae.systems.trials import SLOWEST, STEPS
 
-REACHED = 1e-11
-"""A Newton step longer than this, the second, says that N* was not reached in two."""
+SHORTEST = 1e-12
+"""A step that is shorter than this, relative to the time, is none."""
 
-
-class _Ended(Exception):
-    """The run cannot go on."""
-
-    def __init__(self, ending: Ending) -> None:
-        self.ending = ending
-
-
-@dataclass(eq=False)
-class _Course:
-    """A run under way; see `Run` and `Problem`."""
-
-    fused: Fused
-    problem: Problem
-    time: float
-    state: FloatArray
-    hold: FloatArray
-    rows: list[tuple[float, FloatArray, FloatArray]] = field(default_factory=list)
-    apart: list[int] = field(default_factory=list)
-    event: int = 0
-    steps: int = 0
-    before: float = 0.0
-    mark: float = 0.0
-    next: float = 0.0
-    trial_time: float = np.inf
-    trial: FloatArray = field(default_factory=lambda: np.full(1, np.nan))
-
-    def rate(self, time: float, state: FloatArray) -> FloatArray:
-        """The derivative; nan where it has no value, and the earliest such trial is kept."""
-        values = self.fused.rate(time, state, self.hold, self.problem.plant, self.problem.law)
-        if np.isnan(values[0]) and time < self.trial_time and np.isfinite(state).all():
-            self.trial_time, self.trial = time, state.copy()
-        return values
-
-    def accepted_rate(self) -> FloatArray:
-        """The derivative at the accepted state."""
-        values = self.rate(self.time, self.state)
-        if np.isnan(values[0]):
-            raise _Ended(Ending.INVALID)
-        return values
-
-    def projected(self, time: float, state: FloatArray) -> FloatArray:
-        """A state on N*."""
-        if not self.fused.functions.loop.plant.projects:
-            return state
-        states, left = self.fused.projections(np.array([time]), state[None], self.problem.plant)
-        if left[0] <= REACHED:
-            return states[0]
-        try:
-            found = self.problem.project(time, state)
-        except InconsistentStateError:
-            raise _Ended(Ending.OFF_MANIFOLD) from None
-        return np.concatenate([found, state[found.size :]])
-
-    def update(self) -> None:
-        """What happens at the start of a step: the projection, then a sample."""
-        self.state = self.projected(self.time, self.state)
-        problem = self.problem
-        while self.event < problem.events.size and problem.events[self.event] <= self.time:
-            noise = problem.noise[self.event]
-            self.hold = self.fused.sample(
-                self.time, self.state, self.hold, noise, problem.plant, problem.law
-            )
-            if not np.isfinite(self.hold).all():
-                raise _Ended(Ending.INVALID)
-            self.event += 1
-
-    def accept(self, time: float, state: FloatArray) -> None:
-        """Takes over a step; refuses one in a thousand that hardly led on."""
-        self.time, self.state = time, state
-        self.steps += 1
-        self.trial_time = np.inf
-        if self.steps % STEPS == 0:
-            self.before, self.mark = self.mark, time
-            if time - self.before < SLOWEST * (time - self.problem.times[0]):
-                raise _Ended(Ending.SLOW)
-
-    def write(self, time: float, state: FloatArray) -> None:
-        """Keeps a row of the record."""
-        self.rows.append((time, state, self.hold))
-
-    def boundary(self) -> float:
-        """The next time at which a sample changes what is held, or the last one."""
-        end, events = self.problem.times[-1], self.problem.events[self.event :]
-        return float(min(end, events[0])) if events.size else float(end)
-
-    def _project_rows(self) -> None:
-        """Puts rows that an interpolant gave on N*."""
-        if not (self.apart and self.fused.functions.loop.plant.projects):
-            return
-        times = np.array([self.rows[index][0] for index in self.apart])
-        states = np.array([self.rows[index][1] for index in self.apart])
-        found, left = self.fused.projections(times, states, self.problem.plant)
-        for index, state, length in zip(self.apart, found, left, strict=True):
-            time, other, hold = self.rows[index]
-            if not length <= REACHED:
-                state = self.projected(time, other)
-            self.rows[index] = time, state, hold
-
-    def finish(self, ending: Ending) -> Run:
-        """What the run came to."""
-        self._project_rows()
-        rows, valid = self.fused.rows(self.rows, self.problem.plant, self.problem.law)
-        count = int(np.argmin(np.append(valid, False)))
-        if count < len(valid):
-            ending = Ending.INVALID
-            self.trial_time, self.trial = self.rows[count][0], self.rows[count][1]
-            self.time, self.state = self.trial_time, self.trial
-        return Run(
-            rows[:count],
-            ending,
-            self.time,
-            self.state,
-            self.steps,
-            self.before,
-            self.next,
-            self.trial_time,
-            self.trial,
-        )
+MOST_FAILURES = 100
+"""So many trials of a step may fail for another reason than its error."""
 
 
 def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
@@ -150,7 +30,7 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
 
     def run(problem: Problem) -> Run:
         start = float(problem.times[0])
-        course = _Course(
+        course = Course(
             fused, problem, start, problem.state, problem.hold, before=start, mark=start
         )
         try:
@@ -158,53 +38,102 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
                 _control(course, settings)
             else:
                 steps.run(course)
-        except _Ended as ended:
+        except Ended as ended:
             return course.finish(ended.ending)
         return course.finish(Ending.DONE)
 
     return run
 
 
-def _control(course: _Course, settings: Settings) -> None:
-    """Error control by SciPy's DOP853; rows between steps from its interpolant, on N*."""
-    times, row, longer = course.problem.times, 1, None
-    apart = course.apart
+def _control(course: Course, settings: Settings) -> None:
+    """Error control by DOP853 as in stepper.c; rows between steps from its interpolant, on N*."""
+    times, row, tried = course.problem.times, 1, 0.0
+    rate: FloatArray | None = None
     course.write(course.time, course.state)
     while course.time < times[-1]:
-        course.update()
-        course.accepted_rate()
+        if course.update(is_on=rate is not None):
+            rate = None
+        if rate is None:
+            rate = course.accepted_rate()
         limit = course.boundary()
-        solver = DOP853(
-            course.rate,
+        tried = tried or _first_step(course, rate, settings)
+        step = _controlled(course, settings, rate, min(tried, settings.longest), limit)
+        stop = min(int(np.searchsorted(times, step.end)), times.size - 1)
+        if row < stop:
+            course.write_between(step, times[row:stop])
+        row = stop
+        course.accept(step.end, step.reached)
+        rate = step.rate if step.is_on else None
+        if row < times.size - 1 and times[row] == course.time:
+            if not step.is_on:
+                course.state = course.projected(course.time, course.state)
+            course.write(course.time, course.state)
+            row += 1
+        # A step that only ended early, at a sample, says nothing against longer ones.
+        shortened = step.size < tried and not step.rejected
+        tried = max(step.following, tried if shortened else 0.0)
+    course.update(is_on=rate is not None)
+    course.write(course.time, course.state)
+
+
+def _controlled(
+    course: Course, settings: Settings, rate: FloatArray, size: float, limit: float
+) -> Step:
+    """An accepted step from where a course is, at most to a limit in s."""
+    problem, failures, rejected = course.problem, 0, False
+    while True:
+        end = course.time + size
+        if end >= limit - SHORTEST * abs(limit):
+            end = limit
+        size = end - course.time
+        if not size > SHORTEST * abs(course.time) or failures > MOST_FAILURES:
+            raise Ended(Ending.STUCK)
+        reached, last, checks, stages = course.fused.controlled(
             course.time,
             course.state,
-            limit,
-            max_step=settings.longest,
-            rtol=settings.relative,
-            atol=settings.absolute,
-            first_step=longer and min(longer, limit - course.time),
+            course.hold,
+            problem.plant,
+            problem.law,
+            rate,
+            size,
+            settings.absolute,
+            settings.relative,
         )
-        while solver.status == "running":
-            solver.step()
-            if solver.status == "failed":
-                raise _Ended(Ending.STUCK)
-            between = None
-            while row < times.size - 1 and times[row] < solver.t:
-                between = between or solver.dense_output()
-                course.write(times[row], between(times[row]))
-                apart.append(len(course.rows) - 1)
-                row += 1
-            course.accept(solver.t, solver.y)
-            solver.y = course.state = course.projected(course.time, course.state)
-            if row < times.size - 1 and times[row] == course.time:
-                course.write(course.time, course.state)
-                row += 1
-            if solver.status == "running":
-                solver.f = course.accepted_rate()
-        # A step that only ended early, at a sample, says nothing against longer ones.
-        longer = max(solver.h_abs, longer or 0.0)
-    course.update()
-    course.write(course.time, course.state)
+        fifth, third, finite, left, valid = checks.tolist()
+        is_on, good = left <= REACHED, isfinite(finite)
+        error = size * fifth / sqrt((fifth + 0.01 * third) * rate.size) if fifth else 0.0
+        factor = 10.0 if error == 0.0 else min(10.0, max(0.2, 0.9 * error**-0.125))
+        if not good:
+            course.note_stages(rate, size)
+        elif error < 1.0 and is_on and not isfinite(valid):
+            course.rate(end, reached)
+            good = False
+        elif error < 1.0:
+            following = size * (min(1.0, factor) if rejected else factor)
+            values = reached.copy(), last.copy(), stages
+            return Step(end, size, *values, is_on, following, rejected)
+        failures += not good
+        size *= factor if good else 0.2
+        rejected = True
+
+
+def _first_step(course: Course, rate: FloatArray, settings: Settings) -> float:
+    """A first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4)."""
+    state, longest = course.state, settings.longest
+    unit = settings.absolute + np.abs(state) * settings.relative
+
+    def weighted(vector: FloatArray) -> float:
+        return float(np.sqrt(np.mean(np.square(vector / unit))))
+
+    d0, d1 = weighted(state), weighted(rate)
+    h0 = min(1e-6 if d0 < 1e-5 or d1 < 1e-5 else 0.01 * d0 / d1, longest)
+    other = course.rate(course.time + h0, state + h0 * rate)
+    if np.isnan(other[0]):
+        return h0
+    d2 = weighted(other - rate) / h0
+    still = d1 <= 1e-15 and d2 <= 1e-15
+    h1 = max(1e-6, h0 * 1e-3) if still else (0.01 / max(d1, d2)) ** 0.125
+    return min(100.0 * h0, h1, longest)
 
 
 class _Steps:
@@ -214,7 +143,7 @@ class _Steps:
         self._tableau, self._longest = tableau, longest
         self._one, self._many = fused.steps(tableau)
 
-    def run(self, course: _Course) -> None:
+    def run(self, course: Course) -> None:
         """Runs to the end of the record."""
         times = course.problem.times
         course.write(course.time, course.state)
@@ -223,49 +152,53 @@ class _Steps:
             done = 0
             while done < len(block):
                 done += self._advance(course, block[done : done + CHUNK])
-        course.rows.pop()
+        course.rows[-1] = course.rows[-1].without_last()
         course.update()
         course.write(times[-1], course.state)
 
     def _blocks(self, problem: Problem) -> Iterator[FloatArray]:
         """Times of steps between samples: where each begins, where it ends, and what is a row."""
-        times, longest = problem.times, self._longest
+        times = problem.times
         inside = problem.events[(problem.events > times[0]) & (problem.events < times[-1])]
         ends = np.union1d(times, inside)
-        parts = []
-        for first, last in pairwise(ends):
-            number = int(max(1, np.ceil((last - first) / longest - 0.01)))
-            moments = first + (last - first) * (np.arange(number + 1) / number)
-            moments[-1] = last
-            is_row = np.zeros(number)
-            is_row[-1] = last in times
-            parts.append(np.column_stack([moments[:-1], moments[1:], is_row]))
-            if last in inside or last == ends[-1]:
-                yield np.concatenate(parts)
-                parts = []
+        lengths = np.diff(ends)
+        numbers = np.maximum(1, np.ceil(lengths / self._longest - 0.01)).astype(int)
+        # The last steps of all intervals, then the place of each step in its own one.
+        last = np.cumsum(numbers)
+        own = np.repeat(np.arange(len(numbers)), numbers)
+        place = np.arange(last[-1]) - (last - numbers)[own]
+        shares = np.array([place, place + 1]) / numbers[own]
+        first, after = ends[own] + lengths[own] * shares
+        after[last - 1] = ends[1:]
+        is_row = np.zeros(last[-1])
+        is_row[last - 1] = np.isin(ends[1:], times)
+        block = np.column_stack([first, after, is_row])
+        yield from np.split(block, last[np.flatnonzero(np.isin(ends[1:-1], inside))])
 
-    def _advance(self, course: _Course, block: FloatArray) -> int:
+    def _advance(self, course: Course, block: FloatArray) -> int:
         """Takes some steps, and says how many."""
         problem = course.problem
         step = self._many
         if len(block) < CHUNK:
             step, block = self._one, block[:1]
-        starts, lengths = block[:, 0][None], (block[:, 1] - block[:, 0])[None]
-        given = (starts, lengths, course.hold, problem.plant, problem.law)
-        states, checks = (np.array(values) for values in step(course.state, *given))
+        starts, ends, is_row = block.T
+        given = (starts[:, None], (ends - starts)[:, None], course.hold, problem.plant, problem.law)
+        states, checks = (
+            values.copy().reshape(len(block), -1) for values in step(course.state, *given)
+        )
         # The first number is not finite where a step has no value, the second is a Newton step.
-        good = np.isfinite(checks[0]) & (checks[1] <= REACHED)
+        good = np.isfinite(checks[:, 0]) & (checks[:, 1] <= REACHED)
         count = int(np.argmin(np.append(good, False)))
-        for index in range(count):
-            course.accept(block[index, 1], states[:, index])
-            if block[index, 2]:
-                course.write(course.time, course.state)
+        for end, state in zip(ends[:count].tolist(), states, strict=False):
+            course.accept(end, state)
+        chosen = np.flatnonzero(is_row[:count])
+        course.rows.append(Rows(ends[chosen], states[chosen], course.hold, False))
         if count == len(block):
             return count
         self._advance_slowly(course, *block[count])
         return count + 1
 
-    def _advance_slowly(self, course: _Course, start: float, end: float, is_row: float) -> None:
+    def _advance_slowly(self, course: Course, start: float, end: float, is_row: float) -> None:
         """A step where two Newton steps do not reach N*, or where something has no value."""
         course.state = course.projected(start, course.state)
         a, b, c = self._tableau
@@ -276,7 +209,7 @@ class _Steps:
         state = course.state + step * (b @ np.array(rates))
         course.next = end
         if not np.isfinite(state).all():
-            raise _Ended(Ending.SPOILT)
+            raise Ended(Ending.SPOILT)
         course.accept(end, state)
         if is_row:
             course.write(end, state)

@@ -126,7 +126,8 @@ def _source(functions: LoopFunctions) -> str:
     sizes: dict[str, int] = {
         "NUM_STATES": dae.num_states,
         "NUM_LAGS": functions.num_lags,
-        "SIZE": dae.num_states + functions.num_lags,
+        "NUM_INTEGRALS": functions.num_integrals,
+        "SIZE": functions.size,
         "NUM_FORCES": dae.num_constraints,
         "NUM_CONTROLS": dae.num_controls,
         "NUM_REFERENCES": len(columns["reference"]),

@@ -3,28 +3,23 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from threading import Lock
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, numbers
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.rollout import interpreted, machine
 from drake_dae.diagrams.rollout.failures import failure_of
 from drake_dae.diagrams.rollout.functions import LoopFunctions, loop_functions
 from drake_dae.diagrams.rollout.fused import Fused
+from drake_dae.diagrams.rollout.problems import checked_times, problems_of
 from drake_dae.diagrams.rollout.run import Ending, Problem, Run, Settings, num_cores
-from drake_dae.diagrams.rollout.samples import Samples
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.simulate import check_config
-from drake_dae.systems.plant import DaePlant
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
 T = TypeVar("T")
@@ -61,11 +56,12 @@ def rollout(
 ) -> list[Rollout]:
     """Runs a closed loop from one start or from thousands, without Drake, on all cores.
 
-    It computes what `simulate` does: plant, law, references, exogenous signals and sensor, and the
-    projection onto N* at the start of each step. With fixed steps the record is Drake's, of states
-    before their projection; under error control steps are those of DOP853 (Hairer, Norsett and
-    Wanner, 1993), a thousandth of the accuracy each, and rows between them are on N*. Where a C
-    compiler is found the whole loop is machine code; otherwise SciPy and CasADi step it.
+    It computes what `simulate` does: plant, law with its integrals, references, exogenous signals
+    and sensor, and the projection onto N* at the start of each step. With fixed steps the record is
+    Drake's, of states before their projection; under error control steps are those of DOP853
+    (Hairer, Norsett and Wanner, 1993), a thousandth of the accuracy each, and rows between them are
+    on N*. Where a C compiler is found the whole loop is machine code; otherwise a step is one call
+    of CasADi. Where plant and law have the same numbers, motion follows from what the law wants.
 
     Args:
         loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it; what is drawn
@@ -116,11 +112,12 @@ def run_loop(
     check_config(config)
     choice: Compiled = loop.plant.dae.compiled if compiled is None else compiled
     check_choice("rollout", choice)
-    moments = _times(times)
+    moments = checked_times(times)
     functions = functions_of(loop)
-    scale = np.concatenate([loop.plant.dae.scale, np.ones(functions.num_lags)])
+    scale = np.ones(functions.size)
+    scale[: loop.plant.dae.num_states] = loop.plant.dae.scale
     settings = Settings.of(config, scale)
-    problems = _problems(functions, starts, parameters, moments, seeds)
+    problems = problems_of(functions, starts, parameters, moments, seeds)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
     kinds = [_is_model(loop, problem) for problem in problems]
     found: dict[int, Rollout] = {}
@@ -152,32 +149,6 @@ def _runs(
         return list(
             pool.map(lambda problem: machine.run(code, functions, problem, settings), problems)
         )
-
-
-@checked(ModelError)
-def start_values(loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatArray]:
-    """Start and parameters of a closed loop as `rollout` takes them.
-
-    Args:
-        loop: The closed loop.
-        context: Its context.
-
-    Returns:
-        The state x, then of a force sensor its state, if it has a lag, and what it holds, if it
-        samples, shape (n,); and the parameters of the plant, then the model's of the law and its
-        gains, shape (m,).
-    """
-    plant, controller, sensor = loop.plant, loop.controller, loop.sensor
-    own = plant.GetMyContextFromRoot(context)
-    parts = [plant.state(own)]
-    if sensor is not None:
-        felt = sensor.GetMyContextFromRoot(context)
-        parts.append(felt.get_continuous_state_vector().CopyToVector())
-        if felt.num_discrete_state_groups():
-            parts.append(felt.get_discrete_state(0).value())
-    law = controller.GetMyContextFromRoot(context)
-    values = [block.get_numeric_parameter(0).value() for block in (own, law)]
-    return np.concatenate(parts), np.concatenate(values)
 
 
 def functions_of(loop: ClosedLoop, is_model: bool = False) -> LoopFunctions:
@@ -215,77 +186,6 @@ def _kept(functions: LoopFunctions, name: str, make: Callable[[], T]) -> T:
         memory[key] = make()
     found: T = memory[key]
     return found
-
-
-def _times(times: ArrayLike) -> FloatArray:
-    found = numbers("times", times)
-    if found.ndim != 1 or found.size < 2 or not np.isfinite(found).all():
-        raise ModelError(f"times must be two or more finite numbers, shape (j,), got {times!r}")
-    if np.any(np.diff(found) <= 0.0):
-        raise ModelError("times must be strictly increasing")
-    return found
-
-
-def _table(what: str, given: ArrayLike, size: int, hint: str) -> FloatArray:
-    found = np.atleast_2d(numbers(what, given))
-    if found.ndim != 2 or found.shape[1] != size:
-        raise ModelError(
-            f"{what} must have shape ({size},), or (k, {size}) for k runs, got "
-            f"{np.shape(given)}: {hint}"
-        )
-    if not np.isfinite(found).all():
-        raise ModelError(f"{what} must be finite")
-    return found
-
-
-def _problems(
-    functions: LoopFunctions,
-    starts: ArrayLike,
-    parameters: ArrayLike | None,
-    times: FloatArray,
-    seeds: Sequence[int] | None,
-) -> list[Problem]:
-    loop = functions.loop
-    default, values = start_values(loop, loop.diagram.CreateDefaultContext())
-    hint = "see start_values"
-    states = _table("starts", starts, default.size, hint)
-    given = _table("parameters", values if parameters is None else parameters, values.size, hint)
-    count = len(states)
-    if len(given) not in (1, count):
-        raise ModelError(f"{len(given)} rows of parameters for {count} starts")
-    if seeds is not None and len(seeds) != count:
-        raise ModelError(f"{len(seeds)} seeds for {count} starts")
-    bad = [seed for seed in seeds or () if not 0 <= seed < 2**32]
-    if bad:
-        raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
-    rows = np.broadcast_to(given, (count, values.size))
-    samples = Samples.of(loop, times)
-    size = loop.plant.dae.num_states + functions.num_lags
-    split = functions.plant.sizes[-1]
-    problems, lock = [], Lock()
-    for index, (start, row) in enumerate(zip(states, rows, strict=True)):
-        plant, law = row[:split].copy(), row[split:].copy()
-        current = functions.plant_parameters(plant)
-        loop.plant.check_start(start[: loop.plant.dae.num_states], current(times[0]))
-        noise = samples.noise(None if seeds is None else seeds[index])
-        hold = start[size:].copy() if samples.holds else noise[0].copy()
-        project = partial(_project, loop.plant, current, lock)
-        problems.append(
-            Problem(times, start[:size], hold, plant, law, samples.events, noise[1:], project)
-        )
-    return problems
-
-
-def _project(
-    plant: DaePlant,
-    parameters: Callable[[float], FloatArray],
-    lock: Lock,
-    time: float,
-    state: FloatArray,
-) -> FloatArray:
-    """The state on N* next to one, that of a sensor left out; by one thread at a time."""
-    with lock:
-        return plant.structure.manifold.project(state[: plant.dae.num_states], parameters(time))
 
 
 def _machine_code(

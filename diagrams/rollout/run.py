@@ -108,7 +108,7 @@ class Problem:
 
     Attributes:
         times: When rows of the record are written, in s, from the start to the end, shape (k,).
-        state: x, and then the state of the sensor if it has a lag.
+        state: x, then the state of the sensor if it has a lag, and the integrals of the law.
         hold: What the sensor holds, or its noise, shape (m,).
         plant, law: What their functions take as parameters.
         events: When the sensor samples, or its noise changes, in s.

@@ -7,7 +7,8 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.rollout.rollout import Rollout, run_loop, start_values
+from drake_dae.diagrams.rollout.problems import start_values
+from drake_dae.diagrams.rollout.rollout import Rollout, run_loop
 from drake_dae.diagrams.scenario import Scenario
 
 ROWS = 1000

@@ -79,14 +79,16 @@ static int write(double time, const double *x, Moment *m, double *row) {
   const double *arg[REST_ARG] = {x, m->force, m->plant};
   double *res[REST_RES] = {row + NUM_STATES, checks, checks + 1};
   int i, valid = set_time(time, m);
-  const double *parts[4] = {m->control, m->reference, m->moving, m->measured};
-  const int sizes[4] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING, NUM_MEASURED};
+  const double *parts[5] = {m->control, m->reference, m->moving, m->measured,
+                            x + SIZE - NUM_INTEGRALS};
+  const int sizes[5] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING, NUM_MEASURED,
+                        NUM_INTEGRALS};
   dae_motion(motion_arg, motion_res, 0, 0, 0);
   valid &= isfinite(sum) != 0;
   memcpy(row, x, NUM_STATES * sizeof(double));
   dae_rest(arg, res, 0, 0, 0);
   row += NUM_STATES + NUM_REST;
-  for (i = 0; i < 4; row += sizes[i++]) memcpy(row, parts[i], (size_t)sizes[i] * sizeof(double));
+  for (i = 0; i < 5; row += sizes[i++]) memcpy(row, parts[i], (size_t)sizes[i] * sizeof(double));
   return valid & (isfinite(checks[1]) != 0);
 }
 

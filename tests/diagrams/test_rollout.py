@@ -12,9 +12,11 @@ from drake_dae import (
     ConstantReference,
     ForceSensor,
     RobotPlant,
+    TrackingLaw,
     TrajectoryReference,
     build_scenario,
     make_closed_loop,
+    poles,
     rollout,
     simulate,
     start_values,
@@ -130,6 +132,27 @@ def test_error_control_agrees(name, compiled):
     assert np.max(np.abs(found.record["constraint_residual"])) < 1e-13
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize("mass", [None, 11.0])
+def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass):
+    """To 1e-9, as long as the steps do; also where the plant is not what the law takes it for."""
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6", "compiled=false")
+    loop, context = build_scenario(chosen)
+    if mass is not None:
+        loop.plant.set_parameter(
+            loop.plant.GetMyMutableContextFromRoot(context), "link1.mass", mass
+        )
+    start, parameters = start_values(loop, context)
+    times = [0.0, 0.05, 0.051, 0.4, 1.0]
+    one, other = (
+        rollout(loop, start, parameters, times, config=chosen.integrator, compiled=compiled)[0]
+        for compiled in (False, True)
+    )
+    assert one.steps == other.steps
+    for name, recorded in one.record.signals.items():
+        np.testing.assert_allclose(other.record[name], recorded.values, rtol=1e-9, atol=1e-9)
+
+
 @both
 @pytest.mark.parametrize(
     "settings",
@@ -217,6 +240,49 @@ def test_sensors_measure_as_in_drake(sensor, compiled):
     wanted = run(loop, context, 0.2, chosen.integrator)
     (found,) = rollout(
         loop, start, parameters, wanted.time, config=chosen.integrator, compiled=compiled, seeds=[7]
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
+@both
+@pytest.mark.parametrize("case", ["position", "measured", "direct"])
+def test_integrals_are_those_of_drake(case, compiled):
+    """To 1e-12 of the largest value, as all that equal steps give.
+
+    Of a position, of a force behind a sensor with a lag, and of one that the law but integrates.
+    """
+    name, settings = {
+        "position": ("two_link_wall", ["integral=[tool.z]", "start.errors.tool.z=0.01"]),
+        "measured": ("two_link_measured_force", ["integral=[wall.force, tool.z]"]),
+        "direct": ("two_link_wall", []),
+    }[case]
+    chosen = scenario(name, "duration=0.1", *settings, *fixed())
+    loop, context = build_scenario(chosen)
+    start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    if case == "direct":
+        model, structure = loop.plant.model, loop.controller.law.structure
+        options = {"structure": structure, "measured_force": True, "integral": ["wall.force"]}
+        law = TrackingLaw(model.dae, poles(-4.0), **options)
+        plant = RobotPlant(model, structure=structure)
+        loop = make_closed_loop(plant, law, loop.reference.references)
+        context = loop.diagram.CreateDefaultContext()
+        loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), start)
+    if case != "measured":
+        own = loop.controller.GetMyMutableContextFromRoot(context)
+        loop.controller.set_integral(own, [0.02])
+        own = loop.plant.GetMyMutableContextFromRoot(context)
+        loop.plant.set_parameter(own, "link1.mass", 13.0)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.1, chosen.integrator)
+    assert np.ptp(wanted["integral"]) > 1e-6
+    (found,) = rollout(
+        loop,
+        start,
+        parameters,
+        grid(0.1, 1e-3),
+        config=chosen.integrator,
+        compiled=compiled,
+        seeds=[chosen.force.seed],
     )
     assert_equal_records(found.record, wanted, 1e-12)
 
