@@ -108,7 +108,9 @@ class Manifold:
         other.
         """
         state, p, scale = self.system.state, self.system.parameter_symbol, ca.SX(self._scale)
-        residual = ca.Function("residual", [state, p], [self.residual_expression])
+        # The steps hold them often: what is common goes once, and not from all of it.
+        left, gradient = ca.cse([self.residual_expression, gradient])
+        residual = ca.Function("residual", [state, p], [left], {"cse": False})
         (step_for, pivots), steps = _shortest_step(gradient, scale), {}
         for number in range(STEPS):
             steps[f"step {number}"] = step = scale * step_for(residual(state, p))
@@ -119,7 +121,7 @@ class Manifold:
         outputs = {"sizes": ca.vertcat(*reaches, *sizes), **steps}
         # For next to nothing, like the sines, which are looked at where this fails.
         doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / lengths[i] for i in heads])) - DOUBT
-        return self.system.trace("projection onto the manifold", outputs, doubt=doubt)
+        return self.system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
 
     @cached_property
     def _newton(self) -> TracedFunction:
