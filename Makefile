@@ -27,7 +27,7 @@ help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
 	@echo 'make check       lint, types and the quick tests: the daily round, some two minutes'
 	@echo 'make test        lint, types and all tests'
-	@echo 'make benchmark   speed, with ratios'
+	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'

@@ -110,7 +110,9 @@ class Manifold:
         first step. They are doubted where gradients nearly depend on each other.
         """
         state, p, scale = self.system.state, self.system.parameter_symbol, ca.SX(self._scale)
-        residual = ca.Function("residual", [state, p], [self.residual_expression])
+        # The steps hold them often: what is common goes once, and not from all of it.
+        left, gradient = ca.cse([self.residual_expression, gradient])
+        residual = ca.Function("residual", [state, p], [left], {"cse": False})
         (step_for, pivots), steps = _shortest_step(gradient, scale), []
         for _ in range(STEPS):
             steps.append(scale * step_for(residual(state, p)))
@@ -118,13 +120,12 @@ class Manifold:
         start = self.system.state
         unit = ca.fmax(scale, ca.fabs(start))
         lengths = [ca.norm_2(step / scale) for step in steps]
-        size, left = (ca.norm_2(step / unit) for step in steps[:2])
-        found, outcome = _followed(start, steps, lengths, size, left)
-        sizes = ca.vertcat(outcome, *lengths)
-        outputs = {"sizes": sizes, "found": found, "step": steps[0]}
+        sizes = [ca.norm_2(step / unit) for step in steps[:2]]
+        found, outcome = _followed(start, steps, lengths, *sizes)
+        outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": found, "step": steps[0]}
         # For next to nothing, like the sines, which are looked at where this fails.
         doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / usual[i] for i in heads])) - DOUBT
-        return self.system.trace("projection onto the manifold", outputs, doubt=doubt)
+        return self.system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
 
     @cached_property
     def _newton(self) -> TracedFunction:

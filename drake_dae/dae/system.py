@@ -392,17 +392,18 @@ class DaeSystem:
         regular: str = "a matrix",
         often: bool = True,
         doubt: ca.SX | None = None,
+        lean: bool = False,
     ) -> TracedFunction:
         """Expressions as a fast function of the state, of other inputs and of the parameters.
 
         Args:
             name: What the outputs are, for messages.
-            outputs, pivot, regular, often, doubt: The arguments of `TracedFunction`.
+            outputs, pivot, regular, often, doubt, lean: The arguments of `TracedFunction`.
             inputs: Other symbols, which stand between "state" and "parameters".
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
         return TracedFunction(
-            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt
+            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt, lean
         )
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:

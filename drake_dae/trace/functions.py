@@ -66,6 +66,7 @@ class TracedFunction:
         regular: What messages call that matrix.
         often: Whether it is called often enough for common subexpressions to be worth removing, and
             for machine code.
+        lean: Whether common subexpressions have been removed already.
         compiled: Whether a function that is called often becomes machine code; see
             `trace.compiled`.
         doubt: A scalar that is negative where the values are not valid though the pivot is large
@@ -88,6 +89,7 @@ class TracedFunction:
         often: bool = True,
         compiled: Compiled = False,
         doubt: ca.SX | None = None,
+        lean: bool = False,
     ) -> None:
         self.name = name
         self._regular = regular
@@ -107,7 +109,7 @@ class TracedFunction:
         self._function = ca.Function(
             _identifier(name),
             list(inputs.values()),
-            ca.cse(expressions) if often else expressions,
+            ca.cse(expressions) if often and not lean else expressions,
             {"cse": False},
         )
         self.num_operations = int(self._function.n_instructions())

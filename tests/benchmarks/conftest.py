@@ -1,30 +1,65 @@
-"""One table of all figures, printed at the end."""
+"""One table of all figures, printed at the end, and the same in Markdown."""
 
+import re
 from collections.abc import Callable
 
 import pytest
 
 from drake_dae.analysis.tables import Table
 
-ROWS = pytest.StashKey[dict[str, dict[str, str]]]()
+LINES = pytest.StashKey[list[list[str]]]()
+OTHERS = pytest.StashKey[list[list[str]]]()
+HEAD = ["", "ours", "counterpart", "ratio", "wanted"]
+
+
+@pytest.fixture
+def compare(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Adds a line of the table: compare("law", 1e-6, "interpreted", 4e-5, wanted=0.1), in s."""
+    lines = request.config.stash.setdefault(LINES, [])
+
+    def add(
+        figure: str,
+        ours: float,
+        peer: str = "",
+        theirs: float | None = None,
+        wanted: float | str = "",
+    ) -> None:
+        cells = [figure, duration(ours), peer, ""]
+        if theirs is not None:
+            cells[2:] = [f"{peer}: {duration(theirs)}", f"{ours / theirs:.2g}"]
+        lines.append([*cells, f"< {wanted:g}" if isinstance(wanted, float) else wanted])
+
+    return add
 
 
 @pytest.fixture
 def report(request: pytest.FixtureRequest) -> Callable[..., None]:
-    """Adds figures to a row: report("two_link, rigid", {"law [us]": "12.3"})."""
-    rows = request.config.stash.setdefault(ROWS, {})
+    """Adds figures of one thing: report("two_link, rigid", {"law [us]": "12.3 (<20)"})."""
+    lines = request.config.stash.setdefault(OTHERS, [])
 
     def add(row: str, figures: dict[str, str]) -> None:
-        rows.setdefault(row, {}).update(figures)
+        for column, text in figures.items():
+            ours, wanted = re.fullmatch(r"(.*?)(?: \(([<>].*)\))?", text).groups("")
+            ours, _, ratio = ours.partition(", x ")
+            lines.append([f"{row}: {column}", ours, "", ratio and f"1 / {ratio}", wanted])
 
     return add
+
+
+def duration(seconds: float) -> str:
+    """A time in the unit that fits it."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if seconds >= size or unit == "us":
+            return f"{seconds / size:.3g} {unit}"
+    raise AssertionError
 
 
 def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> None:
-    rows = config.stash.get(ROWS, {})
-    columns = list(dict.fromkeys(column for figures in rows.values() for column in figures))
-    cells = [[row, *(figures.get(c, "") for c in columns)] for row, figures in rows.items()]
-    terminalreporter.section("speed; in brackets what is wanted")
-    terminalreporter.write_line(str(Table(["", *columns], cells)))
+    compared, others = config.stash.get(LINES, []), config.stash.get(OTHERS, [])
+    terminalreporter.section("speed: ratios of ours to the counterpart, in one run and alternating")
+    terminalreporter.write_line(str(Table(HEAD, [*compared, *others])))
+    if compared:
+        terminalreporter.section("the lines with a counterpart in Markdown")
+        terminalreporter.write_line(Table(HEAD, compared).to_markdown())
