@@ -3,7 +3,7 @@
 import jsonschema
 import numpy as np
 import pytest
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, scenario_validator
 
 from drake_dae import (
     CircleReference,
@@ -16,7 +16,7 @@ from drake_dae import (
     build_scenario,
     load_scenario,
 )
-from drake_dae.diagrams.scenario import save_scenario, scenario_data, scenario_schema
+from drake_dae.diagrams.scenario import save_scenario, scenario_data
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
 
@@ -54,10 +54,10 @@ def test_a_form_is_its_reference_and_is_written_as_such(form, tmp_path):
 def test_the_schema_knows_all():
     forms = ", ".join(f"'{place}': {form}" for place, form in enumerate([*FORMS, "2.0"]))
     data = scenario_data(scenario("two_link_wall", f"references={{{forms}}}"))
-    jsonschema.validate(data, scenario_schema())
+    scenario_validator().validate(data)
     data["references"]["0"]["limit"] = {}
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(data, scenario_schema())
+        scenario_validator().validate(data)
 
 
 def refusal(form):
@@ -132,3 +132,26 @@ def test_a_robot_follows_what_a_file_tells(tmp_path):
     middle = (record.time > 0.2) & (record.time < 0.8)
     wanted = 0.3 + 0.1 * np.sin(2 * record.time[middle])
     np.testing.assert_allclose(record["desired_output"][middle, 0], wanted, atol=5e-4)
+
+
+@pytest.mark.slow
+def test_the_writing_arm_writes_a_letter_and_presses_as_told():
+    """The D, from (0.2, 0.5) to the left: 0.1 m wide, 0.15 m high, after the start errors are gone.
+
+    Double poles at -4 leave 0.1 of 0.03 m when it begins at 1.5 s, and 0.2 mm 1.5 s later.
+    """
+    loop, _, record = run_scenario(
+        scenario("seven_joint_writing", "duration=5.5", "compiled=false")
+    )
+    np.testing.assert_allclose(
+        record["tracking_error"], loop.predicted_error(record), rtol=0, atol=1e-6
+    )
+    force = record["constraint_force"][:, 0]
+    np.testing.assert_allclose(force[record.time < 4.2], 20.0, atol=1e-9)
+    assert force.min() == pytest.approx(5.0, abs=1e-9)
+    drawn = (record.time > 3.0) & (force > 19.0) & (record.time < 4.6)
+    y, z = 0.2 - record["controlled_output"][drawn, 0], record["controlled_output"][drawn, 1] - 0.5
+    top, slope = 0.05 + 0.15 - z, 0.05 + z  # Of its corners cut at 45 degrees.
+    side = np.where(np.abs(z - 0.075) < 0.025, np.abs(y - 0.1), np.abs(y - np.minimum(top, slope)))
+    assert np.count_nonzero(drawn) > 40
+    assert np.minimum(side, np.abs(z)).max() < 3e-3
