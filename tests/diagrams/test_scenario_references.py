@@ -13,6 +13,7 @@ from drake_dae import (
     PolylineReference,
     SpiralReference,
     TextReference,
+    WaypointsReference,
     build_scenario,
     load_scenario,
 )
@@ -33,6 +34,12 @@ FORMS = {
     ),
     f"!Polyline {{points: [[0, 0], [1, 0], [1, 1]], corner: 0.1, order: 3, {GENTLE}}}": (
         PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3)
+    ),
+    "!Waypoints {points: [[0, 0], [1, 0]], times: [0, 2], order: 2}": (
+        WaypointsReference([[0, 0], [1, 0]], [0, 2], order=2)
+    ),
+    f"!Waypoints {{points: [[0, 0], [1, 0], [0, 1]], {GENTLE}}}": (
+        WaypointsReference([[0, 0], [1, 0], [0, 1]], limits=LIMITS)
     ),
     "!Csv {file: /a.csv, columns: [y, z], smoothing: 0.1, start_time: 2}": CsvReference(
         "/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0
@@ -97,6 +104,8 @@ def refusal(form):
             f"!Polyline {{points: [[0], [0]], corner: 0.1, {GENTLE}}}",
             ": points 0 and 1 are the same, (0.0,)",
         ),
+        ("!Waypoints {points: [[0], [1]]}", ": waypoints take either times, or limits"),
+        ("!Waypoints {points: [[0], [1]], times: [0, 0]}", ": times must increase from 0 or later"),
         ("!Csv {file: none.csv, columns: [z]}", "scenarios/none.csv': No such file"),
         ("!Csv {file: 'a\0b', columns: [z]}", ""),
         ("!Csv {file: biped.yaml, columns: [z]}", "no column 'time'; "),
