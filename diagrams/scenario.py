@@ -91,6 +91,7 @@ Reference = Annotated[
     | Annotated[references.CircleReference, Form(tag="!Circle")]
     | Annotated[references.SpiralReference, Form(tag="!Spiral")]
     | Annotated[references.PolylineReference, Form(tag="!Polyline")]
+    | Annotated[references.WaypointsReference, Form(tag="!Waypoints")]
     | Annotated[references.CsvReference, Form(tag="!Csv")]
     | Annotated[references.TextReference, Form(tag="!Text")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),

@@ -27,6 +27,7 @@ from .dae.references import ReferenceRows as ReferenceRows
 from .dae.references import SinusoidReference as SinusoidReference
 from .dae.references import SpiralReference as SpiralReference
 from .dae.references import TextReference as TextReference
+from .dae.references import WaypointsReference as WaypointsReference
 from .dae.references import references_by_name as references_by_name
 from .dae.signals import Parameter as Parameter
 from .dae.signals import Signal as Signal

@@ -7,7 +7,7 @@ import jsonschema
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
-from runs import run_scenario
+from runs import run_scenario, scenario_validator
 from two_arms import GRASP, two_arms
 
 from drake_dae import (
@@ -39,7 +39,7 @@ from drake_dae import (
     load_scenario,
 )
 from drake_dae.diagrams import scenario_parts as forms
-from drake_dae.diagrams.scenario import Scenario, save_scenario, scenario_schema
+from drake_dae.diagrams.scenario import Scenario, save_scenario
 from drake_dae.diagrams.shipped import find_scenario, shipped_scenarios
 from drake_dae.diagrams.typed_yaml import load_yaml
 from drake_dae.errors import ScenarioError
@@ -197,10 +197,10 @@ def test_the_json_schema_holds_for_shipped_scenarios(name, tmp_path):
     save_scenario(load_scenario(path), tmp_path / "full.yaml")
     for file in (path, tmp_path / "full.yaml"):
         data = load_yaml(file.read_text(), name)
-        jsonschema.validate(data, scenario_schema())
+        scenario_validator().validate(data)
         data["constraints"][0]["nmae"] = "wall"
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate(data, scenario_schema())
+            scenario_validator().validate(data)
 
 
 def test_every_form_reads_back_equal(tmp_path):

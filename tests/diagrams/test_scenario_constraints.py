@@ -1,14 +1,12 @@
 """The constraints of scenarios: each runs from a file, and is looked at by Drake's kinematics."""
 
-import jsonschema
 import numpy as np
 import pytest
 from pydrake.geometry import SceneGraph
-from runs import run_scenario
+from runs import run_scenario, scenario_validator
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario import scenario_schema
 from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.diagrams.typed_yaml import load_yaml
@@ -259,7 +257,7 @@ def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_pat
     at once. The constraint is looked at by Drake: projection leaves round-off."""
     text, robot, holds, outputs = CASES[name]
     path = scenario_file(tmp_path, text, robot)
-    jsonschema.validate(load_yaml(path.read_text(), "own"), scenario_schema())
+    scenario_validator().validate(load_yaml(path.read_text(), "own"))
     loop, _, record = run_scenario(load_scenario(path))
     assert [signal.name for signal in loop.plant.dae.output_signals] == outputs
     distance = np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)

@@ -3,7 +3,7 @@
 import jsonschema
 import numpy as np
 import pytest
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, scenario_validator
 
 from drake_dae import (
     CircleReference,
@@ -13,10 +13,11 @@ from drake_dae import (
     PolylineReference,
     SpiralReference,
     TextReference,
+    WaypointsReference,
     build_scenario,
     load_scenario,
 )
-from drake_dae.diagrams.scenario import save_scenario, scenario_data, scenario_schema
+from drake_dae.diagrams.scenario import save_scenario, scenario_data
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
 
@@ -33,6 +34,12 @@ FORMS = {
     ),
     f"!Polyline {{points: [[0, 0], [1, 0], [1, 1]], corner: 0.1, order: 3, {GENTLE}}}": (
         PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3)
+    ),
+    "!Waypoints {points: [[0, 0], [1, 0]], times: [0, 2], order: 2}": (
+        WaypointsReference([[0, 0], [1, 0]], [0, 2], order=2)
+    ),
+    f"!Waypoints {{points: [[0, 0], [1, 0], [0, 1]], {GENTLE}}}": (
+        WaypointsReference([[0, 0], [1, 0], [0, 1]], limits=LIMITS)
     ),
     "!Csv {file: /a.csv, columns: [y, z], smoothing: 0.1, start_time: 2}": CsvReference(
         "/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0
@@ -54,10 +61,10 @@ def test_a_form_is_its_reference_and_is_written_as_such(form, tmp_path):
 def test_the_schema_knows_all():
     forms = ", ".join(f"'{place}': {form}" for place, form in enumerate([*FORMS, "2.0"]))
     data = scenario_data(scenario("two_link_wall", f"references={{{forms}}}"))
-    jsonschema.validate(data, scenario_schema())
+    scenario_validator().validate(data)
     data["references"]["0"]["limit"] = {}
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(data, scenario_schema())
+        scenario_validator().validate(data)
 
 
 def refusal(form):
@@ -97,6 +104,8 @@ def refusal(form):
             f"!Polyline {{points: [[0], [0]], corner: 0.1, {GENTLE}}}",
             ": points 0 and 1 are the same, (0.0,)",
         ),
+        ("!Waypoints {points: [[0], [1]]}", ": waypoints take either times, or limits"),
+        ("!Waypoints {points: [[0], [1]], times: [0, 0]}", ": times must increase from 0 or later"),
         ("!Csv {file: none.csv, columns: [z]}", "scenarios/none.csv': No such file"),
         ("!Csv {file: 'a\0b', columns: [z]}", ""),
         ("!Csv {file: biped.yaml, columns: [z]}", "no column 'time'; "),
@@ -132,3 +141,26 @@ def test_a_robot_follows_what_a_file_tells(tmp_path):
     middle = (record.time > 0.2) & (record.time < 0.8)
     wanted = 0.3 + 0.1 * np.sin(2 * record.time[middle])
     np.testing.assert_allclose(record["desired_output"][middle, 0], wanted, atol=5e-4)
+
+
+@pytest.mark.slow
+def test_the_writing_arm_writes_a_letter_and_presses_as_told():
+    """The D, from (0.2, 0.5) to the left: 0.1 m wide, 0.15 m high, after the start errors are gone.
+
+    Double poles at -4 leave 0.1 of 0.03 m when it begins at 1.5 s, and 0.2 mm 1.5 s later.
+    """
+    loop, _, record = run_scenario(
+        scenario("seven_joint_writing", "duration=5.5", "compiled=false")
+    )
+    np.testing.assert_allclose(
+        record["tracking_error"], loop.predicted_error(record), rtol=0, atol=1e-6
+    )
+    force = record["constraint_force"][:, 0]
+    np.testing.assert_allclose(force[record.time < 4.2], 20.0, atol=1e-9)
+    assert force.min() == pytest.approx(5.0, abs=1e-9)
+    drawn = (record.time > 3.0) & (force > 19.0) & (record.time < 4.6)
+    y, z = 0.2 - record["controlled_output"][drawn, 0], record["controlled_output"][drawn, 1] - 0.5
+    top, slope = 0.05 + 0.15 - z, 0.05 + z  # Of its corners cut at 45 degrees.
+    side = np.where(np.abs(z - 0.075) < 0.025, np.abs(y - 0.1), np.abs(y - np.minimum(top, slope)))
+    assert np.count_nonzero(drawn) > 40
+    assert np.minimum(side, np.abs(z)).max() < 3e-3

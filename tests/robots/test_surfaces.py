@@ -37,6 +37,7 @@ SURFACES = {
     "sphere": Sphere((0.1, 0.2, 0.3), 0.7),
     "inside sphere": Sphere((0.1, 0.2, 0.3), 0.7, inside=True),
     "cylinder": Cylinder((0.4, 0.0, 0.1), (1.0, 1.0, 0.3), 0.5),
+    "turned cylinder": Cylinder((0.4, 0.0, 0.1), (0.2, 0.0, 1.0), 0.5, zero=(-1.0, 0.5, 0.0)),
     "inside cylinder": Cylinder((0.4, 0.0, 0.1), (0.0, 0.0, 2.0), 0.5, inside=True),
     "ellipsoid": Ellipsoid((0.1, -0.1, 0.2), (0.5, 0.8, 0.3)),
     "torus": Torus((0.0, 0.1, 0.2), (0.2, 0.1, 1.0), 0.8, 0.3),
@@ -112,6 +113,15 @@ def test_coordinates_cover_the_surface(name):
         for _, gradient, _, jacobian in map(function, points)
     ]
     assert min(volumes) > 0.1
+
+
+def test_the_angle_of_a_cylinder_is_counted_from_where_it_is_told():
+    """A pipe before a robot at the origin: 0 where it faces it, growing to its right."""
+    pipe = Cylinder((0.8, 0.0, 0.0), (0.0, 0.0, 2.0), 0.2, zero=(-1.0, 0.0, 7.0))
+    for angle in (-2.9, -0.4, 0.0, 1.1):
+        offset = [-0.2 * np.cos(angle), -0.2 * np.sin(angle), 0.3]
+        found = np.array(ca.evalf(pipe.coordinates(ca.SX(offset)))).ravel()
+        np.testing.assert_allclose(found, [angle, 0.3], atol=1e-15)
 
 
 @pytest.mark.parametrize("name", [n for n in SURFACES if not SURFACES[n].coordinate_signals])
@@ -230,6 +240,10 @@ def test_tangents_are_upright():
         (lambda: Sphere((0, 0, 0), 0.0), "radius must be positive, got 0.0"),
         (lambda: Sphere((0, 0, np.nan), 1.0), "center must be three finite numbers"),
         (lambda: Cylinder((0, 0, 0), (0, 0, 1), -1.0), "radius must be positive"),
+        (
+            lambda: Cylinder((0, 0, 0), (0, 0, 2), 1.0, zero=(0, 0, -3)),
+            r"zero must not lie along the axis, got \(0\.0, 0\.0, -1\.0\)",
+        ),
         (lambda: Ellipsoid((0, 0, 0), (1, 0, 1)), "semi_axes must be positive"),
         (lambda: Torus((0, 0, 0), (0, 0, 1), 0.2, 0.3), "must exceed minor_radius"),
         (

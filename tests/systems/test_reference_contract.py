@@ -26,6 +26,7 @@ from drake_dae import (
     SystemReference,
     TextReference,
     TrajectoryReference,
+    WaypointsReference,
 )
 from drake_dae.errors import ReferenceSignalError
 
@@ -61,6 +62,7 @@ MEMBERS = {
     "turn": CircleReference([0.0, 1.0], 0.1, limits=LIMITS),
     "spiral": SpiralReference([0.0, 1.0], 0.0, 0.3, 0.2, LIMITS),
     "polyline": PolylineReference(EDGES, LIMITS, 0.2),
+    "waypoints": WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
     "text": TextReference("L", [0.0, 0.0], 1.0, LIMITS, press=[2.0, 1.0], corner=0.3),
     "file": CsvReference(str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3),
     "system": SystemReference(Swing(), [2, 2]),
@@ -71,6 +73,7 @@ MEMBERS = {
 TIMES = (0.41, 0.93, 1.62)
 
 ROUGH = {
+    "waypoints": WaypointsReference([[0.0], [1.0]], [0.0, 1.0], order=2),
     "system": SystemReference(Swing(), [2, 2]),
     "line": LineReference(0.0, 1.0, LIMITS, order=2),
     "polyline": PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),

@@ -12,6 +12,7 @@ from drake_dae.dae.references.paths import CircleReference, LineReference, Spira
 from drake_dae.dae.references.reference import Reference, stack_references
 from drake_dae.dae.references.splines import PolylineReference
 from drake_dae.dae.references.travel import PathLimits
+from drake_dae.dae.references.waypoints import WaypointsReference
 from drake_dae.dae.references.writing import TextReference
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "SinusoidReference",
     "SpiralReference",
     "TextReference",
+    "WaypointsReference",
     "references_by_name",
     "stack_references",
 ]

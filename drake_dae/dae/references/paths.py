@@ -92,14 +92,14 @@ class PathReference(FormulaReference):
             )
 
 
-def check_order(order: int) -> None:
+def check_order(order: int, most: int = 12) -> None:
     """Refuses an order that a path cannot have.
 
     Raises:
-        ReferenceSignalError: It is not from 2 to 12.
+        ReferenceSignalError: It is not from 2 to `most`.
     """
-    if not 2 <= order <= 12:
-        raise ReferenceSignalError(f"order must be from 2 to 12, got {order}")
+    if not 2 <= order <= most:
+        raise ReferenceSignalError(f"order must be from 2 to {most}, got {order}")
 
 
 @checked(ReferenceSignalError)

@@ -1,24 +1,21 @@
 """Motions through many points: uniform B-splines in time, with limits that their points tell."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive
 from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.reference import Reference
+from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
 from drake_dae.dae.references.travel import PathLimits
 from drake_dae.errors import ReferenceSignalError
-
-MOST_IN_EXPRESSION = 200
-"""Of how many points a reference is an expression of time: longer ones are tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +62,8 @@ class TimeSpline:
             found.append(np.diff(found[-1], axis=0) / self.step)
         return found
 
-    def at(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        """The function t -> r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+    def pieces(self, degrees: Sequence[int]) -> Pieces:
+        """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
         rows = {
             j: sliding_window_view(self.differences[j], self.degree - j + 1, axis=0)
             @ basis_pieces(self.degree - j).T
@@ -76,32 +73,8 @@ class TimeSpline:
         places = [(i, j) for i, degree in enumerate(degrees) for j in range(degree + 1)]
         for row, (i, j) in enumerate(places):
             factors[:, row, : self.degree - j + 1] = rows[j][:, i]
-        powers, last = np.arange(self.degree + 1), self.spans - 1
-
-        def evaluate(time: float) -> FloatArray:
-            place = min(max((time - self.start_time) / self.step, 0.0), last + 1.0)
-            span = min(int(place), last)
-            return factors[span] @ (place - span) ** powers
-
-        return evaluate
-
-    def expression(self, degree: int, time: ca.SX) -> ca.SX:
-        """r, r', ... at a symbolic time, shape (degree + 1, k)."""
-        place = ca.fmin(ca.fmax((time - self.start_time) / self.step, 0), self.spans)
-        span = ca.fmin(ca.floor(place), self.spans - 1)
-        chosen = ca.vertcat(*[span == index for index in range(self.spans)])
-        monomials = ca.horzcat(*[(place - span) ** k for k in range(self.degree + 1)])
-        rows = []
-        for j in range(degree + 1):
-            piece, table = basis_pieces(self.degree - j), self.differences[j]
-            window = ca.vertcat(
-                *[
-                    ca.mtimes(ca.DM(table[k : k + self.spans]).T, chosen).T
-                    for k in range(len(piece))
-                ]
-            )
-            rows.append(ca.mtimes([monomials[: len(piece)], ca.DM(piece), window]))
-        return ca.vertcat(*rows)
+        breaks = self.start_time + self.step * np.arange(self.spans + 1, dtype=np.float64)
+        return Pieces(breaks, factors)
 
 
 def basis_pieces(degree: int) -> FloatArray:
@@ -122,7 +95,7 @@ def basis_pieces(degree: int) -> FloatArray:
 
 
 @checked(ReferenceSignalError)
-class SplineReference(Reference):
+class SplineReference(PiecewiseReference):
     """A reference that is a `TimeSpline`."""
 
     @property
@@ -134,23 +107,8 @@ class SplineReference(Reference):
     def size(self) -> int:
         return int(self.spline.points.shape[1])
 
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        self._check(degrees)
-        return self.spline.at(degrees)
-
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        self._check(degrees)
-        if self.spline.spans > MOST_IN_EXPRESSION:
-            return None
-        table = self.spline.expression(max(degrees), time)
-        return ca.vertcat(*[table[: degree + 1, i] for i, degree in enumerate(degrees)])
-
-    def _check(self, degrees: Sequence[int]) -> None:
-        if max(degrees) > self.spline.order:
-            raise ReferenceSignalError(
-                f"this {type(self).__name__} has {self.spline.order} continuous derivatives, the "
-                f"law needs {max(degrees)}: pass order={max(degrees)} or more"
-            )
+    def pieces(self, degrees: Sequence[int]) -> Pieces:
+        return self.spline.pieces(degrees)
 
 
 def spline_within(
@@ -216,25 +174,36 @@ class PolylineReference(SplineReference):
     order: int = 4
 
     def __post_init__(self) -> None:
-        points = numbers("points", self.points, ReferenceSignalError)
-        if points.ndim != 2 or len(points) < 2 or not points.size or not np.isfinite(points).all():
-            raise ReferenceSignalError(
-                "points must be two or more, as a list of rows of finite numbers, got shape "
-                f"{points.shape}"
-            )
-        object.__setattr__(self, "points", tuple(tuple(map(float, row)) for row in points))
-        lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        if not lengths.all():
-            place = int(np.argmin(lengths))
-            raise ReferenceSignalError(
-                f"points {place} and {place + 1} are the same, {self.points[place]}"
-            )
-        check_spline(self.corner, self.order, float(lengths.sum()))
+        points = settle_points(self)
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+        check_spline(self.corner, self.order, float(length))
 
     @cached_property
     def spline(self) -> TimeSpline:
         points, _ = along_edges(np.array(self.points), 2 * self.corner / self.order)
         return spline_within(points, self.limits, self.start_time, self.order)
+
+
+def settle_points(reference: Any) -> FloatArray:
+    """Makes the field `points` a tuple of rows, and returns it as an array, shape (n, k).
+
+    Raises:
+        ReferenceSignalError: They are no rows of finite numbers, fewer than two, or two in a row
+            are the same.
+    """
+    points = numbers("points", reference.points, ReferenceSignalError)
+    if points.ndim != 2 or len(points) < 2 or not points.size or not np.isfinite(points).all():
+        raise ReferenceSignalError(
+            "points must be two or more, as a list of rows of finite numbers, got shape "
+            f"{points.shape}"
+        )
+    rows = tuple(tuple(map(float, row)) for row in points)
+    object.__setattr__(reference, "points", rows)
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if not lengths.all():
+        place = int(np.argmin(lengths))
+        raise ReferenceSignalError(f"points {place} and {place + 1} are the same, {rows[place]}")
+    return points
 
 
 def check_spline(corner: float, order: int, length: float) -> None:

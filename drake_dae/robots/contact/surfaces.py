@@ -137,12 +137,15 @@ class Cylinder(Surface):
         axis: The direction of the axis, of any length, shape (3,).
         radius: Its radius, m.
         inside: Whether the free side is the inside.
+        zero: Across the axis, where the angle is 0; None for the first of `tangents(axis)`. On the
+            other side the angle jumps, so that it is best where the robot is.
     """
 
     point: Vector
     axis: Vector
     radius: float
     inside: bool = False
+    zero: Vector | None = None
     coordinate_signals: ClassVar = (Signal("angle", "rad"), Signal("along", "m"))
     has_exact_distance: ClassVar = True
 
@@ -150,6 +153,10 @@ class Cylinder(Surface):
         object.__setattr__(self, "point", triple("point", self.point))
         object.__setattr__(self, "axis", unit_vector("axis", self.axis))
         positive("radius", self.radius)
+        if self.zero is not None:
+            object.__setattr__(self, "zero", unit_vector("zero", self.zero))
+            if np.linalg.norm(np.cross(self.zero, self.axis)) < 1e-6:
+                raise ModelError(f"zero must not lie along the axis, got {self.zero}")
 
     @property
     def position(self) -> Vector:
@@ -160,7 +167,7 @@ class Cylinder(Surface):
         return _side(ca.sqrt(x**2 + y**2) - self.radius, self.inside)
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
-        x, y, z = _components(self.axis, offset)
+        x, y, z = _components(self.axis, offset, self.zero)
         return ca.vertcat(ca.atan2(y, x), z)
 
     def picture(self, center: ArrayLike, size: float) -> Picture:
@@ -339,10 +346,16 @@ def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
     return ca.substitute(quotient, p, offset)
 
 
-def _components(axis: Vector, offset: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Components along tangents(axis) and axis."""
+def _components(
+    axis: Vector, offset: ca.SX, zero: Vector | None = None
+) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Components along tangents(axis), or where zero points across the axis, and along the axis."""
     first, second = tangents(axis)
-    if np.dot(np.cross(first, second), axis) < 0.0:
+    if zero is not None:
+        first = np.array(zero) - np.dot(zero, axis) * np.array(axis)
+        first /= np.linalg.norm(first)
+        second = np.cross(axis, first)
+    elif np.dot(np.cross(first, second), axis) < 0.0:
         first = -first
     x, y, z = (ca.dot(ca.DM(vector), offset) for vector in (first, second, np.array(axis)))
     return x, y, z

@@ -30,7 +30,7 @@ def test_a_spline_is_that_of_another_source():
     held = np.pad(spline.points, ((3, 3), (0, 0)), mode="edge")
     knots = 1.0 + 0.25 * np.arange(-4, len(held) + 1)
     other = BSpline(knots, held, 4)
-    function = spline.at([3, 1])
+    function = spline.pieces([3, 1]).at
     for time in (1.0, 1.1, 2.3, 3.5, 3.7):
         table = [other(time, nu=k) for k in range(4)]
         expected = [*(row[0] for row in table), table[0][1], table[1][1]]

@@ -1,0 +1,93 @@
+"""Motions of polynomials in time, one after the other."""
+
+from abc import abstractmethod
+from bisect import bisect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.references.reference import Reference
+from drake_dae.errors import ReferenceSignalError
+
+MOST_IN_EXPRESSION = 200
+"""Of how many polynomials a reference is an expression of time: longer ones are tables."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Polynomials in time, one after the other: in piece i it is factors[i] @ (1, x, x^2, ...).
+
+    There x = (t - breaks[i]) / (breaks[i + 1] - breaks[i]); before and after the value stays.
+
+    Attributes:
+        breaks: When each begins, and when the last one ends, in s, shape (n + 1,).
+        factors: The factors, shape (n, rows, degree + 1).
+    """
+
+    breaks: FloatArray
+    factors: FloatArray
+
+    @cached_property
+    def at(self) -> Callable[[float], FloatArray]:
+        """The function of the time in s, shape (rows,)."""
+        breaks, factors, powers = self.breaks.tolist(), self.factors, self._powers
+        first, last = breaks[0], breaks[-1]
+
+        def evaluate(time: float) -> FloatArray:
+            place = bisect(breaks, time, 1, len(factors)) - 1
+            x = (min(max(time, first), last) - breaks[place]) / (breaks[place + 1] - breaks[place])
+            return factors[place] @ x**powers
+
+        return evaluate
+
+    def expression(self, time: ca.SX) -> ca.SX:
+        """The values at a symbolic time, shape (rows, 1)."""
+        count, rows, size = self.factors.shape
+        passed = [time >= moment for moment in self.breaks[1:-1]]
+        chosen = ca.vertcat(1, *passed) - ca.vertcat(*passed, 0)
+        inside = ca.fmin(ca.fmax(time, self.breaks[0]), self.breaks[-1])
+        begin, width = (
+            ca.dot(ca.DM(values), chosen) for values in (self.breaks[:-1], np.diff(self.breaks))
+        )
+        monomials = ca.vertcat(*[((inside - begin) / width) ** int(k) for k in self._powers])
+        table = ca.mtimes(ca.DM(self.factors.reshape(count, -1).T), chosen)
+        return ca.mtimes(ca.reshape(table, size, rows).T, monomials)
+
+    @property
+    def _powers(self) -> FloatArray:
+        return np.arange(self.factors.shape[2], dtype=float)
+
+
+@checked(ReferenceSignalError)
+class PiecewiseReference(Reference):
+    """A reference of polynomials in time, one after the other, `order` of whose derivatives exist.
+
+    One with many pieces is no expression, but a table.
+    """
+
+    order: int
+
+    @abstractmethod
+    def pieces(self, degrees: Sequence[int]) -> Pieces:
+        """r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        self._check(degrees)
+        return self.pieces(degrees).at
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
+        self._check(degrees)
+        pieces = self.pieces(degrees)
+        return pieces.expression(time) if len(pieces.factors) <= MOST_IN_EXPRESSION else None
+
+    def _check(self, degrees: Sequence[int]) -> None:
+        if max(degrees) > self.order:
+            raise ReferenceSignalError(
+                f"this {type(self).__name__} has {self.order} continuous derivatives, the law "
+                f"needs {max(degrees)}: pass order={max(degrees)} or more"
+            )
