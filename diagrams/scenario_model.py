@@ -41,7 +41,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
         ScenarioError: Something does not fit; the message names its key.
     """
     # The robot.
-    name = Path(scenario.robot.file).name.split(".")[0]  # Of "two_arms.dmd.yaml", too.
+    name = scenario.robot.title
     links = _links(scenario.robot, scene_graph or SceneGraph())
 
     # What it touches or holds.
@@ -49,9 +49,9 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
     if not actuators:
         text = (
-            f"no joint of '{Path(scenario.robot.file).name}' is driven; write all, or a list of "
-            "joints. Without this key those are driven to which the file gives an actuator, as a "
-            "URDF does by a <transmission>"
+            f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
+            "list of joints. Without this key those are driven to which the file gives an "
+            "actuator, as a URDF does by a <transmission>"
         )
         raise ScenarioError(("robot.actuators", text))
 

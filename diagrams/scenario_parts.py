@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
@@ -117,6 +118,8 @@ class Robot:
     Attributes:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
             "package://drake_dae_models/<file>" for a shipped one.
+        description: Instead of a file: a robot of the package robot_descriptions by its name there,
+            "panda_description", cloned when it is first used (the extra `descriptions`).
         packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Those
             of which a package.xml lies in a folder above the file that names them, or beside such a
             folder under their name, and those in ROS_PACKAGE_PATH are found without it.
@@ -134,13 +137,24 @@ class Robot:
             friction; without this it is refused.
     """
 
-    file: str
+    file: str = ""
     packages: dict[str, str] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
     leave_out: list[Literal["joint_friction"]] = field(default_factory=list)
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if bool(self.file) == bool(self.description):
+            wanted = "the key 'file', or 'description' for a robot of robot_descriptions"
+            raise ModelError(f"needs {wanted}{', not both' if self.file else ''}")
+
+    @property
+    def title(self) -> str:
+        """What messages and systems call it: "two_arms" of "two_arms.dmd.yaml"."""
+        return self.description or Path(self.file).name.split(".")[0]
 
 
 @dataclass(frozen=True)

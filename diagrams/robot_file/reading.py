@@ -13,7 +13,9 @@ from pydrake.geometry import Mesh, Role, SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.resources import check_resources, package_folder
+from drake_dae.diagrams.robot_file.descriptions import find_description
 from drake_dae.diagrams.robot_file.efforts import Efforts, read_efforts
 from drake_dae.diagrams.robot_file.meshes import Copies, add_models
 from drake_dae.diagrams.robot_file.packages import add_packages, explained, find_packages
@@ -61,9 +63,14 @@ def read_into(
     Returns:
         The effort limits of joints without an actuator.
     """
-    is_url = robot.file.startswith("package://")
-    if not is_url and not _is_file(robot.file):
-        raise ModelError(f"no file '{robot.file}'; a relative path starts in the scenario's folder")
+    name, places = robot.file, tuple[Path, ...]()
+    if robot.description:
+        with at("robot.description"):
+            described = find_description(robot.description)
+        name, places = str(described.file), described.folders
+    is_url = name.startswith("package://")
+    if not is_url and not _is_file(name):
+        raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
     parser = Parser(plant)
     missing: dict[str, str] = {}
     copies = Copies({}, [])
@@ -71,8 +78,8 @@ def read_into(
         try:
             packages = parser.package_map()
             add_packages(robot.packages, packages)
-            folders, missing = find_packages(robot.file, packages)
-            file = Path(packages.ResolveUrl(robot.file) if is_url else robot.file)
+            folders, missing = find_packages(name, packages, places)
+            file = Path(packages.ResolveUrl(name) if is_url else name)
             _check_one_robot(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
         except ScenarioError:
@@ -87,6 +94,7 @@ def read_into(
         raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
     if scene_graph is not None:
         own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
+        own += places[:2]  # The package and the repository of a description.
         check_resources(scene_graph, [*own, *folders])
         _tell_what_is_left_out(copies.left_out, scene_graph)
     return read_efforts(models)
