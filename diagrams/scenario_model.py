@@ -12,6 +12,7 @@ from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.keys import at, each
 from drake_dae.diagrams.robot_file.changes import change_robot, finalize
+from drake_dae.diagrams.robot_file.loops import cut_loops, loop_constraints
 from drake_dae.diagrams.robot_file.reading import read_into, read_robot
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
@@ -42,10 +43,10 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
     """
     # The robot.
     name = scenario.robot.title
-    links = _links(scenario.robot, scene_graph or SceneGraph())
+    links, loops = _links(scenario.robot, scene_graph or SceneGraph())
 
     # What it touches or holds.
-    constraints = _constraints(scenario.constraints, links)
+    constraints = _constraints(scenario.constraints, loops, links)
     actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
     if not actuators:
         text = (
@@ -110,12 +111,15 @@ def add_robot(robot: Robot, plant: MultibodyPlant, scene_graph: SceneGraph) -> N
             says beside it does not fit.
     """
     change_robot(robot, plant, read_into(plant, robot, scene_graph))
+    cut_loops(plant)
 
 
 @at("robot.file")
-def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
+def _links(robot: Robot, scene_graph: SceneGraph) -> tuple[MultibodyExpressions, list[Constraint]]:
+    """The robot of a scenario, and the constraints that its joints are which close loops."""
     plant, efforts = read_robot(robot, scene_graph)
     change_robot(robot, plant, efforts)
+    cuts = cut_loops(plant)
     finalize(plant)
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -128,23 +132,28 @@ def _links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
                 "length"
             )
     links = MultibodyExpressions(plant)
-    plant_constraints(links)
-    return links
+    try:
+        plant_constraints(links)
+    except ModelError as error:
+        raise ModelError(
+            f"{error}. With leave_out: [constraints] under robot the file stays as it is"
+        ) from None
+    return links, loop_constraints(cuts, plant)
 
 
 def _constraints(
-    forms: Sequence[Constraint | Written[Constraint]], links: Links
+    forms: Sequence[Constraint | Written[Constraint]], loops: Sequence[Constraint], links: Links
 ) -> list[Constraint]:
     constraints = each("constraints", forms, lambda form: made(form, ()))
     each("constraints", constraints, lambda constraint: _try(constraint, links))
-    taken = [constraint.name for constraint in plant_constraints(links)]
+    taken = [constraint.name for constraint in (*plant_constraints(links), *loops)]
     for index, constraint in enumerate(constraints):
         name = constraint.name
         if not name or name in taken:
             key = f"constraints.{index}.name"
             raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
         taken.append(name)
-    return constraints
+    return [*constraints, *loops]
 
 
 def _try(constraint: Constraint, links: Links) -> None:

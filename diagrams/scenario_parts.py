@@ -113,7 +113,8 @@ class Robot:
 
     Meshes that Drake cannot read, as collisions in .stl or .dae, are left out: no equation needs
     them.
-    Joints that mimic another one are constraints "<joint>_coupler".
+    Joints that mimic another one are constraints "<joint>_coupler". Joints that close loops, as in
+    SDFormat, are constraints of their names; where a loop has joints without motors, one of these.
 
     Attributes:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
@@ -133,8 +134,9 @@ class Robot:
             names, or name -> effort limit in N m or N, or "all" that turn or slide and mimic no
             other. Where no limit is given it is that of the file. Controls have this order, after
             those that the file gives actuators.
-        leave_out: What the file has and the equations have not: joint_friction, which is Coulomb
-            friction; without this it is refused.
+        leave_out: What the file has and the equations have not, which without this is refused:
+            joint_friction, which is Coulomb friction; constraints, all those that the file has
+            beside its joints, as <equality> of MJCF, which are then written under `constraints`.
     """
 
     file: str = ""
@@ -143,7 +145,7 @@ class Robot:
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
-    leave_out: list[Literal["joint_friction"]] = field(default_factory=list)
+    leave_out: list[Literal["joint_friction", "constraints"]] = field(default_factory=list)
     description: str = ""
 
     def __post_init__(self) -> None:

@@ -23,6 +23,14 @@ from drake_dae.diagrams.scenario_parts import Robot
 from drake_dae.diagrams.shipped import FOLDER
 from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
 
+_IGNORED = re.compile(r"The (?:tag|attribute) '(\w+)' .*ignored")
+_IDLE = {
+    *("camera", "custom", "keyframe", "light", "sensor", "site", "size", "statistic", "visual"),
+    *("timestep", "integrator", "solver", "iterations", "ls_iterations", "tolerance", "jacobian"),
+    *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
+}
+"""What MJCF has and Drake leaves out that no equation of ours has."""
+
 _DRAWN = (".obj", ".gltf", ".dae")
 """The kinds of mesh that Drake's Meshcat draws."""
 
@@ -74,7 +82,7 @@ def read_into(
     parser = Parser(plant)
     missing: dict[str, str] = {}
     copies = Copies({}, [])
-    with TemporaryDirectory() as scratch, _drake_log() as dropped:
+    with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
             add_packages(robot.packages, packages)
@@ -89,6 +97,9 @@ def read_into(
             text = copies.named(str(error))
             unknown = {name: origin for name, origin in missing.items() if name in text}
             raise ModelError(explained(unknown) if unknown else text) from None
+    if "constraints" in robot.leave_out:
+        for key in plant.GetConstraintIds():
+            plant.RemoveConstraint(key)
     told = [text for text in dropped.warnings if not _is_answered(text, robot)]
     if told:
         raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
@@ -104,6 +115,8 @@ def _is_answered(warning: str, robot: Robot) -> bool:
     """Whether the scenario says what to do about a warning of Drake's parser."""
     if "effort limit" in warning:
         return robot.actuators is not None
+    if "equality" in warning or "mimic" in warning:
+        return "constraints" in robot.leave_out
     return "friction" in warning and "joint_friction" in robot.leave_out
 
 
@@ -136,10 +149,10 @@ def _listed(files: list[Path]) -> str:
 
 
 @contextmanager
-def _drake_log() -> Iterator["_Dropped"]:
+def _drake_log(copies: Copies) -> Iterator["_Dropped"]:
     """Listens to what Drake's parser tells."""
     log = logging.getLogger("drake")
-    level, dropped = log.level, _Dropped(log.getEffectiveLevel())
+    level, dropped = log.level, _Dropped(log.getEffectiveLevel(), copies)
     log.addFilter(dropped)
     log.setLevel(logging.WARNING)  # Whoever wants to see less must still be told.
     try:
@@ -154,9 +167,10 @@ class _Dropped(logging.Filter):
 
     KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
 
-    def __init__(self, level: int) -> None:
+    def __init__(self, level: int, copies: Copies) -> None:
         super().__init__()
         self._level = level
+        self._copies = copies
         self.warnings: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -164,6 +178,10 @@ class _Dropped(logging.Filter):
         is_dropped = "warning: " in text and any(kind in text for kind in self.KINDS)
         if is_dropped:
             self.warnings.append(text)
+        ignored = _IGNORED.search(text)
+        if ignored and ignored[1] in _IDLE:
+            return False
+        record.msg, record.args = self._copies.named(text), ()
         return not is_dropped and record.levelno >= self._level
 
 
@@ -185,8 +203,8 @@ def _explained(warning: str) -> str:
         text += " Name the driven joints under robot.actuators"
     elif "equality" in text:
         return (
-            f"{place}: {' '.join(text.split())} Take it out of the file, and write it under "
-            "constraints; two joints that move together are a !JointCoupler"
+            f"{place}: {' '.join(text.split())} Write leave_out: [constraints] under robot, and "
+            "the constraint under constraints; two joints that move together are a !JointCoupler"
         )
     file, _, line = place.rpartition(":")
     owner = ""
