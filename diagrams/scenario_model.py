@@ -15,6 +15,7 @@ from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.diagrams.completion.completion import Completed, complete
 from drake_dae.diagrams.keys import at, each
 from drake_dae.diagrams.robot_file.changes import change_robot, finalize
+from drake_dae.diagrams.robot_file.loops import cut_loops, loop_constraints
 from drake_dae.diagrams.robot_file.reading import read_into, read_robot
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
@@ -111,17 +112,17 @@ class _Robot:
 
 def _read(scenario: Scenario, scene_graph: SceneGraph) -> _Robot:
     # The robot.
-    name = Path(scenario.robot.file).name.split(".")[0]  # Of "two_arms.dmd.yaml", too.
-    links = robot_links(scenario.robot, scene_graph)
+    name = scenario.robot.title
+    links, loops = robot_links(scenario.robot, scene_graph)
 
     # What it touches or holds.
-    constraints = _constraints(scenario.constraints, links)
+    constraints = _constraints(scenario.constraints, loops, links)
     actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
     if not actuators:
         text = (
-            f"no joint of '{Path(scenario.robot.file).name}' is driven; write all, or a list of "
-            "joints. Without this key those are driven to which the file gives an actuator, as a "
-            "URDF does by a <transmission>"
+            f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
+            "list of joints. Without this key those are driven to which the file gives an "
+            "actuator, as a URDF does by a <transmission>"
         )
         raise ScenarioError(("robot.actuators", text))
 
@@ -168,11 +169,14 @@ def add_robot(robot: Robot, plant: MultibodyPlant, scene_graph: SceneGraph) -> N
             says beside it does not fit.
     """
     change_robot(robot, plant, read_into(plant, robot, scene_graph))
+    cut_loops(plant)
 
 
 @at("robot.file")
-def robot_links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
-    """The links of a scenario's robot.
+def robot_links(
+    robot: Robot, scene_graph: SceneGraph
+) -> tuple[MultibodyExpressions, list[Constraint]]:
+    """The links of a scenario's robot, and the constraints that those joints are which close loops.
 
     Args:
         robot: What the scenario has under `robot`.
@@ -183,6 +187,7 @@ def robot_links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
     """
     plant, efforts = read_robot(robot, scene_graph)
     change_robot(robot, plant, efforts)
+    cuts = cut_loops(plant)
     finalize(plant)
     for index in plant.GetJointIndices():
         joint = plant.get_joint(index)
@@ -195,23 +200,28 @@ def robot_links(robot: Robot, scene_graph: SceneGraph) -> MultibodyExpressions:
                 "length"
             )
     links = MultibodyExpressions(plant)
-    plant_constraints(links)
-    return links
+    try:
+        plant_constraints(links)
+    except ModelError as error:
+        raise ModelError(
+            f"{error}. With leave_out: [constraints] under robot the file stays as it is"
+        ) from None
+    return links, loop_constraints(cuts, plant)
 
 
 def _constraints(
-    forms: Sequence[Constraint | Written[Constraint]], links: Links
+    forms: Sequence[Constraint | Written[Constraint]], loops: Sequence[Constraint], links: Links
 ) -> list[Constraint]:
     constraints = each("constraints", forms, lambda form: made(form, ()))
     each("constraints", constraints, lambda constraint: _try(constraint, links))
-    taken = [constraint.name for constraint in plant_constraints(links)]
+    taken = [constraint.name for constraint in (*plant_constraints(links), *loops)]
     for index, constraint in enumerate(constraints):
         name = constraint.name
         if not name or name in taken:
             key = f"constraints.{index}.name"
             raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
         taken.append(name)
-    return constraints
+    return [*constraints, *loops]
 
 
 def _try(constraint: Constraint, links: Links) -> None:

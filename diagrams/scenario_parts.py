@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
@@ -112,11 +113,14 @@ class Robot:
 
     Meshes that Drake cannot read, as collisions in .stl or .dae, are left out: no equation needs
     them.
-    Joints that mimic another one are constraints "<joint>_coupler".
+    Joints that mimic another one are constraints "<joint>_coupler". Joints that close loops, as in
+    SDFormat, are constraints of their names; where a loop has joints without motors, one of these.
 
     Attributes:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
             "package://drake_dae_models/<file>" for a shipped one.
+        description: Instead of a file: a robot of the package robot_descriptions by its name there,
+            "panda_description", cloned when it is first used (the extra `descriptions`).
         packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Those
             of which a package.xml lies in a folder above the file that names them, or beside such a
             folder under their name, and those in ROS_PACKAGE_PATH are found without it.
@@ -130,18 +134,33 @@ class Robot:
             names, or name -> effort limit in N m or N, or "all" that turn or slide and mimic no
             other. Where no limit is given it is that of the file. Controls have this order, after
             those that the file gives actuators.
-        leave_out: What the file has and the equations have not, which is refused without this:
+        leave_out: What the file has and the equations have not, which without this is refused:
             joint_friction, which is Coulomb friction; inertia that no body can have, in whose place
-            Drake takes that of a ball of water of the same mass.
+            Drake takes that of a ball of water of the same mass; constraints, all those that the
+            file has beside its joints, as <equality> of MJCF, which are then written under
+            `constraints`.
     """
 
-    file: str
+    file: str = ""
     packages: dict[str, str] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
-    leave_out: list[Literal["joint_friction", "inertia"]] = field(default_factory=list)
+    leave_out: list[Literal["joint_friction", "inertia", "constraints"]] = field(
+        default_factory=list
+    )
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if bool(self.file) == bool(self.description):
+            wanted = "the key 'file', or 'description' for a robot of robot_descriptions"
+            raise ModelError(f"needs {wanted}{', not both' if self.file else ''}")
+
+    @property
+    def title(self) -> str:
+        """What messages and systems call it: "two_arms" of "two_arms.dmd.yaml"."""
+        return self.description or Path(self.file).name.split(".")[0]
 
 
 @dataclass(frozen=True)

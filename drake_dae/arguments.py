@@ -1,8 +1,10 @@
 """Arguments of public names, checked by their annotations: the same words everywhere."""
 
 import inspect
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from functools import wraps
+from contextlib import contextmanager
+from functools import cache, wraps
 from math import isfinite
 from numbers import Complex, Integral, Real
 from types import NoneType, UnionType
@@ -48,6 +50,33 @@ def result_of(
     except Exception as failure:
         text = f"{what} failed: {type(failure).__name__}: {brief(str(failure))}"
         raise error(text) from failure
+
+
+@contextmanager
+def numpy_told(what: str) -> Iterator[None]:
+    """Tells in one line, once, that a function calls NumPy on symbols: CasADi takes twenty lines.
+
+    Args:
+        what: How the warning calls the function.
+    """
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        yield
+    for one in found:
+        text = str(one.message)
+        if one.category is FutureWarning and "casadi" in text and "numpy" in text:
+            _tell(what)
+        else:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+
+
+@cache
+def _tell(what: str) -> None:
+    warnings.warn(
+        f"{what} calls a function of NumPy on CasADi symbols; write casadi.sin for numpy.sin, and "
+        "likewise for others: CasADi is about to change what NumPy's give",
+        stacklevel=2,
+    )
 
 
 class _Rule(NamedTuple):

@@ -110,9 +110,7 @@ def _entries(
     seen.add(title)
     given = examples.get(title, {})
     given = tuple({**tag, **example} for example in (given if isinstance(given, list) else [given]))
-    shown = {name: value for example in reversed(given) for name, value in example.items()}
     required = [name for name in schema.get("required", ()) if name != TAG]
-    around = {**tag, **{name: shown.get(name) for name in required}}
     keys = tuple(
         Key(
             name,
@@ -129,7 +127,7 @@ def _entries(
     yield Entry(title, where, schema["description"], keys, given, data, path)
     for name, inner in properties.items():
         if name != TAG:
-            inside = _with(data, path, {**around, name: None})
+            inside = _with(data, path, {**given[0], name: None})
             yield from _entries(inner, inside, (*path, name), examples, seen)
 
 

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pydrake.multibody.parsing import PackageMap
@@ -31,16 +31,19 @@ def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
                 raise ModelError(f"no package in '{folder}': {error}") from None
 
 
-def find_packages(file: str, known: PackageMap) -> tuple[list[Path], dict[str, str]]:
+def find_packages(
+    file: str, known: PackageMap, places: Sequence[Path] = ()
+) -> tuple[list[Path], dict[str, str]]:
     """Adds the packages that a file names, and that files which it names do.
 
     A package is looked for beside the file that names it: in each folder above that file, a folder
     of that name or that one itself, with a package.xml that bears the name. Then it is looked for
-    in ROS_PACKAGE_PATH.
+    in ROS_PACKAGE_PATH, and then in places.
 
     Args:
         file: A path, or a URL of a package.
         known: The packages that are found already; others are added.
+        places: Where packages lie as folders of their name.
 
     Returns:
         The folders of the packages that are added, and what is not found: its name -> a file that
@@ -58,6 +61,8 @@ def find_packages(file: str, known: PackageMap) -> tuple[list[Path], dict[str, s
                 found = _beside(name, origin) if origin.name else None
                 if found is None and ros.Contains(name):
                     found = Path(ros.GetPath(name))
+                if found is None:
+                    found = next((one / name for one in places if (one / name).is_dir()), None)
                 if found is None:
                     missing[name] = str(origin) if origin.name else ""
                     continue

@@ -13,13 +13,23 @@ from pydrake.geometry import Mesh, Role, SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.resources import check_resources, package_folder
+from drake_dae.diagrams.robot_file.descriptions import find_description
 from drake_dae.diagrams.robot_file.efforts import Efforts, read_efforts
 from drake_dae.diagrams.robot_file.meshes import Copies, add_models
 from drake_dae.diagrams.robot_file.packages import add_packages, explained, find_packages
 from drake_dae.diagrams.scenario_parts import Robot
 from drake_dae.diagrams.shipped import FOLDER
 from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
+
+_IGNORED = re.compile(r"The (?:tag|attribute) '(\w+)' .*ignored")
+_IDLE = {
+    *("camera", "custom", "keyframe", "light", "sensor", "site", "size", "statistic", "visual"),
+    *("timestep", "integrator", "solver", "iterations", "ls_iterations", "tolerance", "jacobian"),
+    *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
+}
+"""What MJCF has and Drake leaves out that no equation of ours has."""
 
 _DRAWN = (".obj", ".gltf", ".dae")
 """The kinds of mesh that Drake's Meshcat draws."""
@@ -61,18 +71,23 @@ def read_into(
     Returns:
         The effort limits of joints without an actuator.
     """
-    is_url = robot.file.startswith("package://")
-    if not is_url and not _is_file(robot.file):
-        raise ModelError(f"no file '{robot.file}'; a relative path starts in the scenario's folder")
+    name, places = robot.file, tuple[Path, ...]()
+    if robot.description:
+        with at("robot.description"):
+            described = find_description(robot.description)
+        name, places = str(described.file), described.folders
+    is_url = name.startswith("package://")
+    if not is_url and not _is_file(name):
+        raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
     parser = Parser(plant)
     missing: dict[str, str] = {}
     copies = Copies({}, [])
-    with TemporaryDirectory() as scratch, _drake_log() as dropped:
+    with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
             add_packages(robot.packages, packages)
-            folders, missing = find_packages(robot.file, packages)
-            file = Path(packages.ResolveUrl(robot.file) if is_url else robot.file)
+            folders, missing = find_packages(name, packages, places)
+            file = Path(packages.ResolveUrl(name) if is_url else name)
             _check_one_robot(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
         except ScenarioError:
@@ -82,11 +97,15 @@ def read_into(
             text = copies.named(str(error))
             unknown = {name: origin for name, origin in missing.items() if name in text}
             raise ModelError(explained(unknown) if unknown else text) from None
+    if "constraints" in robot.leave_out:
+        for key in plant.GetConstraintIds():
+            plant.RemoveConstraint(key)
     told = [text for text in dropped.warnings if not _is_answered(text, robot)]
     if told:
         raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
     if scene_graph is not None:
         own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
+        own += places[:2]  # The package and the repository of a description.
         check_resources(scene_graph, [*own, *folders])
         _tell_what_is_left_out(copies.left_out, scene_graph)
     return read_efforts(models)
@@ -98,6 +117,8 @@ def _is_answered(warning: str, robot: Robot) -> bool:
         return robot.actuators is not None
     if "inertia" in warning:
         return "inertia" in robot.leave_out
+    if "equality" in warning or "mimic" in warning:
+        return "constraints" in robot.leave_out
     return "friction" in warning and "joint_friction" in robot.leave_out
 
 
@@ -130,10 +151,10 @@ def _listed(files: list[Path]) -> str:
 
 
 @contextmanager
-def _drake_log() -> Iterator["_Dropped"]:
+def _drake_log(copies: Copies) -> Iterator["_Dropped"]:
     """Listens to what Drake's parser tells."""
     log = logging.getLogger("drake")
-    level, dropped = log.level, _Dropped(log.getEffectiveLevel())
+    level, dropped = log.level, _Dropped(log.getEffectiveLevel(), copies)
     log.addFilter(dropped)
     log.setLevel(logging.WARNING)  # Whoever wants to see less must still be told.
     try:
@@ -148,9 +169,10 @@ class _Dropped(logging.Filter):
 
     KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
 
-    def __init__(self, level: int) -> None:
+    def __init__(self, level: int, copies: Copies) -> None:
         super().__init__()
         self._level = level
+        self._copies = copies
         self.warnings: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -158,6 +180,10 @@ class _Dropped(logging.Filter):
         is_dropped = "warning: " in text and any(kind in text for kind in self.KINDS)
         if is_dropped:
             self.warnings.append(text)
+        ignored = _IGNORED.search(text)
+        if ignored and ignored[1] in _IDLE:
+            return False
+        record.msg, record.args = self._copies.named(text), ()
         return not is_dropped and record.levelno >= self._level
 
 
@@ -180,8 +206,8 @@ def _explained(warning: str) -> str:
         text += " Name the driven joints under robot.actuators"
     elif "equality" in text:
         return (
-            f"{place}: {' '.join(text.split())} Take it out of the file, and write it under "
-            "constraints; two joints that move together are a !JointCoupler"
+            f"{place}: {' '.join(text.split())} Write leave_out: [constraints] under robot, and "
+            "the constraint under constraints; two joints that move together are a !JointCoupler"
         )
     file, _, line = place.rpartition(":")
     owner = ""

@@ -162,7 +162,7 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
         try:
             robot = read_scenario(varied_data(base, changes)).robot
             for path in (robot.file, *robot.packages.values()):
-                if not path.startswith("package://") and not Path(path).is_absolute():
+                if path and not path.startswith("package://") and not Path(path).is_absolute():
                     text = f"a path that varies is absolute or begins with package://, got '{path}'"
                     raise ScenarioError(("robot", text))
         except ScenarioError as error:

@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from drake_dae.arguments import numpy_told
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.smoothness import find_flaw
@@ -156,13 +157,14 @@ def call(
             f"{owner}: {letter} must be a function of the state, got "
             f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
         )
-    try:
-        value = function(*arguments)
-    except Exception as error:
-        raise ModelError(
-            f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
-            f"states: {_explained(error, function, arguments)}"
-        ) from error
+    with numpy_told(f"{owner}: function {letter}"):
+        try:
+            value = function(*arguments)
+        except Exception as error:
+            raise ModelError(
+                f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
+                f"states: {_explained(error, function, arguments)}"
+            ) from error
     if value is None:
         raise ModelError(f"{owner}: function {letter} returned nothing")
     return as_expression(owner, letter, value)

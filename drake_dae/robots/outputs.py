@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from drake_dae.arguments import checked, result_of
+from drake_dae.arguments import checked, numpy_told, result_of
 from drake_dae.arrays import check_axes
 from drake_dae.dae.expressions import as_expression
 from drake_dae.dae.signals import Signal
@@ -200,7 +200,8 @@ class ExpressionOutput(PositionOutput):
     outputs: Sequence[Signal]
 
     def expression(self, links: Links) -> ca.SX:
-        given = result_of("function", self.function, links)
+        with numpy_told("the function of an ExpressionOutput"):
+            given = result_of("function", self.function, links)
         value = ca.vec(as_expression("an ExpressionOutput", "its function", given))
         if value.numel() != len(self.outputs):
             raise ModelError(

@@ -1,5 +1,7 @@
 """Surfaces from formulas and from data: what they are, and how far they are off it."""
 
+import warnings
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from drake_dae import (
     PointOnSurface,
     Sphere,
 )
+from drake_dae.arguments import numpy_told
 from drake_dae.errors import ModelError
 from drake_dae.robots.contact.surface import tangents
 from drake_dae.trace.functions import TracedFunction
@@ -300,3 +303,24 @@ def test_what_is_missing_to_read_a_mesh_is_told(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
     with pytest.raises(ModelError, match=r"pip install 'drake_dae\[meshes\]', or give the mesh as"):
         MeshSurface(file)
+
+
+def test_functions_of_numpy_are_told_in_one_line_and_once():
+    """CasADi tells them in twenty lines, each time that the surface is asked."""
+    p = ca.SX.sym("p", 3)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        surface = ImplicitSurface(lambda p: p[2] - 0.1 * np.sin(3.0 * p[0]))
+        for _ in range(3):
+            surface.distance(p)
+            surface.unit_normal(p)
+        for _ in range(2):
+            with numpy_told("this function"):
+                warnings.warn("casadi: a numpy function was called", FutureWarning, stacklevel=1)
+                warnings.warn("something else", FutureWarning, stacklevel=1)
+    texts = [str(one.message) for one in told]
+    assert texts.count("something else") == 2
+    assert sum("this function calls a function of NumPy" in text for text in texts) == 1
+    assert sum("an ImplicitSurface calls a function of NumPy" in text for text in texts) <= 1
+    assert len(texts) <= 4
+    assert not any("\n" in text for text in texts)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake import geometry
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_dae.arguments import checked, result_of
+from drake_dae.arguments import checked, numpy_told, result_of
 from drake_dae.arrays import positive
 from drake_dae.dae.expressions import as_expression
 from drake_dae.dae.signals import Signal
@@ -331,9 +331,9 @@ class ImplicitSurface(Surface):
             return parse_formula(
                 self.function, {**dict(zip("xyz", ca.vertsplit(p), strict=True)), **names}
             )
-        if not names:
-            return result_of("function", self.function, p)
-        return result_of("function", self.function, p, SimpleNamespace(**names))
+        more = [SimpleNamespace(**names)] if names else []
+        with numpy_told("the function of an ImplicitSurface"):
+            return result_of("function", self.function, p, *more)
 
 
 def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:

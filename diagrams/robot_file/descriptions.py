@@ -1,0 +1,66 @@
+"""Robots by their name in the package robot_descriptions."""
+
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from drake_dae.arrays import brief
+from drake_dae.errors import ModelError
+
+
+class Description(NamedTuple):
+    """A robot that robot_descriptions has.
+
+    Attributes:
+        file: Its URDF or MJCF file.
+        folders: Folders in which its packages lie, under their names.
+    """
+
+    file: Path
+    folders: tuple[Path, ...]
+
+
+def find_description(name: str) -> Description:
+    """The robot with a name such as "panda_description"; it is fetched where it is not yet.
+
+    Raises:
+        ModelError: There is none, it cannot be fetched, or the package is not installed.
+    """
+    try:
+        known = import_module("robot_descriptions").DESCRIPTIONS
+    except ImportError:
+        raise ModelError(
+            "this takes the package robot_descriptions; pip install 'drake_dae[descriptions]', or "
+            "name a file of your own as robot.file"
+        ) from None
+    if name not in known:
+        near = get_close_matches(name, known, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ModelError(
+            f"robot_descriptions has no '{name}'; {hint}python -m robot_descriptions list names all"
+        )
+    try:
+        module = import_module(f"robot_descriptions.{name}")
+    except Exception as error:  # Of git, of the network, of the disk.
+        raise ModelError(
+            f"'{name}' cannot be fetched: {brief(str(error))}. It is cloned when it is first used; "
+            "without a network clone it elsewhere, and let ROBOT_DESCRIPTIONS_CACHE name the "
+            "folder, or name the robot's own file as robot.file"
+        ) from None
+    file = getattr(module, "URDF_PATH", None) or getattr(module, "MJCF_PATH", None)
+    if file is None:
+        raise ModelError(
+            f"'{name}' comes as neither URDF nor MJCF; make a URDF of it, as xacro does, and name "
+            "it as robot.file"
+        )
+    return Description(Path(file), _folders(module, Path(file)))
+
+
+def _folders(module: Any, file: Path) -> tuple[Path, ...]:
+    """Where the loaders of robot_descriptions look for packages."""
+    package, repository = (
+        Path(getattr(module, key, file.parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
+    )
+    found = (package, repository, package.parent, repository.parent, file.parent)
+    return tuple(dict.fromkeys(found))
