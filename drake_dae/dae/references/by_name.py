@@ -90,7 +90,7 @@ def assigned(
         ReferenceSignalError: The name means no output, or the reference has more or fewer rows, or
             is not smooth enough.
     """
-    places = [place for part in name.split(",") for place in meant(part.strip(), outputs, degrees)]
+    places = meant(name, outputs, degrees)
     if not isinstance(reference, Reference):
         reference = ConstantReference([reference] * len(places))
     if reference.size != len(places):
@@ -149,11 +149,17 @@ def references_by_name(
 
 
 def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """The places of the outputs that a name means.
+    """Where the outputs that a name means stand among all, shape (k,).
 
     Raises:
-        ReferenceSignalError: There is no such output.
+        ReferenceSignalError: It means none.
     """
+    parts = [part.strip() for part in name.split(",")]
+    return [place for part in parts for place in _meant(part, outputs, degrees)]
+
+
+def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
+    """The same for a name that is no list."""
     places = {output: place for place, output in enumerate(outputs)}
     if name in places:
         return [places[name]]

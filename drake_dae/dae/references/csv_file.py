@@ -13,7 +13,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, unknown_name
 from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.splines import SplineReference, TimeSpline
+from drake_dae.dae.references.splines import MOST_POINTS, SplineReference, TimeSpline
 from drake_dae.errors import ReferenceSignalError
 
 
@@ -90,10 +90,6 @@ class CsvReference(SplineReference):
         function = self.derivatives([0] * self.size)
         found = [function(self.start_time + time) for time in self.table[:, 0]]
         return np.abs(found - self.table[:, 1:]).max(axis=0)
-
-
-MOST_POINTS = 100_000
-"""How many points a spline may have."""
 
 
 def _read(file: Path, names: Sequence[str]) -> FloatArray:

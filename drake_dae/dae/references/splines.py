@@ -17,6 +17,9 @@ from drake_dae.dae.references.pieces import Pieces, PiecewiseReference
 from drake_dae.dae.references.travel import PathLimits
 from drake_dae.errors import ReferenceSignalError
 
+MOST_POINTS = 20_000
+"""How many points a spline may have: more take longer to prepare than to follow."""
+
 
 @dataclass(frozen=True, eq=False)
 class TimeSpline:
@@ -214,7 +217,7 @@ def check_spline(corner: float, order: int, length: float) -> None:
     """
     positive("corner", corner, ReferenceSignalError)
     check_order(order)
-    least = length * order / 2 / 100_000
+    least = length * order / 2 / MOST_POINTS
     if corner < least:
         raise ReferenceSignalError(
             f"corner must be {least:.3g} or more for a path of length {length:.3g}, got {corner:g}"

@@ -16,7 +16,8 @@ from drake_dae.errors import ReferenceSignalError
 class PathLimits:
     """The largest derivatives along a path: Euclidean norms over the outputs that it covers.
 
-    They are those of the whole motion, so that a curve is taken slower than a line.
+    They are those of the whole motion, so that a curve is taken slower than a line. The outputs
+    have one unit, then.
 
     Attributes:
         speed: The largest |r'|, in the outputs' unit per s.

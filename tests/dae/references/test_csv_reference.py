@@ -86,7 +86,7 @@ def test_what_is_wrong_with_a_file(text, message, tmp_path):
         ({"columns": []}, "columns: empty"),
         ({"smoothing": -1.0}, "smoothing must be positive, got -1"),
         ({"order": 1}, "order must be from 2 to 12"),
-        ({"smoothing": 1e-7}, "smoothing must be 5e-05 s or more for 5 s, got 1e-07 s"),
+        ({"smoothing": 1e-7}, "smoothing must be 0.00025 s or more for 5 s, got 1e-07 s"),
     ],
 )
 def test_refusals(changes, message, tmp_path):
