@@ -27,6 +27,7 @@ from drake_dae.simulation.interruption import Ending, end_at_once, ending_signal
 from drake_dae.simulation.plots import PLOTS, save_plots
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
+from drake_dae.simulation.remarks import surface_remarks
 from drake_dae.simulation.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
@@ -156,8 +157,7 @@ def _write(run: _Run) -> bool:
         limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
         text = summary(record, predicted, limits, run.statistics, run.failure)
         if isinstance(loop.plant, RobotBlock):
-            remarks = [one.remark for one in loop.plant.model.constraints if one.remark]
-            text = "\n".join([text, *remarks])
+            text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)
