@@ -30,6 +30,7 @@ from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
+from drake_dae.simulation.remarks import surface_remarks
 from drake_dae.simulation.run_folder import (
     ANIMATION,
     FILES,
@@ -188,8 +189,7 @@ def _write(run: _Run) -> bool:
         reasons = _reasons(run.scenario, record)
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if isinstance(loop.plant, RobotBlock):
-            remarks = [one.remark for one in loop.plant.model.constraints if one.remark]
-            text = "\n".join([text, *remarks])
+            text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)

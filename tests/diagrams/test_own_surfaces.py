@@ -13,6 +13,7 @@ from drake_dae.diagrams.scenario import save_scenario
 from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.simulation.remarks import surface_remarks
 from drake_dae.trace.functions import TracedFunction
 
 SHORT = ["duration=0.3", "integrator.max_step_size=0.005", "integrator.use_error_control=false"]
@@ -90,13 +91,27 @@ def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summar
     )
     told = "wall: HeightMap 'bump.csv': the surface is off the data by "
     assert told in capsys.readouterr().out
-    assert told in (tmp_path / "run" / "summary.txt").read_text()
+    text = (tmp_path / "run" / "summary.txt").read_text()
+    assert told in text
+    assert "beyond the edge" not in text
     assert (tmp_path / "run" / "animation.html").stat().st_size > 0
     # As run it means the same file from anywhere.
     again = load_scenario(tmp_path / "run" / "scenario.yaml")
     assert again.constraints[0].surface.file == tmp_path / "bump.csv"
     save_scenario(again, tmp_path / "run" / "again.yaml")
     assert load_scenario(tmp_path / "run" / "again.yaml") == again
+
+
+def test_where_the_robot_leaves_the_data_is_told(tmp_path):
+    """The tool starts 5 cm above its reference z = 0.3, and this map ends at z = 0.34."""
+    bump(tmp_path)
+    file = json.dumps(str(tmp_path / "bump.csv"))
+    place = PLACE.replace("[0.8, 0.8]", "[0.8, 0.08]")
+    surface = f"constraints.0.surface=!HeightMap {{file: {file}, {place}, scale: 0.01}}"
+    loop, _, record = run_scenario(scenario("two_link_wall", surface, *SHORT, "duration=0.02"))
+    _, told = surface_remarks(loop.plant.model, record)
+    assert "wall: the robot is beyond the edge of the data by up to 1" in told
+    assert "1 mm, first at 0 s; there a plane goes on" in told
 
 
 def test_a_mesh_in_a_scenario(tmp_path):

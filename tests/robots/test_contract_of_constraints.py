@@ -28,6 +28,7 @@ from drake_dae import (
     CoincidentPoints,
     Ellipsoid,
     FixedDistance,
+    ImplicitSurface,
     JointCoupler,
     MultibodyExpressions,
     Plane,
@@ -89,6 +90,12 @@ def rough_at(place, _):
 def saddle_at(place, _):
     surface = Saddle(tuple(place @ np.array(POINT) - [0.3, 0.1, 0.7 * (0.09 - 0.01)]), 0.7)
     return PointOnSurface("tip", surface, POINT, "saddle")
+
+
+def formula_at(place, _):
+    """With a number of its form, which is a parameter."""
+    surface = ImplicitSurface("x + 2*y - k*z + k*y**2", tuple(place @ np.array(POINT)), {"k": 2.0})
+    return PointOnSurface("tip", surface, POINT, "formula", (0.0, 0.0, 0.0), friction=0.3)
 
 
 def pin_at(place, base):
@@ -207,6 +214,7 @@ MEMBERS = {
     "plane": (plane_at, {"tip", "world"}),
     "ball": (ball_at, {"tip", "world"}),
     "saddle": (saddle_at, {"tip", "world"}),
+    "formula": (formula_at, {"tip", "world"}),
     "pin": (pin_at, {"tip", "base"}),
     "weld": (weld_at, {"tip", "base"}),
     "revolute": (turning_at, {"tip", "base"}),
@@ -449,4 +457,4 @@ def test_a_push_drives_the_residual_up():
         )(links.plant.GetPositions(context), v, values)
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
-    assert found == {"plane", "ball", "saddle", "rubbing", "rough", "rolling"}
+    assert found == {"plane", "ball", "saddle", "formula", "rubbing", "rough", "rolling"}

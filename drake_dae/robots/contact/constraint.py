@@ -221,6 +221,11 @@ class Constraint(ABC):
         """What of what it touches is approximate, and how much; empty if nothing is."""
         return ""
 
+    @property
+    def extent(self) -> FloatArray | None:
+        """The least and the largest coordinates for which it is meant, shape (2, k), or None."""
+        return None
+
     def placement(self, values: FloatArray) -> RigidTransform:
         """Where what the robot touches stands in the world.
 

@@ -49,6 +49,10 @@ class _Map(Surface):
         return ca.vertcat(*[ca.dot(ca.DM(t), offset) for t in tangents(self.normal)])
 
     @property
+    def extent(self) -> FloatArray:
+        return np.column_stack([self.relief.x, self.relief.y])
+
+    @property
     @abstractmethod
     def remark(self) -> str:
         """How far it is off its data."""

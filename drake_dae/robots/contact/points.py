@@ -176,6 +176,10 @@ class PointOnSurface(Constraint):
     def remark(self) -> str:
         return f"{self.name}: {self.surface.remark}" if self.surface.remark else ""
 
+    @property
+    def extent(self) -> FloatArray | None:
+        return self.surface.extent
+
     def placement(self, values: FloatArray) -> RigidTransform:
         turn = np.zeros(3) if self.rpy is None else values[3:6]
         return RigidTransform(RollPitchYaw(turn), values[:3])

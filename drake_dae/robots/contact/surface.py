@@ -46,7 +46,8 @@ class Surface(ABC):
        `shaped` is the same surface with others, numbers or symbols.
     7. `solid` is what fills the side that is not free, as a shape of Drake, for its own contact. A
        surface may have none.
-    8. `remark` says what of it is approximate, if anything is.
+    8. `remark` says what of it is approximate, if anything is, and `extent` up to which coordinates
+       it is given, if it has an end.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
@@ -89,6 +90,11 @@ class Surface(ABC):
     def remark(self) -> str:
         """What of it is approximate, and how much; empty if nothing is."""
         return ""
+
+    @property
+    def extent(self) -> FloatArray | None:
+        """The least and the largest coordinates up to which it is given, shape (2, 2), or None."""
+        return None
 
     def unit_normal(self, offset: ca.SX) -> ca.SX:
         """The gradient of the distance at such a point, shape (3, 1): one long on the surface."""

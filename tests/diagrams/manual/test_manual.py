@@ -44,6 +44,9 @@ PURE = {
 }
 """Keys with numbers that have no unit: directions, ratios, weights."""
 
+GONE_SOON = {"publish_every_time_step"}
+"""Drake 1.51 has it, Drake 1.58 has not: no example of it."""
+
 
 def forms(schema):
     """The title and the properties of each form, found without the code of the page."""
@@ -68,7 +71,9 @@ def test_every_key_is_on_the_page_with_an_example():
         entry = found[title]
         assert [key.name for key in entry.keys] == list(properties), title
         shown = {name for example in entry.examples for name in example} - {TAG}
-        assert shown == set(properties), f"{title}: its example lacks keys, or has others"
+        assert shown == set(properties) - GONE_SOON, (
+            f"{title}: its example lacks keys, or has others"
+        )
         (section,) = re.findall(rf"^## {title}$(.*?)(?=^## |\Z)", page, re.DOTALL | re.MULTILINE)
         assert all(f"\n| `{name}` | " in section for name in properties)
         assert entry.text

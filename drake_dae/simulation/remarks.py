@@ -1,0 +1,43 @@
+"""What a run should say of the surfaces that a robot touched."""
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.robots.contact import Constraint
+from drake_dae.robots.model import RobotModel
+from drake_dae.simulation.record import Record
+from drake_dae.trace.functions import TracedFunction
+
+
+def surface_remarks(model: RobotModel, record: Record) -> list[str]:
+    """What of the surfaces is approximate, and where the robot left what is given of them.
+
+    Args:
+        model: The robot.
+        record: A record of it, with its state.
+    """
+    remarks = [constraint.remark for constraint in model.constraints]
+    remarks += [_left(constraint, model, record) for constraint in model.constraints]
+    return [remark for remark in remarks if remark]
+
+
+def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
+    """When a point is first beyond the edge of its surface; empty if it never is."""
+    extent, dae = constraint.extent, model.dae
+    if extent is None:
+        return ""
+    coordinates = constraint.coordinates(model.links)
+    if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):
+        return ""  # Where a surface that moves has been the record does not say.
+    inputs = {"q": model.links.q, "parameters": dae.parameter_symbol}
+    function = TracedFunction("coordinates", inputs, {"coordinates": coordinates})
+    positions = record["state"][:, : model.links.q.numel()]
+    places = np.array([function(q, dae.parameter_values)[0] for q in positions])
+    beyond = np.max(np.maximum(extent[0] - places, places - extent[1]), axis=1)
+    if not np.any(beyond > 0.0):
+        return ""
+    first = record.time[int(np.argmax(beyond > 0.0))]
+    return (
+        f"{constraint.name}: the robot is beyond the edge of the data by up to "
+        f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there a plane goes on"
+    )
