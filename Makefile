@@ -14,12 +14,13 @@ SEED ?= 0
 VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
 VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
-HOUSE := examples/pictures/house.png
+PICTURES := examples/pictures
+HOUSE := $(PICTURES)/house.png
 
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark campaign house clean lint
+.PHONY: help demo check test benchmark campaign house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -30,6 +31,7 @@ help:
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
+	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
@@ -56,6 +58,12 @@ campaign: $(VENV)/installed-dev
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)
+
+pictures: $(VENV)/installed
+	$(BIN)/drake-dae simulate seven_joint_wall --set duration=8 --out runs/pictures
+	$(BIN)/drake-dae film runs/pictures --out $(PICTURES)/seven_joint_wall.gif
+	cp runs/pictures/path.png $(PICTURES)/seven_joint_wall_path.png
+	cp runs/pictures/errors.png $(PICTURES)/seven_joint_wall_errors.png
 
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache

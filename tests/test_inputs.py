@@ -34,7 +34,7 @@ from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.diagrams.scenario_parts import Robot
 from drake_dae.diagrams.typed_yaml import load_yaml
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
-from drake_dae.simulation.plots import _label
+from drake_dae.simulation.axes import labelled
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -271,7 +271,7 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
 
 
 def test_dollars_in_names_are_no_mathematics():
-    assert _label(Signal("$x^$", "m")) == r"\$x^\$ [m]"
+    assert labelled(Signal("$x^$", "m")) == r"\$x^\$ [m]"
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import logging
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.surface import tangents
 from drake_dae.simulation.constraint_forces import PATH_COLOR, ConstraintLoads, path_of
 from drake_dae.simulation.course import Course, Loop, follow
 from drake_dae.simulation.record import Record
@@ -157,11 +155,13 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
     along = np.gradient(points, axis=0)
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), [0.0, 0.0, 1.0])
+    # Two directions across the line, from one that is nowhere along it.
+    aside = np.where(np.abs(along[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    first = np.cross(along, aside)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    across = np.stack([first, np.cross(along, first)], axis=1)
     turn = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
-    rings = [
-        point + radius * (np.outer(np.cos(turn), first) + np.outer(np.sin(turn), second))
-        for point, (first, second) in zip(points, map(tangents, along), strict=True)
-    ]
+    rings = points[:, None] + radius * np.column_stack([np.cos(turn), np.sin(turn)]) @ across
     near = np.arange(_SIDES)
     far = np.roll(near, -1)
     piece = np.vstack(
@@ -170,8 +170,8 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
             np.column_stack([far, far + _SIDES, near + _SIDES]),
         ]
     )
-    faces = [piece + _SIDES * start for start, _ in pairwise(range(len(points)))]
-    return np.vstack(rings), np.vstack(faces)
+    faces = piece + _SIDES * np.arange(len(points) - 1)[:, None, None]
+    return rings.reshape(-1, 3), faces.reshape(-1, 3)
 
 
 def _with_overlay(page: str, course: Course, title: str) -> str:

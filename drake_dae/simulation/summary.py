@@ -104,6 +104,7 @@ def summary(
     if failure:
         notes.append(f"failed               the record ends at {record.time[-1]:.6g} s: {failure}")
         ended = f"The run ended early, at {record.time[-1]:.4g} s"
+        reasons = ["of what ended it, see above"]
     words = in_words(judge(record, predicted, accuracy), accuracy, reasons, ended)
     beware = _beware(record, limits)
     verdict = [fill(f"{words} But {'; '.join(beware)}." if beware else words, _WIDTH)]
@@ -218,8 +219,8 @@ def _beware(record: Record, limits: Limits) -> list[str]:
         found.append(f"{', '.join(pulling)} would have to pull, and a contact cannot")
     if beyond:
         found.append(f"{', '.join(beyond)} would have to give more than the limit")
-    if joints := _beyond(record, limits):
-        found.append(f"joint limits are left ({'; '.join(joints)})")
+    if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:
+        found.append(f"{', '.join(joints)} would leave the joint limits")
     return found
 
 

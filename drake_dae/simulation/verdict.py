@@ -17,7 +17,7 @@ CLOSE, NEAR = 1e-5, 1e-2
 """Errors that are off their prediction by less than these shares of their outputs' sizes are as
 predicted, and nearly as predicted."""
 
-SLACK = 100.0
+SLACK = 10.0
 """How many times the accuracy of a step a whole run may be off."""
 
 
@@ -37,7 +37,7 @@ class Verdict:
         tracking: How good it was.
         worst: The output that is farthest off, beside its size; None where there are no outputs.
         off: By how much its error is off the predicted one, at most, in its unit.
-        time: When, in s.
+        time: When, in s; where it is not as predicted, since when.
         share: The same beside the output's size.
     """
 
@@ -100,14 +100,15 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
         return Verdict(Tracking.AS_PREDICTED)
     signals = record.signals["tracking_error"].signals
     shares = np.abs(error - predicted) / output_sizes(record, predicted)
-    row, column = np.unravel_index(np.argmax(shares), shares.shape)
+    row, column = map(int, np.unravel_index(np.argmax(shares), shares.shape))
     share = float(shares[row, column])
-    tracking = Tracking.OFF
     if share <= max(CLOSE, SLACK * (accuracy or 0.0)):
         tracking = Tracking.AS_PREDICTED
     elif share <= NEAR:
         tracking = Tracking.NEARLY
-    off = float(np.abs(error - predicted)[row, column])
+    else:
+        tracking, row = Tracking.OFF, int(np.argmax(shares[:, column] > NEAR))
+    off = float(np.max(np.abs(error - predicted)[:, column]))
     return Verdict(tracking, signals[column], off, float(record.time[row]), share)
 
 
@@ -140,9 +141,15 @@ def in_words(
             f"{head}{verdict.tracking.value}: errors stay within {off} of the predicted ones "
             f"({name} is the farthest off); {step}."
         )
+    beside = (
+        f"{verdict.share:.2g} times" if verdict.share > 1.0 else f"{100.0 * verdict.share:.2g} % of"
+    )
+    when = f"at {verdict.time:.3g} s"
+    if verdict.tracking is Tracking.OFF:
+        when = f"from {verdict.time:.3g} s on"
     text = (
-        f"{head}{verdict.tracking.value}: at {verdict.time:.3g} s the error of {name} is off the "
-        f"predicted one by {off}, {100.0 * verdict.share:.2g} % of its size"
+        f"{head}{verdict.tracking.value}: {when} the error of {name} is off the predicted one, by "
+        f"up to {off}, {beside} its size"
     )
     if reasons:
         return f"{text}. Likely because {', and '.join(reasons)}."

@@ -169,8 +169,8 @@ def test_a_run_that_drifted_says_where_and_why():
     reasons = ["the law is sampled"]
     text = verdict(summary(run, PREDICTED, reasons=reasons))
     assert text == (
-        "Not tracked as predicted: at 0.4 s the error of a is off the predicted one by 0.062 m, "
-        "12 % of its size. Likely because the law is sampled."
+        "Not tracked as predicted: from 0.4 s on the error of a is off the predicted one, by up to "
+        "0.062 m, 12 % of its size. Likely because the law is sampled."
     )
     text = verdict(summary(run, PREDICTED, accuracy=1e-3))
     assert text.endswith("If a finer one changes nothing, plant and law differ.")
@@ -179,6 +179,11 @@ def test_a_run_that_drifted_says_where_and_why():
 def test_a_run_that_failed_is_not_called_good():
     text = verdict(summary(record(**EXACT), PREDICTED, failure="singular there"))
     assert text.startswith("The run ended early, at 1 s; up to there: Tracked as predicted")
+    grown = record(tracking_error=([[0.05, 0], [0, 0], [9.0, 0]], [("a", "m"), ("b", "")]))
+    text = verdict(summary(grown, PREDICTED, failure="singular there"))
+    assert text.endswith(
+        "by up to 9 m, 18 times its size. Likely because of what ended it, see above."
+    )
     run = RunStatistics(simulated_time=1.0, wall_time=0.5, steps=12, interrupted=signal.SIGINT)
     text = verdict(summary(record(**EXACT), PREDICTED, run=run))
     assert text.startswith("Interrupted at 1 s; up to there: ")
@@ -189,9 +194,7 @@ def test_what_no_robot_would_do_is_in_the_verdict():
     limits = Limits(np.array([7.0, 40.0]), (np.array([-1.0, -2.0]), np.array([0.4, 3.0])))
     text = verdict(summary(record(constraint_force=pulling, **EXACT), PREDICTED, limits))
     assert "But wall.force would have to pull, and a contact cannot; motor1 would" in text
-    assert text.endswith(
-        "joint limits are left (q goes from 0 to 0.5 rad, its limits are -1 and 0.4)."
-    )
+    assert text.endswith("give more than the limit; q would leave the joint limits.")
 
 
 def test_without_contact():
