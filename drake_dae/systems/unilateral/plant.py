@@ -37,7 +37,7 @@ from drake_dae.systems.unilateral.resets import TOUCHING, Resets
 from drake_dae.trace.functions import TracedFunction
 
 MARGIN = 1e-13
-"""How far below zero, in m and m/s, gap and rate of an open contact are still round-off."""
+"""How far below zero, in m/s, the rate of a contact that begins to leave is still round-off."""
 
 
 @dataclass
@@ -307,10 +307,10 @@ class UnilateralRobotPlant(ParameterizedSystem):
         closed = context.get_discrete_state_vector().value() > 0.5
         margins = np.zeros(closed.size)
         if not closed.all():
-            # A contact that leaves has a gap of round-off; one that is far away may approach.
+            # A contact that leaves has a gap of round-off, whatever its sign.
             state = context.get_continuous_state_vector().value()
             gaps, rates = self._checked(self._contacts.state, context, state)
-            margins[:] = np.maximum(gaps, rates) + MARGIN
+            margins[:] = np.maximum(gaps, rates + MARGIN)
         if closed.any():
             force = self._evaluated(self._mode(context).force, context)
             margins[closed] = force[self._contacts.normals][closed]

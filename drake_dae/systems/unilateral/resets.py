@@ -227,4 +227,10 @@ class Resets:
 
     def _told(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
         names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
-        return [replace(event, closed=names) for event in events]
+        told = []
+        for event in events:
+            found = replace(event, closed=names)
+            if event.kind is ContactChange.REST and not set(event.contacts) & set(names):
+                found = replace(found, kind=ContactChange.IMPACT, rest_time=None)
+            told.append(found)
+        return told
