@@ -32,6 +32,7 @@ from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
 from drake_dae.systems.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.unilateral.events import ContactChange, ContactEvent
+from drake_dae.systems.unilateral.graph import ContactGraph
 from drake_dae.systems.unilateral.modes import Closed, Mode, Modes, closed_of, numbers_of
 from drake_dae.systems.unilateral.resets import TOUCHING, Resets
 from drake_dae.trace.functions import TracedFunction
@@ -251,6 +252,11 @@ class UnilateralRobotPlant(ParameterizedSystem):
         """What happened to contacts since the run of a context began."""
         self.check_context(context)
         return tuple(self._log(context).events)
+
+    @property
+    def graph(self) -> ContactGraph:
+        """Modes, guards and resets: print it, or draw its `graphviz()`."""
+        return ContactGraph(self.dae.name, self.contacts)
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         derivatives.SetFromVector(self._evaluated(self._mode(context).dynamics, context))

@@ -1,0 +1,121 @@
+"""Robots that hit walls and leave them, against integrations of equations written by hand."""
+
+import numpy as np
+import pytest
+from falling import GRAVITY, simulator_of
+from numpy.testing import assert_allclose
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
+from scipy.integrate import solve_ivp
+
+from drake_dae import Plane, PointOnSurface, RobotModel, UnilateralRobotPlant
+from drake_dae.systems.unilateral.events import ContactChange
+
+WALL = -0.5
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """Two massless rods of 1 m with 1 kg at each end; a wall keeps the tip at x <= WALL."""
+    plant = MultibodyPlant(0.0)
+    parent, offset = plant.world_frame(), RigidTransform()
+    for name in ("upper", "lower"):
+        inertia = SpatialInertia(1.0, [0, 0, -1], UnitInertia.PointMass([0, 0, -1]))
+        body = plant.AddRigidBody(name, inertia)
+        at = plant.AddFrame(FixedOffsetFrame(f"{name}_at", parent, offset))
+        plant.AddJoint(RevoluteJoint(name, at, body.body_frame(), [0, -1, 0]))
+        parent, offset = body.body_frame(), RigidTransform([0, 0, -1])
+    plant.AddFrame(FixedOffsetFrame("tip", parent, offset))
+    plant.Finalize()
+    wall = PointOnSurface("tip", Plane((WALL, 0, 0), (-1, 0, 0)), name="wall")
+    nominal = [-0.3, 0.1]
+    model = RobotModel.from_multibody(plant, [wall], [], nominal, forces=[])
+    return UnilateralRobotPlant(model, {"wall": 0.0})
+
+
+def by_hand(x):
+    """M, H, J and J' v in the angles of both rods to the vertical."""
+    a, b, va, vb = x
+    c, s = np.cos(a - b), np.sin(a - b)
+    mass = np.array([[2.0, c], [c, 1.0]])
+    bias = np.array([s * vb**2 + 2.0 * GRAVITY * np.sin(a), -s * va**2 + GRAVITY * np.sin(b)])
+    jacobian = -np.cos([a, b])
+    return mass, bias, jacobian, np.sin(a) * va**2 + np.sin(b) * vb**2
+
+
+def force_by_hand(x):
+    mass, bias, jacobian, curved = by_hand(x)
+    pushed = np.linalg.solve(mass, jacobian)
+    return (pushed @ bias - curved) / (jacobian @ pushed)
+
+
+def integrated_by_hand(x, restitution, end):
+    """Times and impulses of events, 0 where the contact opens, and the last state."""
+    time, closed, events = 0.0, False, []
+    while True:
+        began = time
+
+        def rate(_, x, closed=closed):
+            mass, bias, jacobian, _ = by_hand(x)
+            force = force_by_hand(x) if closed else 0.0
+            return np.concatenate([x[2:], np.linalg.solve(mass, jacobian * force - bias)])
+
+        def guard(t, x, closed=closed, began=began):
+            if closed:
+                return force_by_hand(x)
+            return WALL - np.sin(x[0]) - np.sin(x[1]) if t > began + 1e-6 else 1.0
+
+        guard.terminal, guard.direction = True, -1.0
+        found = solve_ivp(
+            rate, (time, end), x, method="DOP853", rtol=1e-12, atol=1e-13, events=guard
+        )
+        time, x = found.t[-1], found.y[:, -1].copy()
+        if found.status != 1:
+            return events, x
+        impulse = 0.0
+        if not closed:
+            mass, _, jacobian, _ = by_hand(x)
+            pushed = np.linalg.solve(mass, jacobian)
+            impulse = -(1.0 + restitution) * (jacobian @ x[2:]) / (jacobian @ pushed)
+            x[2:] += pushed * impulse
+        events.append((time, impulse))
+        closed = not closed and restitution == 0.0
+
+
+@pytest.mark.parametrize(
+    ("restitution", "kinds"),
+    [
+        (0.7, [ContactChange.IMPACT] * 3),
+        (0.0, [ContactChange.REST, ContactChange.OPENING] * 2),
+    ],
+)
+def test_a_double_pendulum_hits_a_wall_as_an_integration_by_hand_says(pendulum, restitution, kinds):
+    """Steps of 2 ms and windows of 2e-13 s leave some 1e-11; the other has 1e-12 a step."""
+    start = np.array([-1.62, -1.37, -0.14, -1.75])
+    simulator, context = simulator_of(pendulum, start, step=0.002)
+    pendulum.set_parameter(context, "wall.restitution", restitution)
+    simulator.AdvanceTo(1.2)
+    sums = np.array([[1.0, 0, 0, 0], [1.0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]])
+    wanted, last = integrated_by_hand(sums @ start, restitution, 1.2)
+    events = pendulum.events(context)
+    assert [event.kind for event in events] == kinds
+    assert_allclose([event.time for event in events], [time for time, _ in wanted], atol=1e-10)
+    impulses = [event.impulses[0] if event.impulses else 0.0 for event in events]
+    assert_allclose(impulses, [impulse for _, impulse in wanted], rtol=1e-9)
+    assert_allclose(sums @ pendulum.state(context), last, atol=1e-9)
+
+
+def test_the_graph_of_modes_is_read_and_drawn(pendulum):
+    graph = pendulum.graph
+    assert graph.modes == ((), ("wall",))
+    assert str(graph).splitlines() == [
+        "robot: 2 modes",
+        "{} -> {} when phi(wall) falls to 0: phi'(wall) := -e phi'(wall)",
+        "{} -> {wall} when phi(wall) falls to 0 and bouncing would end within the settling time: "
+        "phi'(wall) := 0",
+        "{wall} -> {} when lambda(wall) falls to 0",
+    ]
+    drawn = graph.graphviz()
+    assert drawn.startswith('digraph "robot" {')
+    assert drawn.count("->") == 3
