@@ -2,14 +2,26 @@
 
 import numpy as np
 import pytest
-from falling import GRAVITY, simulator_of
+from arms import arm, numbers, touching
+from falling import GRAVITY, HALF, HEIGHT, MASS, box, simulator_of
 from numpy.testing import assert_allclose
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
+from pydrake.trajectories import PiecewisePolynomial
 from scipy.integrate import solve_ivp
 
-from drake_dae import Plane, PointOnSurface, RobotModel, UnilateralRobotPlant
+from drake_dae import (
+    FlexibleJoints,
+    Plane,
+    PointOnSurface,
+    RobotModel,
+    RobotPlant,
+    UnilateralRobotPlant,
+)
 from drake_dae.systems.unilateral.events import ContactChange
 
 WALL = -0.5
@@ -119,3 +131,81 @@ def test_the_graph_of_modes_is_read_and_drawn(pendulum):
     drawn = graph.graphviz()
     assert drawn.startswith('digraph "robot" {')
     assert drawn.count("->") == 3
+
+
+def test_what_stays_closed_moves_as_a_robot_plant():
+    """The same equations; they are traced in another order, and projected likewise."""
+    found, pushed = arm("two_link"), [12.0, 25.0]
+    plants = (
+        UnilateralRobotPlant(found.model, {"wall": 0.5}),
+        RobotPlant(found.model, structure=found.structure),
+    )
+    shown = []
+    for plant in plants:
+        simulator = Simulator(plant)
+        ResetIntegratorFromFlags(simulator, "runge_kutta3", 0.005)
+        simulator.get_mutable_integrator().set_fixed_step_mode(True)
+        context = simulator.get_mutable_context()
+        plant.set_state(context, found.structure.manifold.project(found.model.dae.nominal_state))
+        plant.GetInputPort("control").FixValue(context, pushed)
+        context.SetAccuracy(1e-8)
+        simulator.AdvanceTo(0.1)
+        simulator.AdvancePendingEvents()
+        names = ("state", "constraint_force", "constraint_residual", "controlled_output")
+        names += ("link_state", "constraint_wrenches")
+        shown.append([plant.GetOutputPort(name).Eval(context) for name in names])
+        assert shown[-1][1] > 1.0
+    for one, other in zip(*shown, strict=True):
+        assert_allclose(one, other, rtol=1e-10, atol=1e-12)
+
+
+def test_stages_keep_their_state_through_an_impact():
+    """v+ = v- + M^-1 J' Lambda by MultibodyPlant; shafts behind springs go on as they were."""
+    model = touching("two_link", [FlexibleJoints(stiffness=8000.0, inertia=0.5)])
+    plant = UnilateralRobotPlant(model, {"wall": 0.5})
+    q, v = model.configuration(None, [1.2, -1.6]), np.array([0.3, -0.2])
+    found = numbers("two_link", q, v)
+    (approach,) = found.constraint_jacobian @ v
+    v *= -np.sign(approach)
+    before = np.concatenate([q, v, q, [0.4, -0.1]])
+    _, context = simulator_of(plant, before)
+    (event,) = plant.events(context)
+    pushed = np.linalg.solve(found.mass, found.constraint_jacobian[0])
+    impulse = 1.5 * abs(approach) / (found.constraint_jacobian[0] @ pushed)
+    after = plant.state(context)
+    assert_allclose(event.impulses, [impulse], rtol=1e-12)
+    assert_allclose(after[2:4], v + pushed * impulse, rtol=1e-12)
+    assert_allclose(after[[0, 1, 4, 5, 6, 7]], before[[0, 1, 4, 5, 6, 7]], atol=1e-15)
+    lost = 0.5 * (v @ found.mass @ v - after[2:4] @ found.mass @ after[2:4])
+    assert_allclose(event.energy_lost, lost, rtol=1e-10)
+    assert_allclose(plant.GetOutputPort("motor_state").Eval(context), before[4:])
+    assert plant.GetOutputPort("joint_torque").size() == 2
+
+
+@pytest.mark.parametrize("hold", [None, 0.01])
+def test_a_control_that_jumps_opens_a_contact_at_once(hold):
+    """A torque of 2 m g b from 0.03 s on, within a step, or held by a sampling that begins one."""
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(box({"left": 0.0, "right": 0.0}))
+    torque = 2.0 * MASS * GRAVITY * HALF
+    jump = PiecewisePolynomial.ZeroOrderHold(
+        [0.0, 0.03, 1.0], [[0.0, 0.0, 0.0], [0.0, torque, 0.0]]
+    )
+    source = builder.AddSystem(TrajectorySource(jump))
+    if hold:
+        held = builder.AddSystem(ZeroOrderHold(hold, 2))
+        builder.Connect(source.get_output_port(), held.get_input_port())
+        source = held
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    simulator = Simulator(builder.Build())
+    ResetIntegratorFromFlags(simulator, "runge_kutta3", 0.008)
+    simulator.get_mutable_integrator().set_fixed_step_mode(True)
+    root = simulator.get_mutable_context()
+    context = plant.GetMyMutableContextFromRoot(root)
+    plant.set_state(context, [0.0, HEIGHT, 0.0, 0.0, 0.0, 0.0])
+    root.SetAccuracy(1e-8)
+    simulator.AdvanceTo(0.05)
+    (event,) = plant.events(context)
+    assert event.kind is ContactChange.OPENING
+    assert event.contacts == ("left",)
+    assert abs(event.time - 0.03) < 1e-11
