@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.contacts import Jam
 from drake_dae.errors import SimulationError
 from drake_dae.systems.unilateral.contacts import Terms, UnilateralContacts
 from drake_dae.systems.unilateral.events import ContactChange, ContactEvent
@@ -119,6 +120,10 @@ class Resets:
                 x,
             )
         touches = [contacts.touches[i] for i in touching]
+        if contacts.dae.rubbing:
+            found = terms.jam(contacts.kept.tolist(), [touch.normal for touch in touches])
+            if found in (Jam.INCONSISTENT, Jam.INDETERMINATE):
+                raise contacts.jammed(time, x, [contacts.names[i] for i in touching], found)
         fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
         pushing = {touching[place] for place in fit.pushing}
         closed = tuple(i in pushing for i in range(len(closed)))
