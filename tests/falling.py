@@ -27,8 +27,8 @@ CORNERS = {
 }
 
 
-def ball(restitution, mass=1.0):
-    """A ball that falls onto a floor, z its height; nothing drives it."""
+def ball_model(mass=1.0, exogenous=()):
+    """A ball above a floor, z its height; nothing drives it."""
     z, v = ca.SX.sym("z"), ca.SX.sym("v")
     links = LinkExpressions(
         z,
@@ -38,8 +38,13 @@ def ball(restitution, mass=1.0):
         {"ball": ca.vertcat(0, 0, z)},
         actuation_matrix=np.zeros((1, 0)),
     )
-    model = RobotModel(links, [PointOnSurface("ball", FLOOR, name="floor")], [], forces=[])
-    return UnilateralRobotPlant(model, {"floor": restitution})
+    floor = PointOnSurface("ball", FLOOR, name="floor")
+    return RobotModel(links, [floor], [], forces=[], exogenous=exogenous)
+
+
+def ball(restitution, mass=1.0):
+    """A ball that falls onto a floor."""
+    return UnilateralRobotPlant(ball_model(mass), {"floor": restitution})
 
 
 def planar_box(constraints, driven=True):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from arms import arm, numbers, touching
-from falling import GRAVITY, HALF, HEIGHT, MASS, box, simulator_of
+from falling import GRAVITY, HALF, HEIGHT, MASS, ball_model, box, simulator_of
 from numpy.testing import assert_allclose
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -13,13 +13,17 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from drake_dae import (
+    ConstantReference,
     FlexibleJoints,
     Plane,
     PointOnSurface,
+    ReferenceGenerator,
     RobotModel,
     RobotPlant,
+    SinusoidReference,
     UnilateralRobotPlant,
 )
 from drake_dae.systems.unilateral.events import ContactChange
@@ -209,3 +213,44 @@ def test_a_control_that_jumps_opens_a_contact_at_once(hold):
     assert event.kind is ContactChange.OPENING
     assert event.contacts == ("left",)
     assert abs(event.time - 0.03) < 1e-11
+
+
+def test_a_table_that_falls_away_faster_than_g_leaves_the_ball():
+    """z = A sin(w t): lambda = m (g - A w^2 sin(w t)) comes to zero where sin(w t) = g / (A w^2).
+
+    From there the ball flies, and the table meets it again where both are equally high.
+    """
+    amplitude, frequency = 0.05, 20.0
+    model = ball_model(exogenous=["floor.position"])
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(UnilateralRobotPlant(model, {"floor": 0.5}))
+    moving = ReferenceGenerator(
+        [ConstantReference([0.0, 0.0]), SinusoidReference(0.0, amplitude, frequency)],
+        plant.exogenous_layout.degrees,
+    )
+    table = builder.AddSystem(moving)
+    builder.Connect(table.get_output_port(), plant.GetInputPort("exogenous"))
+    simulator = Simulator(builder.Build())
+    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.002)
+    simulator.get_mutable_integrator().set_fixed_step_mode(True)
+    root = simulator.get_mutable_context()
+    context = plant.GetMyMutableContextFromRoot(root)
+    plant.set_state(context, [0.0, amplitude * frequency])
+    root.SetAccuracy(1e-8)
+    simulator.AdvanceTo(0.4)
+    leaves, hits, *_ = plant.events(context)
+    leaving = np.arcsin(GRAVITY / (amplitude * frequency**2)) / frequency
+    assert leaves.kind is ContactChange.OPENING
+    assert abs(leaves.time - leaving) < 1e-11
+    start, speed = GRAVITY / frequency**2, amplitude * frequency * np.cos(frequency * leaving)
+
+    def apart(t):
+        fly = t - leaving
+        return start + speed * fly - GRAVITY * fly**2 / 2.0 - amplitude * np.sin(frequency * t)
+
+    hitting = brentq(apart, leaving + 0.02, leaving + 0.4, xtol=1e-14)
+    assert hits.kind is ContactChange.IMPACT
+    assert abs(hits.time - hitting) < 1e-10
+    table_speed = amplitude * frequency * np.cos(frequency * hitting)
+    approach = speed - GRAVITY * (hitting - leaving) - table_speed
+    assert_allclose(hits.impulses, [-1.5 * approach], rtol=1e-9)

@@ -55,18 +55,21 @@ class UnilateralRobotPlant(ModalPorts):
     """A robot (37)-(40) some of whose contacts open and close: a system for each closed set.
 
     The constraints that are closed hold as in `RobotPlant`; an open contact has a gap phi > 0 and
-    no force. So for each contact that opens and closes phi >= 0, lambda >= 0, phi lambda = 0.
+    no force. So each contact that opens and closes keeps phi >= 0, lambda >= 0, phi lambda = 0.
 
     - It closes where phi falls through zero: an impact, by Newton's law with its coefficient of
-      restitution e, without friction; several at once by a linear complementarity problem. Bouncing
-      ends by a rule; see `Resets` for both.
-    - It opens where lambda falls through zero.
+      restitution e; several at once by a linear complementarity problem. Bouncing ends by a rule
+      that is exact in its limit; see `Resets` for all of it. Velocities jump; positions and the
+      states of stages do not. Impacts are without friction.
+    - It opens where lambda falls through zero, or where a control that jumps pulls at it.
+    - Where contacts depend on each other, as four feet of a table, as few as do carry it, and the
+      others touch without force. Where friction leaves no motion, or two, the run ends with a
+      JammedContactError.
 
-    Velocities jump; positions and the states of stages do not. Both are found by Drake's Simulator
-    as zeros of witness functions, to within a hundredth of `context.SetAccuracy` in s (with a fixed
-    step, in steps), which must be set: 1e-10, for times to 1e-12 s. A contact that opens and closes
-    again within a step is closed after it. What controls read after an event enters the next choice
-    of a mode.
+    Drake's Simulator finds these moments as zeros of witness functions, to within a hundredth of
+    the context's accuracy in s under error control, and in steps with a fixed step. So it must be
+    set, which `simulate` does to that of the integrator: context.SetAccuracy(1e-9) is 1e-11 s. A
+    step leaves N* by its error, and is projected at the start of the next one, as in `DaePlant`.
 
     Input ports:
         control: u, shape (p,).
@@ -104,6 +107,7 @@ class UnilateralRobotPlant(ModalPorts):
             surface.
         AssumptionError: The constraints of a mode are dependent.
         SimulationError: No forces fit, impacts do not end, or the context has no accuracy.
+        JammedContactError: Friction jams a contact (Painleve), which has no motion, or two.
     """
 
     __slots__ = SHARED_DICTIONARY

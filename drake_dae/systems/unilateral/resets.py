@@ -61,9 +61,10 @@ class Resets:
 
         max(2 c+ / a) / (1 - rho)
 
-    (exact for a single contact where a is constant). If that is at most `settling_time` T, all
-    touching contacts come to rest at once: they skip gaps of at most a T^2 / 8. The event has the
-    limit as its `rest_time`.
+    (exact for a single contact, and for two that a block rocks on, where a is constant). If that is
+    at most `settling_time` T, all touching contacts come to rest at once, which may take impulses
+    that pull as little as what is skipped: gaps of at most a T^2 / 8, and rates of at most a T / 2.
+    No energy is gained by that either. The event has the limit as its `rest_time`.
 
     Then those touching contacts are closed which push: lambda_i >= 0, c'_i >= 0, lambda_i c'_i = 0.
 
