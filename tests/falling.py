@@ -102,7 +102,7 @@ class StickingCorner(Constraint):
 def rocking_block():
     """Housner's block: its feet neither bounce nor slide."""
     model = planar_box([StickingCorner("left"), StickingCorner("right")], driven=False)
-    return UnilateralRobotPlant(model, {"left": 0.0, "right": 0.0})
+    return UnilateralRobotPlant(model, {"left": 0.0, "right": 0.0}, settling_time=5e-3)
 
 
 def standing_on_right(angle):

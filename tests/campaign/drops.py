@@ -24,7 +24,7 @@ def plant():
 def attempt(seed: int, folder: Path, duration: float = 2.0) -> Outcome:
     """Drops a box, and watches it at each step for a while, in s."""
     random = np.random.default_rng(seed)
-    start = np.array([0.0, 1.2, *random.standard_normal(4) * [0.8, 0.5, 0.5, 2.0]])
+    start = np.array([0.0, 0.7, *random.standard_normal(4) * [0.8, 0.5, 0.5, 2.0]])
     start[1] += 0.3 * random.random()
     outcome = Outcome(f"drop {seed}")
     try:
