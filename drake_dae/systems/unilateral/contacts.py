@@ -74,7 +74,7 @@ class UnilateralContacts:
         touches: The rows of each contact.
         kept: The rows of all other constraints.
         normals: The row of each contact that can only push.
-        state: A function of state and parameters: the gaps, and their rates.
+        gaps: A function of state and parameters: phi of each contact, and phi'.
         rates: The rates of all constraints, shape (m, 1), and `drift`, that part of their
             derivatives which exogenous signals make.
         residual: phi_i, phi_i' of each, or what restricts velocities alone.
@@ -136,7 +136,7 @@ class UnilateralContacts:
         ]
         self.residual = ca.vertcat(ca.SX(0, 1), *holds)
         found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
-        self.state = dae.trace("gaps", found)
+        self.gaps = dae.trace("gaps", found)
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
         control = ca.SX.sym("u", dae.num_controls)

@@ -183,7 +183,7 @@ class UnilateralRobotPlant(ModalPorts):
         if not closed.all():
             # A contact that leaves has a gap of round-off, whatever its sign.
             state = context.get_continuous_state_vector().value()
-            gaps, rates = self._checked(self._contacts.state, context, state)
+            gaps, rates = self._checked(self._contacts.gaps, context, state)
             margins[:] = np.maximum(gaps, rates + MARGIN)
         if closed.any():
             force = self._force(context)

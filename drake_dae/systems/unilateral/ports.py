@@ -125,7 +125,7 @@ class ModalPorts(ParameterizedSystem):
     def gaps(self, context: Context) -> FloatArray:
         """phi of each contact, m, shape (k,)."""
         self.check_context(context)
-        return self._contacts.state.evaluate(self.state(context), self._values(context))[0].copy()
+        return self._contacts.gaps.evaluate(self.state(context), self._values(context))[0].copy()
 
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""

@@ -97,7 +97,7 @@ class Resets:
         x, before = state, closed
         for _ in range(REPEATED):
             terms = contacts.terms(x, control, parameters)
-            gaps, rates = (value.copy() for value in contacts.state.evaluate(x, parameters))
+            gaps, rates = (value.copy() for value in contacts.gaps.evaluate(x, parameters))
             touching = [i for i in range(len(closed)) if closed[i] or gaps[i] <= TOUCHING]
             if len(touching) > MOST:
                 names = ", ".join(contacts.names[i] for i in touching)
@@ -166,7 +166,7 @@ class Resets:
             closed=(),
             impulses=tuple(float(impulse[contacts.normals[i]]) for i in took_part),
             energy_lost=float(-0.5 * impulse @ (before + after)),
-            rest_time=None if rest is None else time + rest,
+            rest_time=None if rest is None else float(time + rest),
         )
 
     def _rest(
