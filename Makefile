@@ -53,7 +53,7 @@ benchmark: $(VENV)/installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -q
 
 campaign: $(VENV)/installed-dev
-	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --seed $(SEED)
+	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
 
 house: $(VENV)/installed-dev

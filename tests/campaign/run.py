@@ -15,10 +15,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from campaign import bad_inputs, random_robots
+from campaign import bad_inputs, drops, random_robots
 from campaign.outcomes import BAD, CLASSES, HANG, RESULT, Outcome
 
-ATTEMPTS = {"input": bad_inputs.attempt, "robot": random_robots.attempt}
+ATTEMPTS = {"input": bad_inputs.attempt, "robot": random_robots.attempt, "drop": drops.attempt}
 
 TIME_LIMIT = 60.0
 """For one attempt, s; the slowest that ends takes a third of it on a busy machine."""
@@ -130,6 +130,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1500, help="bad inputs")
     parser.add_argument("--robots", type=int, default=500, help="random robots")
+    parser.add_argument("--drops", type=int, default=1000, help="drops onto a floor")
     parser.add_argument("--seed", type=int, default=0, help="of the first of each")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--accepted", action="store_true", help="list every bad input that ran")
@@ -137,6 +138,7 @@ def main() -> int:
     given = parser.parse_args()
     items = [("input", given.seed + i) for i in range(given.count)]
     items += [("robot", given.seed + i) for i in range(given.robots)]
+    items += [("drop", given.seed + i) for i in range(given.drops)]
     began = time.monotonic()
     outcomes = campaign(items, given.processes)
     print(report(outcomes))

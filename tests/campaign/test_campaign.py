@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from campaign import bad_inputs, random_robots
+from campaign import bad_inputs, drops, random_robots
 from campaign.outcomes import BAD, REFUSED, RESULT
 
 FEW, MANY = range(40), range(40, 180)
@@ -32,11 +32,17 @@ def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Pa
         assert outcome.kind == RESULT, outcome
 
 
+@pytest.mark.parametrize("seed", each(range(10), range(10, 30)))
+def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path: Path):
+    outcome = drops.attempt(seed, tmp_path, duration=0.5)
+    assert outcome.kind == RESULT, outcome
+
+
 @pytest.mark.slow
 def test_the_command_prints_counts():
     command = [sys.executable, Path(__file__).with_name("run.py"), "--processes", "2"]
     done = subprocess.run(
-        [*command, "--count", "10", "--robots", "2", "--seed", "100"],
+        [*command, "--count", "10", "--robots", "2", "--drops", "1", "--seed", "100"],
         capture_output=True,
         text=True,
         timeout=120,

@@ -1,91 +1,31 @@
 """Contacts that open and close, against closed forms."""
 
-import casadi as ca
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
-
-from drake_dae import (
-    CoincidentPoints,
-    LinkExpressions,
-    Plane,
-    PointOnSurface,
-    RobotModel,
-    UnilateralRobotPlant,
+from falling import (
+    GRAVITY,
+    HALF,
+    HEIGHT,
+    INERTIA,
+    MASS,
+    ball,
+    box,
+    rocking_block,
+    simulator_of,
+    standing_on_right,
 )
+from numpy.testing import assert_allclose
+from pydrake.systems.analysis import Simulator
+from scipy.integrate import quad
+
+from drake_dae import CoincidentPoints, RobotModel, UnilateralRobotPlant
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.systems.unilateral.events import ContactChange
-
-GRAVITY = 9.81
-FLOOR = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-
-
-def ball(restitution, mass=1.0):
-    """A ball that falls onto a floor, z its height; nothing drives it."""
-    z, v = ca.SX.sym("z"), ca.SX.sym("v")
-    links = LinkExpressions(
-        z,
-        v,
-        ca.SX(mass),
-        ca.SX(mass * GRAVITY),
-        {"ball": ca.vertcat(0, 0, z)},
-        actuation_matrix=np.zeros((1, 0)),
-    )
-    model = RobotModel(links, [PointOnSurface("ball", FLOOR, name="floor")], [], forces=[])
-    return UnilateralRobotPlant(model, {"floor": restitution})
-
-
-HALF, HEIGHT, MASS = 0.2, 0.5, 2.0
-INERTIA = MASS * (HALF**2 + HEIGHT**2) / 3.0
-
-
-def box(restitution, **options):
-    """A box on two feet in the x-z plane, pushed along x and turned: x, z, angle about y."""
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    c, s = ca.cos(q[2]), ca.sin(q[2])
-    turned = ca.vertcat(ca.horzcat(c, 0, s), ca.horzcat(0, 1, 0), ca.horzcat(-s, 0, c))
-    links = LinkExpressions(
-        q,
-        v,
-        ca.diag(ca.SX([MASS, MASS, INERTIA])),
-        ca.SX([0.0, MASS * GRAVITY, 0.0]),
-        {"box": (turned, ca.vertcat(q[0], 0, q[1]))},
-        actuation_matrix=np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]),
-        default_positions=np.array([0.0, HEIGHT, 0.0]),
-    )
-    feet = [
-        PointOnSurface("box", FLOOR, (side * HALF, 0.0, -HEIGHT), name=name)
-        for name, side in (("left", -1.0), ("right", 1.0))
-    ]
-    model = RobotModel(links, feet, [], forces=[])
-    contacts = {"left": restitution, "right": restitution}
-    return UnilateralRobotPlant(model, contacts, **options)
 
 
 @pytest.fixture(scope="module")
 def bouncing_box():
-    return box(0.5)
-
-
-def simulator_of(plant, state, step=0.01, accuracy=1e-8, scheme="runge_kutta5"):
-    """Fixed steps, and events to a hundredth of `accuracy` in steps."""
-    simulator = Simulator(plant)
-    ResetIntegratorFromFlags(simulator, scheme, step)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    context = simulator.get_mutable_context()
-    controls = plant.GetInputPort("control").size()
-    if controls:
-        plant.GetInputPort("control").FixValue(context, np.zeros(controls))
-    plant.set_state(context, state)
-    context.SetAccuracy(accuracy)
-    simulator.Initialize()
-    return simulator, context
-
-
-def kinetic(plant, velocity):
-    mass = np.diag([MASS, MASS, INERTIA])
-    return 0.5 * velocity @ mass @ velocity
+    return box({"left": 0.5, "right": 0.5})
 
 
 @pytest.mark.slow
@@ -174,6 +114,60 @@ def test_a_box_tips_where_the_moment_outweighs_it(bouncing_box):
     acceleration = GRAVITY + HALF * 1.001 * most / INERTIA
     mobility = 1.0 / MASS + HALF**2 / INERTIA
     assert_allclose(force[1], acceleration / mobility, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_block_rocks_as_housner_says_and_comes_to_rest_at_its_limit():
+    """From rest at an angle t to its right foot. About a foot, R = sqrt(b^2 + h^2) away from the
+    centre, tan a = b / h, with I_o = I + m R^2,
+
+        I_o w^2 / 2 = m g R (cos(a - t_max) - cos(a - t)),
+
+    and where it is flat the moment about the new foot is kept: w+ / w- = 1 - 2 m R^2 sin^2 a / I_o,
+    which for a box is 1 - 3/2 sin^2 a (Housner 1963), so that its height above the edge, the cosine
+    of a - t_max less that of a, shrinks by the square. Times come from quadrature in s, where
+    t = t_max (1 - s^2) takes the singularity away.
+    """
+    reach, a = np.hypot(HALF, HEIGHT), np.arctan2(HALF, HEIGHT)
+    about_foot = INERTIA + MASS * reach**2
+    ratio = 1.0 - 1.5 * np.sin(a) ** 2
+    assert_allclose(ratio, 1.0 - 2.0 * MASS * reach**2 * np.sin(a) ** 2 / about_foot, rtol=1e-14)
+
+    def fall(most):
+        def integrand(s):
+            angle = most * (1.0 - s * s)
+            # cos(a - most) - cos(a - angle), without cancellation.
+            drop = 2.0 * np.sin(a - (most + angle) / 2.0) * np.sin((most - angle) / 2.0)
+            speed = np.sqrt(2.0 * MASS * GRAVITY * reach * drop / about_foot)
+            return 2.0 * most * s / speed
+
+        return quad(integrand, 0.0, 1.0, epsabs=0.0, epsrel=1e-12)[0]
+
+    def angle_of(height):
+        # Of height = sin(a) t - cos(a) t^2 / 2 - ... where the arc cosine would cancel.
+        if height > 1e-6:
+            return a - np.arccos(np.cos(a) + height)
+        return height / np.sin(a) * (1.0 + height / np.tan(a) / np.sin(a) / 2.0)
+
+    height, time, times = np.cos(a - 0.1) - np.cos(a), 0.0, []
+    for _ in range(45):
+        duration, height = fall(angle_of(height)), height * ratio**2
+        times.append(time + duration)
+        period = duration + fall(angle_of(height))
+        time += period
+    limit = time + period * ratio / (1.0 - ratio)  # Angles of 1e-9 are small.
+    plant = rocking_block()
+    simulator, context = simulator_of(plant, standing_on_right(0.1), step=0.01)
+    simulator.AdvanceTo(1.75)
+    events = plant.events(context)
+    hits = [event for event in events if event.kind is not ContactChange.OPENING]
+    found = [event.time for event in hits]
+    # Fixed steps of 10 ms leave some 1e-10 of the speed.
+    assert_allclose(found, times[: len(found)], atol=1e-8)
+    assert_allclose(hits[1].energy_lost / hits[0].energy_lost, ratio**2, rtol=1e-7)
+    assert hits[-1].kind is ContactChange.REST
+    assert plant.closed(context) == ("left", "right")
+    assert abs(hits[-1].rest_time - limit) < 1e-8
 
 
 def test_complementarity_holds_and_no_impact_gains_energy(bouncing_box):

@@ -1,19 +1,21 @@
 """The contacts of a robot that open and close, and their numbers at a state."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray, number, unknown_name
+from drake_dae.arrays import FloatArray, number, show, unknown_name
+from drake_dae.dae.contacts import Jam, jam
 from drake_dae.dae.layout import Indices
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError
+from drake_dae.errors import JammedContactError, ModelError
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.unilateral.impacts import Touch
+from drake_dae.systems.unilateral.impacts import Touch, is_p_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,7 @@ class Terms:
         force_matrix: How constraint forces enter c', shape (m, m).
         impulse_matrix: How impulses enter c, shape (m, m); the same without friction.
         velocity_change: How impulses enter x, shape (n, m).
+        size: How large the terms are that `accelerations` are the sums of.
     """
 
     rates: FloatArray
@@ -33,6 +36,29 @@ class Terms:
     force_matrix: FloatArray
     impulse_matrix: FloatArray
     velocity_change: FloatArray
+    size: FloatArray
+
+    def jam(self, kept: Sequence[int], normals: Sequence[int]) -> Jam | None:
+        """What becomes of contacts that touch and rub; None where one set of forces fits.
+
+        Args:
+            kept: The rows that nothing opens.
+            normals: The rows of the contacts.
+        """
+        rows = [*kept, *normals]
+        part = np.ix_(rows, rows)
+        matrix, without, offset = (
+            self.force_matrix[part],
+            self.impulse_matrix[part],
+            self.accelerations[rows],
+        )
+        places = list(range(len(kept), len(rows)))
+        if is_p_matrix(matrix, without, places):
+            return None
+        force = np.full(len(rows), np.inf)
+        with suppress(np.linalg.LinAlgError):
+            force[:] = np.linalg.solve(matrix, -offset)
+        return jam(matrix, without, force, self.size[rows], places)
 
 
 class UnilateralContacts:
@@ -48,7 +74,10 @@ class UnilateralContacts:
         touches: The rows of each contact.
         kept: The rows of all other constraints.
         normals: The row of each contact that can only push.
-        state: A function of state and parameters: the gaps, and their rates.
+        gaps: A function of state and parameters: phi of each contact, and phi'.
+        rates: The rates of all constraints, shape (m, 1), and `drift`, that part of their
+            derivatives which exogenous signals make.
+        residual: phi_i, phi_i' of each, or what restricts velocities alone.
 
     Raises:
         ModelError: There is no such constraint, or it is none that can only push.
@@ -101,8 +130,13 @@ class UnilateralContacts:
         ]
         self.rates = ca.vertcat(ca.SX(0, 1), *rows)
         self.drift = dae.exogenous.rate(self.rates)
+        holds = [
+            dae.k[i] if ca.depends_on(dae.k[i], links.v) else ca.vertcat(dae.k[i], rate[i])
+            for i in range(dae.num_constraints)
+        ]
+        self.residual = ca.vertcat(ca.SX(0, 1), *holds)
         found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
-        self.state = dae.trace("gaps", found)
+        self.gaps = dae.trace("gaps", found)
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
         control = ca.SX.sym("u", dae.num_controls)
@@ -145,6 +179,21 @@ class UnilateralContacts:
             force_matrix=moved[:, 1 : m + 1],
             impulse_matrix=moved[:, m + 1 :],
             velocity_change=solved[:, m + 1 :],
+            size=np.abs(slope) @ np.abs(solved[:, 0]) + np.abs(drift),
+        )
+
+    def jammed(
+        self, time: float, state: FloatArray, names: Sequence[str], found: Jam | None
+    ) -> JammedContactError:
+        """The error where friction jams contacts."""
+        outcome = f". What becomes of it is {found.value}" if found else ""
+        return JammedContactError(
+            f"{self.dae.name}: friction jams the contact of {', '.join(names)} at t = {time:.6g} "
+            f"s, state {show(state)} (Painleve){outcome}. Lower the friction, slide the other way, "
+            "or hold the robot less steeply to the surface",
+            time,
+            state,
+            found,
         )
 
 

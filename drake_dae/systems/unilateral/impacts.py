@@ -18,6 +18,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Indices
+from drake_dae.trace.functions import SINGULAR_PIVOT
 
 MOST = 8
 """So many contacts may touch at once: every set of them is tried."""
@@ -134,3 +135,24 @@ def stopping(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArra
     part = matrix[np.ix_(rows, rows)]
     values[rows] = np.linalg.pinv(part, DEPENDENT, hermitian=True) @ -offset[rows]
     return values
+
+
+def is_p_matrix(matrix: FloatArray, without: FloatArray, contacts: Sequence[int]) -> bool:
+    """Whether all principal minors of A that hold all other rows are positive: one y fits any b.
+
+    Args:
+        matrix: A, shape (m, m).
+        without: A without friction, positive semidefinite, shape (m, m).
+        contacts: The rows of the contacts.
+    """
+    kept = [i for i in range(len(matrix)) if i not in contacts]
+    for count in range(1, len(contacts) + 1):
+        for chosen in combinations(contacts, count):
+            part = np.ix_([*kept, *chosen], [*kept, *chosen])
+            whole = np.linalg.det(without[part])
+            # Of normals that depend on each other none is a minor that decides.
+            if whole > DEPENDENT * np.prod(np.diag(without[part])) and not (
+                np.linalg.det(matrix[part]) > SINGULAR_PIVOT * whole
+            ):
+                return False
+    return True

@@ -26,8 +26,9 @@ class Mode:
         rows: Where its constraints stand among all; of contacts that stick, those that are
             independent.
         dynamics: x', a function of state, control if there is one, and parameters.
-        force: All constraint forces, zero where open, likewise.
-        output: The controlled outputs, likewise.
+        force: All constraint forces, zero where open, likewise if `force_needs_control`.
+        output: The controlled outputs, likewise if `output_needs_control`.
+        force_needs_control, output_needs_control: Whether the control enters them.
     """
 
     closed: Closed
@@ -36,6 +37,8 @@ class Mode:
     dynamics: TracedFunction
     force: TracedFunction
     output: TracedFunction
+    force_needs_control: bool
+    output_needs_control: bool
 
 
 class Modes:
@@ -93,18 +96,20 @@ class Modes:
             raise ModelError(f"{system.name}: a contact that opens and closes has degree 2 at most")
         derivatives = structure.derivatives
         own = derivatives.expand(derivatives.constraint_input)
-        force = ca.SX(contacts.dae.num_constraints, 1)
+        force = ca.SX(dae.num_constraints, 1)
         force[rows] = own
-        controlled = system.num_controls > 0
+        output = system.l + ca.mtimes(system.m, own)
+        by_control = [ca.depends_on(value, derivatives.control) for value in (force, output)]
+        rate = derivatives.expand(derivatives.rate)
         return Mode(
             closed=closed,
             structure=structure,
             rows=tuple(rows),
-            dynamics=structure.trace("dynamics", derivatives.expand(derivatives.rate), controlled),
-            force=structure.trace("constraint force", ca.densify(force), controlled),
-            output=structure.trace(
-                "controlled output", system.l + ca.mtimes(system.m, own), controlled
-            ),
+            dynamics=structure.trace("dynamics", rate, dae.num_controls > 0),
+            force=structure.trace("constraint force", ca.densify(force), by_control[0]),
+            output=structure.trace("controlled output", output, by_control[1]),
+            force_needs_control=by_control[0],
+            output_needs_control=by_control[1],
         )
 
 

@@ -3,15 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
-    ContinuousState,
-    DependencyTicket,
     EventStatus,
     State,
     UnrestrictedUpdateEvent,
@@ -22,22 +17,22 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
-from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+    SimulationError,
+)
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.failures import off_manifold
-from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.trials import state_tickets
-from drake_dae.systems.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.unilateral.events import ContactChange, ContactEvent
-from drake_dae.systems.unilateral.modes import Closed, Mode, Modes, closed_of, numbers_of
+from drake_dae.systems.unilateral.graph import ContactGraph
+from drake_dae.systems.unilateral.modes import Closed, closed_of, numbers_of
+from drake_dae.systems.unilateral.ports import ModalPorts
 from drake_dae.systems.unilateral.resets import TOUCHING, Resets
-from drake_dae.trace.functions import TracedFunction
 
 MARGIN = 1e-13
-"""How far below zero, in m and m/s, gap and rate of an open contact are still round-off."""
+"""How far below zero, in m/s, the rate of a contact that begins to leave is still round-off."""
 
 
 @dataclass
@@ -56,22 +51,25 @@ class Log:
 
 
 @checked(ModelError)
-class UnilateralRobotPlant(ParameterizedSystem):
+class UnilateralRobotPlant(ModalPorts):
     """A robot (37)-(40) some of whose contacts open and close: a system for each closed set.
 
     The constraints that are closed hold as in `RobotPlant`; an open contact has a gap phi > 0 and
-    no force. So for each contact that opens and closes phi >= 0, lambda >= 0, phi lambda = 0.
+    no force. So each contact that opens and closes keeps phi >= 0, lambda >= 0, phi lambda = 0.
 
     - It closes where phi falls through zero: an impact, by Newton's law with its coefficient of
-      restitution e, without friction; several at once by a linear complementarity problem. Bouncing
-      ends by a rule; see `Resets` for both.
-    - It opens where lambda falls through zero.
+      restitution e; several at once by a linear complementarity problem. Bouncing ends by a rule
+      that is exact in its limit; see `Resets` for all of it. Velocities jump; positions and the
+      states of stages do not. Impacts are without friction.
+    - It opens where lambda falls through zero, or where a control that jumps pulls at it.
+    - Where contacts depend on each other, as four feet of a table, as few as do carry it, and the
+      others touch without force. Where friction leaves no motion, or two, the run ends with a
+      JammedContactError.
 
-    Velocities jump; positions and the states of stages do not. Both are found by Drake's Simulator
-    as zeros of witness functions, to within a hundredth of `context.SetAccuracy` in s (with a fixed
-    step, in steps), which must be set: 1e-10, for times to 1e-12 s. A contact that opens and closes
-    again within a step is closed after it. What controls read after an event enters the next choice
-    of a mode.
+    Drake's Simulator finds these moments as zeros of witness functions, to within a hundredth of
+    the context's accuracy in s under error control, and in steps with a fixed step. So it must be
+    set, which `simulate` does to that of the integrator: context.SetAccuracy(1e-9) is 1e-11 s. A
+    step leaves N* by its error, and is projected at the start of the next one, as in `DaePlant`.
 
     Input ports:
         control: u, shape (p,).
@@ -109,9 +107,11 @@ class UnilateralRobotPlant(ParameterizedSystem):
             surface.
         AssumptionError: The constraints of a mode are dependent.
         SimulationError: No forces fit, impacts do not end, or the context has no accuracy.
+        JammedContactError: Friction jams a contact (Painleve), which has no motion, or two.
     """
 
     __slots__ = SHARED_DICTIONARY
+    #: As of `DaePlant`.
     time_step = 0.0
 
     def __init__(
@@ -122,62 +122,15 @@ class UnilateralRobotPlant(ParameterizedSystem):
         settling_time: float = 1e-3,
     ) -> None:
         settling = positive(f"{model.name}: settling_time", settling_time)
-        self._contacts = bound = UnilateralContacts(model, contacts)
-        dae = bound.dae
-        signals = {"state": dae.state_signals, "control": dae.control_signals}
-        super().__init__(dae, dae.parameter_values, signals)
-        self.set_name(model.name)
-        self.model = model
-        self.contacts = bound.names
-        self.modes = Modes(bound)
-        self._by_numbers: dict[bytes, Mode] = {}
-        self._resets = Resets(bound, self.modes, settling)
-        count = len(self.contacts)
-        opened = self.modes((False,) * count, dae.nominal_state)
-        start = opened.structure.manifold.project(dae.nominal_state)
-        self.DeclareContinuousState(BasicVector(start))
-        self.DeclareDiscreteState(count)
-        self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
-        self._is_controlled = dae.num_controls > 0
-        rows = [
-            ca.vertcat(dae.k[i], bound.rates[i])
-            if not ca.is_equal(dae.k[i], bound.rates[i])
-            else dae.k[i]
-            for i in range(dae.num_constraints)
-        ]
-        residual = ca.vertcat(ca.SX(0, 1), *rows)
-        self._residual = dae.trace("constraint residual", {"value": residual})
-        moved = (dae.f, dae.g, dae.h, dae.l, dae.m, residual, dae.exogenous.rate(bound.drift))
-        by_state = state_tickets(self) | self._declare_exogenous(dae.exogenous.degrees(*moved))
-        by_state.add(self.xd_ticket())
-        by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
-        self.DeclareVectorOutputPort(
-            "state", dae.num_states, weakly(self._copy_state), state_tickets(self)
-        )
-        self.DeclareVectorOutputPort("mode", count, weakly(self._copy_mode), {self.xd_ticket()})
-        self.DeclareVectorOutputPort(
-            "constraint_force",
-            dae.num_constraints,
-            weakly(self._calc_force),
-            by_control if self._is_controlled else by_state,
-        )
-        self.DeclareVectorOutputPort(
-            "constraint_residual", residual.numel(), weakly(self._calc_residual), by_state
-        )
-        self.DeclareVectorOutputPort(
-            "controlled_output",
-            dae.num_outputs,
-            weakly(self._calc_output),
-            by_control if self._is_controlled else by_state,
-        )
-        self._add_parts(by_state, by_control)
+        super().__init__(model, contacts)
+        self._resets = Resets(self._contacts, self.modes, settling)
         self._log_index = self.DeclareCacheEntry(
             "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
         ).cache_index()
         self._margins_index = self.DeclareCacheEntry(
             "margins",
             ValueProducer(_no_margins, weakly(self._calc_margins)),
-            by_control if self._is_controlled else by_state,
+            self._by_control,
         ).cache_index()
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
         self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
@@ -191,102 +144,23 @@ class UnilateralRobotPlant(ParameterizedSystem):
             for i, name in enumerate(self.contacts)
         ]
 
-    def _add_parts(
-        self, by_state: set[DependencyTicket], by_control: set[DependencyTicket]
-    ) -> None:
-        """Declares the ports that a `RobotPlant` has besides those of a `DaePlant`."""
-        model = self.model
-        size = model.links.q.numel() + model.links.v.numel()
-        parts, start = {"link_state": slice(0, size)}, size
-        for stage in model.stages:
-            for name, part in stage.ports.items():
-                parts[name] = slice(start + part.start, start + part.stop)
-            start += stage.state.numel()
-        for name, part in parts.items():
-            self.DeclareVectorOutputPort(
-                name, part.stop - part.start, weakly(self._calc_part, part), state_tickets(self)
-            )
-        bound = ConstraintSet(model.constraints)
-        force = ca.SX.sym("force", bound.size)
-        wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
-        self._wrenches = self.dae.trace("wrenches", {"value": wrenches}, {"force": force})
-        size = len(self.wrench_signals)
-        self.DeclareVectorOutputPort(
-            "constraint_wrenches", size, weakly(self._calc_wrenches), by_control
-        )
-        if model.joint_force is not None:
-            self._joint_force = self.dae.trace("joint torque", {"value": model.joint_force})
-            size = model.joint_force.numel()
-            self.DeclareVectorOutputPort(
-                "joint_torque", size, weakly(self._calc_joint_torque), by_state
-            )
-
-    def state(self, context: Context) -> FloatArray:
-        """The state x in a context, shape (n,)."""
-        self.check_context(context)
-        return context.get_continuous_state_vector().CopyToVector()
-
-    def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,), all contacts open: a run finds its mode when it begins.
-
-        Raises:
-            ModelError: The shape is wrong.
-        """
-        self.check_context(context)
-        context.SetContinuousState(self.dae.state_vector(state))
-        context.SetDiscreteState(np.zeros(len(self.contacts)))
-
-    def gaps(self, context: Context) -> FloatArray:
-        """phi of each contact, m, shape (k,)."""
-        self.check_context(context)
-        return self._contacts.state.evaluate(self.state(context), self._values(context))[0].copy()
-
-    def closed(self, context: Context) -> tuple[str, ...]:
-        """The names of the contacts that are closed."""
-        self.check_context(context)
-        shut = closed_of(context.get_discrete_state_vector().value())
-        return tuple(name for name, is_shut in zip(self.contacts, shut, strict=True) if is_shut)
-
     def events(self, context: Context) -> tuple[ContactEvent, ...]:
         """What happened to contacts since the run of a context began."""
         self.check_context(context)
         return tuple(self._log(context).events)
 
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        derivatives.SetFromVector(self._evaluated(self._mode(context).dynamics, context))
+    @property
+    def graph(self) -> ContactGraph:
+        """Modes, guards and resets: print it, or draw its `graphviz()`."""
+        return ContactGraph(self.dae.name, self.contacts)
 
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         return self._witnesses
-
-    def _formulas(self) -> dict[str, Formula]:
-        raise ModelError(
-            f"{self.dae.name}: a plant whose contacts open and close does not convert to "
-            "AutoDiffXd, since its velocities jump; convert a RobotPlant with those contacts that "
-            "stay closed"
-        )
-
-    def _mode(self, context: Context) -> Mode:
-        numbers = context.get_discrete_state_vector().value()
-        mode = self._by_numbers.get(numbers.tobytes())  # In each evaluation, so without tuples.
-        if mode is None:
-            state = context.get_continuous_state_vector().value()
-            mode = self.modes(closed_of(numbers), state)
-            self._by_numbers[numbers.tobytes()] = mode
-        return mode
 
     def _log(self, context: Context) -> Log:
         # The object stays the same, and is ours to change.
         found: Log = self.get_cache_entry(self._log_index).Eval(context)
         return found
-
-    def _control(self, context: Context) -> FloatArray:
-        return self._control_port.Eval(context) if self._is_controlled else np.zeros(0)
-
-    def _evaluated(self, function: TracedFunction, context: Context) -> FloatArray:
-        x = context.get_continuous_state_vector().value()
-        if self._is_controlled:
-            return self._checked(function, context, x, self._control_port.Eval(context))[0]
-        return self._checked(function, context, x)[0]
 
     def _guard(self, place: int, context: Context) -> float:
         """Positive while a contact stays as it is: Drake seeks where that ends."""
@@ -307,12 +181,12 @@ class UnilateralRobotPlant(ParameterizedSystem):
         closed = context.get_discrete_state_vector().value() > 0.5
         margins = np.zeros(closed.size)
         if not closed.all():
-            # A contact that leaves has a gap of round-off; one that is far away may approach.
+            # A contact that leaves has a gap of round-off, whatever its sign.
             state = context.get_continuous_state_vector().value()
-            gaps, rates = self._checked(self._contacts.state, context, state)
-            margins[:] = np.maximum(gaps, rates) + MARGIN
+            gaps, rates = self._checked(self._contacts.gaps, context, state)
+            margins[:] = np.maximum(gaps, rates + MARGIN)
         if closed.any():
-            force = self._evaluated(self._mode(context).force, context)
+            force = self._force(context)
             margins[closed] = force[self._contacts.normals][closed]
         value.set_value(margins)
 
@@ -381,32 +255,6 @@ class UnilateralRobotPlant(ParameterizedSystem):
         state.get_mutable_continuous_state().SetFromVector(after.state)
         state.get_mutable_discrete_state().set_value(numbers_of(after.closed))
         return EventStatus.Succeeded()
-
-    def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFrom(context.get_continuous_state_vector())
-
-    def _copy_mode(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value())
-
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluated(self._mode(context).force, context))
-
-    def _calc_output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluated(self._mode(context).output, context))
-
-    def _calc_residual(self, context: Context, output: BasicVector) -> None:
-        state = context.get_continuous_state_vector().value()
-        output.SetFromVector(self._checked(self._residual, context, state)[0])
-
-    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
-        force = self._evaluated(self._mode(context).force, context).copy()
-        output.SetFromVector(self._wrenches(self.state(context), force, self._values(context))[0])
-
-    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.state(context)[part])
-
-    def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._joint_force(self.state(context), self._values(context))[0])
 
 
 def _no_events() -> AbstractValue:

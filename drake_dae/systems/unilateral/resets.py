@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.contacts import Jam
 from drake_dae.errors import SimulationError
 from drake_dae.systems.unilateral.contacts import Terms, UnilateralContacts
 from drake_dae.systems.unilateral.events import ContactChange, ContactEvent
@@ -60,9 +61,10 @@ class Resets:
 
         max(2 c+ / a) / (1 - rho)
 
-    (exact for a single contact where a is constant). If that is at most `settling_time` T, all
-    touching contacts come to rest at once: they skip gaps of at most a T^2 / 8. The event has the
-    limit as its `rest_time`.
+    (exact for a single contact, and for two that a block rocks on, where a is constant). If that is
+    at most `settling_time` T, all touching contacts come to rest at once, which may take impulses
+    that pull as little as what is skipped: gaps of at most a T^2 / 8, and rates of at most a T / 2.
+    No energy is gained by that either. The event has the limit as its `rest_time`.
 
     Then those touching contacts are closed which push: lambda_i >= 0, c'_i >= 0, lambda_i c'_i = 0.
 
@@ -95,7 +97,7 @@ class Resets:
         x, before = state, closed
         for _ in range(REPEATED):
             terms = contacts.terms(x, control, parameters)
-            gaps, rates = (value.copy() for value in contacts.state.evaluate(x, parameters))
+            gaps, rates = (value.copy() for value in contacts.gaps.evaluate(x, parameters))
             touching = [i for i in range(len(closed)) if closed[i] or gaps[i] <= TOUCHING]
             if len(touching) > MOST:
                 names = ", ".join(contacts.names[i] for i in touching)
@@ -119,6 +121,10 @@ class Resets:
                 x,
             )
         touches = [contacts.touches[i] for i in touching]
+        if contacts.dae.rubbing:
+            found = terms.jam(contacts.kept.tolist(), [touch.normal for touch in touches])
+            if found in (Jam.INCONSISTENT, Jam.INDETERMINATE):
+                raise contacts.jammed(time, x, [contacts.names[i] for i in touching], found)
         fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
         pushing = {touching[place] for place in fit.pushing}
         closed = tuple(i in pushing for i in range(len(closed)))
@@ -160,7 +166,7 @@ class Resets:
             closed=(),
             impulses=tuple(float(impulse[contacts.normals[i]]) for i in took_part),
             energy_lost=float(-0.5 * impulse @ (before + after)),
-            rest_time=None if rest is None else time + rest,
+            rest_time=None if rest is None else float(time + rest),
         )
 
     def _rest(
@@ -227,4 +233,10 @@ class Resets:
 
     def _told(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
         names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
-        return [replace(event, closed=names) for event in events]
+        told = []
+        for event in events:
+            found = replace(event, closed=names)
+            if event.kind is ContactChange.REST and not set(event.contacts) & set(names):
+                found = replace(found, kind=ContactChange.IMPACT, rest_time=None)
+            told.append(found)
+        return told

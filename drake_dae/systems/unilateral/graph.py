@@ -1,0 +1,83 @@
+"""Modes, guards and resets of contacts that open and close, to be read and drawn."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What leads from a mode to another, or back to itself.
+
+    Attributes:
+        source: The contacts that are closed before.
+        target: The contacts that are closed after it, if none of the others opens at once.
+        contact: The contact that it happens to.
+        guard: When it happens.
+        reset: What it does to the state; empty if nothing.
+    """
+
+    source: tuple[str, ...]
+    target: tuple[str, ...]
+    contact: str
+    guard: str
+    reset: str
+
+    def __str__(self) -> str:
+        text = f"{_shown(self.source)} -> {_shown(self.target)} when {self.guard}"
+        return f"{text}: {self.reset}" if self.reset else text
+
+
+@dataclass(frozen=True)
+class ContactGraph:
+    """All modes of a plant, and what leads from one to another; `str` is one line for each.
+
+    Attributes:
+        name: The plant.
+        contacts: The names of the contacts.
+    """
+
+    name: str
+    contacts: tuple[str, ...]
+
+    @property
+    def modes(self) -> tuple[tuple[str, ...], ...]:
+        """The contacts that are closed in each mode, fewest first."""
+        counts = range(len(self.contacts) + 1)
+        return tuple(mode for count in counts for mode in combinations(self.contacts, count))
+
+    @property
+    def transitions(self) -> tuple[Transition, ...]:
+        """Guards and resets."""
+        return tuple(self._transitions())
+
+    def _transitions(self) -> Iterator[Transition]:
+        for mode in self.modes:
+            for name in self.contacts:
+                if name in mode:
+                    left = tuple(other for other in mode if other != name)
+                    yield Transition(mode, left, name, f"lambda({name}) falls to 0", "")
+                    continue
+                more = tuple(other for other in self.contacts if other in mode or other == name)
+                falls = f"phi({name}) falls to 0"
+                rate = f"phi'({name})"
+                yield Transition(mode, mode, name, falls, f"{rate} := -e {rate}")
+                settles = f"{falls} and bouncing would end within the settling time"
+                yield Transition(mode, more, name, settles, f"{rate} := 0")
+
+    def __str__(self) -> str:
+        return "\n".join([f"{self.name}: {len(self.modes)} modes", *map(str, self.transitions)])
+
+    def graphviz(self) -> str:
+        """The graph in the language of Graphviz: `dot -Tsvg` draws it."""
+        lines = [f'digraph "{self.name}" {{', "  rankdir=LR;", "  node [shape=box];"]
+        lines += [f'  "{_shown(mode)}";' for mode in self.modes]
+        for transition in self.transitions:
+            label = "\\n".join(filter(None, (transition.guard, transition.reset)))
+            ends = f'"{_shown(transition.source)}" -> "{_shown(transition.target)}"'
+            lines.append(f'  {ends} [label="{label}"];')
+        return "\n".join([*lines, "}"]) + "\n"
+
+
+def _shown(closed: Sequence[str]) -> str:
+    return "{" + ", ".join(closed) + "}"

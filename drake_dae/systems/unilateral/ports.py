@@ -1,0 +1,214 @@
+"""What a robot shows whose contacts open and close, in the mode that its context is in."""
+
+from collections.abc import Callable, Mapping
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, ContinuousState
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError, SimulationError, SingularityError
+from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.block import ParameterizedSystem
+from drake_dae.systems.formulas import Formula
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.trials import state_tickets
+from drake_dae.systems.unilateral.contacts import UnilateralContacts
+from drake_dae.systems.unilateral.modes import Mode, Modes, closed_of
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class ModalPorts(ParameterizedSystem):
+    """State, mode and ports of a `UnilateralRobotPlant`; its mode stays as it is.
+
+    Args:
+        model: The robot.
+        contacts: Name of a constraint that can only push -> its coefficient of restitution.
+
+    Attributes:
+        model: The robot.
+        contacts: The names of the contacts that open and close, in the order of `mode`.
+        modes: Which contacts are closed -> how the robot moves then; see `Mode`.
+        wrench_signals: Names and units of `constraint_wrenches`.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, model: RobotModel, contacts: Mapping[str, float]) -> None:
+        self._contacts = bound = UnilateralContacts(model, contacts)
+        dae = bound.dae
+        signals = {"state": dae.state_signals, "control": dae.control_signals}
+        super().__init__(dae, dae.parameter_values, signals)
+        self.set_name(model.name)
+        self.model = model
+        self.contacts = bound.names
+        self.modes = Modes(bound)
+        self._by_numbers: dict[bytes, Mode] = {}
+        self._now: Mode | None = None
+        count = len(self.contacts)
+        opened = self.modes((False,) * count, dae.nominal_state)
+        start = opened.structure.manifold.project(dae.nominal_state)
+        self.DeclareContinuousState(BasicVector(start))
+        self.DeclareDiscreteState(count)
+        self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
+        residual = bound.residual
+        self._residual = dae.trace("constraint residual", {"value": residual})
+        moved = (dae.f, dae.g, dae.h, dae.l, dae.m, residual, dae.exogenous.rate(bound.drift))
+        self._by_state = state_tickets(self) | self._declare_exogenous(
+            dae.exogenous.degrees(*moved)
+        )
+        self._by_state.add(self.xd_ticket())
+        # The control enters forces where it enters what they balance.
+        derivatives = opened.structure.derivatives
+        rate = derivatives.expand(derivatives.rate)
+        balanced = ca.jtimes(bound.rates, dae.state, rate)
+        self._by_control = set(self._by_state)
+        if ca.depends_on(balanced, derivatives.control):
+            self._by_control.add(self.input_port_ticket(self._control_port.get_index()))
+        self._declare("state", dae.num_states, self._copy_state)
+        self.DeclareVectorOutputPort("mode", count, weakly(self._copy_mode), {self.xd_ticket()})
+        self._declare("constraint_force", dae.num_constraints, self._calc_force, True)
+        self._declare("constraint_residual", residual.numel(), self._calc_residual)
+        self._declare("controlled_output", dae.num_outputs, self._calc_output, True)
+        self._declare_parts()
+
+    def _declare(
+        self, name: str, size: int, calc: Callable[..., None], by_control: bool = False
+    ) -> None:
+        tickets = self._by_control if by_control else self._by_state
+        self.DeclareVectorOutputPort(name, size, weakly(calc), tickets)
+
+    def _declare_parts(self) -> None:
+        """The ports that a `RobotPlant` has besides those of a `DaePlant`."""
+        model = self.model
+        size = model.links.q.numel() + model.links.v.numel()
+        parts, start = {"link_state": slice(0, size)}, size
+        for stage in model.stages:
+            for name, part in stage.ports.items():
+                parts[name] = slice(start + part.start, start + part.stop)
+            start += stage.state.numel()
+        for name, part in parts.items():
+            calc = weakly(self._calc_part, part)
+            self.DeclareVectorOutputPort(name, part.stop - part.start, calc, self._by_state)
+        bound = ConstraintSet(model.constraints)
+        force = ca.SX.sym("force", bound.size)
+        wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
+        self._wrenches = self.dae.trace("wrenches", {"value": wrenches}, {"force": force})
+        self._declare("constraint_wrenches", wrenches.numel(), self._calc_wrenches, True)
+        loops = model.loop_joints
+        if loops.signals:
+            self._loops = self.dae.trace("loop state", {"value": loops.state})
+            self._declare("loop_state", len(loops.signals), self._calc_loop_state)
+        if model.joint_force is not None:
+            self._joint_force = self.dae.trace("joint torque", {"value": model.joint_force})
+            self._declare("joint_torque", model.joint_force.numel(), self._calc_joint_torque)
+
+    def state(self, context: Context) -> FloatArray:
+        """The state x in a context, shape (n,)."""
+        self.check_context(context)
+        return context.get_continuous_state_vector().CopyToVector()
+
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Sets x as given, shape (n,), all contacts open: a run finds its mode when it begins.
+
+        Raises:
+            ModelError: The shape is wrong.
+        """
+        self.check_context(context)
+        context.SetContinuousState(self.dae.state_vector(state))
+        context.SetDiscreteState(np.zeros(len(self.contacts)))
+
+    def gaps(self, context: Context) -> FloatArray:
+        """phi of each contact, m, shape (k,)."""
+        self.check_context(context)
+        return self._contacts.gaps.evaluate(self.state(context), self._values(context))[0].copy()
+
+    def closed(self, context: Context) -> tuple[str, ...]:
+        """The names of the contacts that are closed."""
+        self.check_context(context)
+        shut = closed_of(context.get_discrete_state_vector().value())
+        return tuple(name for name, is_shut in zip(self.contacts, shut, strict=True) if is_shut)
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        mode, is_controlled = self._mode(context), self.dae.num_controls > 0
+        derivatives.SetFromVector(self._evaluated(mode.dynamics, context, is_controlled))
+
+    def _formulas(self) -> dict[str, Formula]:
+        raise ModelError(
+            f"{self.dae.name}: a plant whose contacts open and close does not convert to "
+            "AutoDiffXd, since its velocities jump; convert a RobotPlant with those contacts that "
+            "stay closed"
+        )
+
+    def _mode(self, context: Context) -> Mode:
+        numbers = context.get_discrete_state_vector().value()
+        mode = self._by_numbers.get(numbers.tobytes())  # In each evaluation, so without tuples.
+        if mode is None:
+            state = context.get_continuous_state_vector().value()
+            mode = self.modes(closed_of(numbers), state)
+            self._by_numbers[numbers.tobytes()] = mode
+        self._now = mode
+        return mode
+
+    def _control(self, context: Context) -> FloatArray:
+        return self._control_port.Eval(context) if self.dae.num_controls else np.zeros(0)
+
+    def _evaluated(
+        self, function: TracedFunction, context: Context, needs_control: bool
+    ) -> FloatArray:
+        x = context.get_continuous_state_vector().value()
+        if needs_control:
+            return self._checked(function, context, x, self._control_port.Eval(context))[0]
+        return self._checked(function, context, x)[0]
+
+    def _force(self, context: Context) -> FloatArray:
+        mode = self._mode(context)
+        return self._evaluated(mode.force, context, mode.force_needs_control)
+
+    def _explained(
+        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    ) -> SimulationError:
+        """Where friction jams a contact, that, and whether any motion fits."""
+        if not (self.dae.rubbing and isinstance(error, SingularityError) and self._now):
+            return error
+        control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
+        bound = self._contacts
+        terms = bound.terms(error.state, control, parameters)
+        places = [i for i, shut in enumerate(self._now.closed) if shut]
+        found = terms.jam(bound.kept.tolist(), [bound.normals[i] for i in places])
+        if found is None:
+            return error
+        return bound.jammed(error.time, error.state, [self.contacts[i] for i in places], found)
+
+    def _copy_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFrom(context.get_continuous_state_vector())
+
+    def _copy_mode(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value())
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._force(context))
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        mode = self._mode(context)
+        output.SetFromVector(self._evaluated(mode.output, context, mode.output_needs_control))
+
+    def _calc_residual(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluated(self._residual, context, False))
+
+    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
+        force = self._force(context)
+        output.SetFromVector(self._wrenches(self.state(context), force, self._values(context))[0])
+
+    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self.state(context)[part])
+
+    def _calc_loop_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluated(self._loops, context, False))
+
+    def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluated(self._joint_force, context, False))
