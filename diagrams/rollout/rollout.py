@@ -56,12 +56,13 @@ def rollout(
 ) -> list[Rollout]:
     """Runs a closed loop from one start or from thousands, without Drake, on all cores.
 
-    It computes what `simulate` does: plant, law with its integrals, references, exogenous signals
-    and sensor, and the projection onto N* at the start of each step. With fixed steps the record is
-    Drake's, of states before their projection; under error control steps are those of DOP853
-    (Hairer, Norsett and Wanner, 1993), a thousandth of the accuracy each, and rows between them are
-    on N*. Where a C compiler is found the whole loop is machine code; otherwise a step is one call
-    of CasADi. Where plant and law have the same numbers, motion follows from what the law wants.
+    It computes what `simulate` does: plant, law with its integrals, limits of drives, references,
+    exogenous signals and sensor, and the projection onto N* at the start of each step. With fixed
+    steps the record is Drake's, of states before their projection; under error control steps are
+    those of DOP853 (Hairer, Norsett and Wanner, 1993), a thousandth of the accuracy each, and rows
+    between them are on N*. Where a C compiler is found the whole loop is machine code; otherwise a
+    step is one call of CasADi. Where plant and law have the same numbers, the motion follows from
+    what the law wants.
 
     Args:
         loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it; what is drawn
