@@ -86,6 +86,8 @@ def _reason(
     control = functions.law(x, reference, *measured, *integral, law)[0]
     if not functions.law.is_valid:
         return simulation_error(functions.law.failure(), time, x, signals)
+    if functions.limits is not None:
+        control = np.clip(control, -functions.limits, functions.limits)
     functions.plant(x, control, plant)
     if not functions.plant.is_valid:
         return simulation_error(functions.plant.failure(), time, x, signals)

@@ -16,6 +16,9 @@ from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.trace.functions import TracedFunction
 
+HOLD, LIMITS = "control_hold", "control_limits"
+"""The names of what may stand between controller and plant."""
+
 
 @dataclass(frozen=True, eq=False)
 class LoopFunctions:
@@ -53,8 +56,8 @@ class LoopFunctions:
 
         A function of the state with that of the sensor and the law's integrals, of R, of what the
         sensor holds (or its noise), and of the parameters of plant and law. It returns the
-        derivative, v, a number that is finite if all have values and all matrices are regular, u,
-        and the measured force.
+        derivative, v, a number that is finite if all have values and all matrices are regular, u as
+        drives give it, the measured force, and what drives cut off.
         """
         return self._motions[0]
 
@@ -94,8 +97,12 @@ class LoopFunctions:
         elif sensor is not None:
             measured = [felt + sensor.bias + sensor.noise_deviation * hold]
         given = [x, reference, *measured, *integral, law]
-        control, _, *of_law = self.law.function(*given)
-        shown = [control, measured[0] if sensor is not None else ca.SX(0, 1)]
+        wanted, _, *of_law = self.law.function(*given)
+        control, excess = wanted, ca.SX(0, 1)
+        if self.limits is not None:
+            control = ca.fmax(-self.limits, ca.fmin(self.limits, wanted))
+            excess = wanted - control
+        shown = [control, measured[0] if sensor is not None else ca.SX(0, 1), excess]
 
         def moved(by: TracedFunction, *arguments: ca.SX) -> list[ca.SX]:
             rate, force, *checks = by.function(*arguments)
@@ -104,6 +111,8 @@ class LoopFunctions:
             if integral:
                 read = [force] if self.is_direct else measured
                 rates = self.law.function(x, reference, *read, *integral, law)[2]
+                if self.limits is not None:  # Integrals stand still meanwhile.
+                    rates = ca.if_else(ca.mmax(ca.fabs(wanted) - self.limits) > 0, 0, rates)
                 rate = ca.vertcat(rate, rates)
             return [rate, force, checks[-1]]
 
@@ -113,7 +122,7 @@ class LoopFunctions:
             return ca.Function("motion", inputs, ca.cse(values), {"cse": False})
 
         both = function(moved(self.plant, x, control, plant), *shown)
-        under = traced.trace_motion() if self.is_model else None
+        under = traced.trace_motion() if self.is_model and self.limits is None else None
         if under is not None:
             values = moved(under, *given)
             if function(values).n_instructions() < 0.9 * both.n_instructions():
@@ -144,6 +153,15 @@ class LoopFunctions:
         """How many states the sensor has."""
         sensor = self.loop.sensor
         return self.loop.plant.dae.num_constraints if sensor and sensor.time_constant else 0
+
+    @cached_property
+    def limits(self) -> FloatArray | None:
+        """The largest |u| that the drives give, shape (p,); None for drives without limits."""
+        diagram = self.loop.diagram
+        if not diagram.HasSubsystemNamed(LIMITS):
+            return None
+        found: FloatArray = diagram.GetSubsystemByName(LIMITS).limits
+        return found
 
     @property
     def num_integrals(self) -> int:
@@ -215,6 +233,7 @@ class LoopFunctions:
             "exogenous": moving if "exogenous" in loop.signals else (),
             "measured_force": dae.constraint_input_signals if loop.sensor else (),
             "integral": loop.controller.law.integral.signals,
+            "excess": dae.control_signals if self.limits is not None else (),
         }
 
 
@@ -223,13 +242,11 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
 
     Raises:
         ModelError: A reference is no expression of time, or the loop has what no rollout has:
-            Drake's own contact, a sampled law, or drives with limits.
+            Drake's own contact, or a sampled law.
     """
     plant, law = loop.plant, loop.controller.law
     unknown = "Drake's own contact" if not isinstance(plant, DaePlant) else ""
-    unknown = unknown or (
-        "a sampled law, or drives with limits" if "control" in loop.loggers else ""
-    )
+    unknown = unknown or ("a sampled law" if loop.diagram.HasSubsystemNamed(HOLD) else "")
     if unknown or not isinstance(plant, DaePlant):
         raise ModelError(f"a rollout does not know {unknown}; run the loop by simulate")
     dae, structure = plant.dae, plant.structure

@@ -80,11 +80,12 @@ class Fused:
         options = {"cse": False}
         rate, force, valid, *_ = functions.rate(state, reference, hold, plant, law)
         self._rate = ca.Function("rate", inputs, [rate, force, valid + checks[-1]], options)
-        _, force, valid, control, measured = functions.motion(state, reference, hold, plant, law)
+        _, force, valid, *shown = functions.motion(state, reference, hold, plant, law)
+        control, measured, excess = shown
         rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
         valid += checks[-1] + of_rest[-1]
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
-        row = ca.vertcat(row, state[size - functions.num_integrals :])
+        row = ca.vertcat(row, state[size - functions.num_integrals :], excess)
         self._rows = Many(ca.Function("rows", inputs, [row, valid], options))
         self._projection = self._project_function()
         self._projections = Many(self._projection)

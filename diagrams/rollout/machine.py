@@ -126,6 +126,7 @@ def _source(functions: LoopFunctions) -> str:
     sizes: dict[str, int] = {
         "NUM_STATES": dae.num_states,
         "NUM_LAGS": functions.num_lags,
+        "NUM_EXCESS": len(columns["excess"]),
         "NUM_INTEGRALS": functions.num_integrals,
         "SIZE": functions.size,
         "NUM_FORCES": dae.num_constraints,

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.rollout import interpreted, machine
 from drake_dae.diagrams.rollout.failures import failure_of
@@ -33,14 +35,24 @@ class Rollout:
     """A run of a closed loop.
 
     Attributes:
-        record: Its signals at the given times, up to where it came.
         steps: How many steps it took.
         failure: Why it could not go on, with time and state; None if it came to its end.
     """
 
-    record: Record
     steps: int
     failure: SimulationError | None
+    _functions: LoopFunctions = field(repr=False)
+    _times: FloatArray = field(repr=False)
+    _rows: FloatArray = field(repr=False)
+
+    @cached_property
+    def record(self) -> Record:
+        """Its signals at the given times, up to where it came."""
+        columns, loop = self._functions.columns, self._functions.loop
+        stops = np.cumsum([len(signals) for signals in columns.values()])
+        parts = dict(zip(columns, np.split(self._rows, stops[:-1], axis=1), strict=True))
+        signals = {name: Recorded(parts[name], tuple(columns[name])) for name in loop.signals}
+        return loop.with_errors(Record(self._times[: len(self._rows)], signals))
 
 
 @checked(ModelError)
@@ -56,12 +68,13 @@ def rollout(
 ) -> list[Rollout]:
     """Runs a closed loop from one start or from thousands, without Drake, on all cores.
 
-    It computes what `simulate` does: plant, law with its integrals, references, exogenous signals
-    and sensor, and the projection onto N* at the start of each step. With fixed steps the record is
-    Drake's, of states before their projection; under error control steps are those of DOP853
-    (Hairer, Norsett and Wanner, 1993), a thousandth of the accuracy each, and rows between them are
-    on N*. Where a C compiler is found the whole loop is machine code; otherwise a step is one call
-    of CasADi. Where plant and law have the same numbers, motion follows from what the law wants.
+    It computes what `simulate` does: plant, law with its integrals, limits of drives, references,
+    exogenous signals and sensor, and the projection onto N* at the start of each step. With fixed
+    steps the record is Drake's, of states before their projection; under error control steps are
+    those of DOP853 (Hairer, Norsett and Wanner, 1993), a thousandth of the accuracy each, and rows
+    between them are on N*. Where a C compiler is found the whole loop is machine code; otherwise a
+    step is one call of CasADi. Where plant and law have the same numbers, the motion follows from
+    what the law wants.
 
     Args:
         loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it; what is drawn
@@ -221,16 +234,7 @@ def _machine_code(
 
 
 def _result(functions: LoopFunctions, problem: Problem, run: Run) -> Rollout:
-    time = problem.times[: len(run.rows)]
-    stops = np.cumsum([len(signals) for signals in functions.columns.values()])
-    parts = np.split(run.rows, stops[:-1], axis=1)
-    found = {
-        name: Recorded(values, tuple(signals))
-        for (name, signals), values in zip(functions.columns.items(), parts, strict=True)
-    }
-    signals = {name: found[name] for name in functions.loop.signals}
-    record = functions.loop.with_errors(Record(time, signals))
     failure = None
     if run.ending is not Ending.DONE:
         failure = failure_of(functions, problem, run)
-    return Rollout(record, run.steps, failure)
+    return Rollout(run.steps, failure, functions, problem.times, run.rows)

@@ -33,6 +33,7 @@ typedef struct {
   double plant[NUM_PLANT + 1], law[NUM_LAW + 1];
   double reference[NUM_REFERENCES + 1], moving[NUM_PLANT_MOVING + 1];
   double control[NUM_CONTROLS + 1], force[NUM_FORCES + 1], measured[NUM_FORCES + 1];
+  double excess[NUM_CONTROLS + 1];
   const double *hold;
   double time; /* at which references and what moves are; not a number before the first */
 } Moment;
@@ -63,7 +64,7 @@ static int set_time(double time, Moment *m) {
 static int rates(double time, const double *x, Moment *m, double *rate) {
   double valid;
   const double *arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
-  double *res[MOTION_RES] = {rate, m->force, &valid, m->control, m->measured};
+  double *res[MOTION_RES] = {rate, m->force, &valid, m->control, m->measured, m->excess};
   int i, good = set_time(time, m);
   dae_rate(arg, res, 0, 0, 0);
   good &= isfinite(valid) != 0;
@@ -75,20 +76,20 @@ static int rates(double time, const double *x, Moment *m, double *rate) {
 static int write(double time, const double *x, Moment *m, double *row) {
   double rate[SIZE + 1], sum, checks[3];
   const double *motion_arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
-  double *motion_res[MOTION_RES] = {rate, m->force, &sum, m->control, m->measured};
+  double *motion_res[MOTION_RES] = {rate, m->force, &sum, m->control, m->measured, m->excess};
   const double *arg[REST_ARG] = {x, m->force, m->plant};
   double *res[REST_RES] = {row + NUM_STATES, checks, checks + 1};
   int i, valid = set_time(time, m);
-  const double *parts[5] = {m->control, m->reference, m->moving, m->measured,
-                            x + SIZE - NUM_INTEGRALS};
-  const int sizes[5] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING, NUM_MEASURED,
-                        NUM_INTEGRALS};
+  const double *parts[6] = {m->control,  m->reference,           m->moving,
+                            m->measured, x + SIZE - NUM_INTEGRALS, m->excess};
+  const int sizes[6] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING,
+                        NUM_MEASURED, NUM_INTEGRALS,  NUM_EXCESS};
   dae_motion(motion_arg, motion_res, 0, 0, 0);
   valid &= isfinite(sum) != 0;
   memcpy(row, x, NUM_STATES * sizeof(double));
   dae_rest(arg, res, 0, 0, 0);
   row += NUM_STATES + NUM_REST;
-  for (i = 0; i < 5; row += sizes[i++]) memcpy(row, parts[i], (size_t)sizes[i] * sizeof(double));
+  for (i = 0; i < 6; row += sizes[i++]) memcpy(row, parts[i], (size_t)sizes[i] * sizeof(double));
   return valid & (isfinite(checks[1]) != 0);
 }
 

@@ -287,6 +287,25 @@ def test_integrals_are_those_of_drake(case, compiled):
     assert_equal_records(found.record, wanted, 1e-12)
 
 
+@both
+@pytest.mark.parametrize(("pole", "integral"), [(-80, []), (-40, ["integral=[tool.z]"])])
+def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
+    """To 1e-12 of the largest value; integrals stand still while a drive is at its limit."""
+    settings = ["duration=0.1", "start.errors.tool.z=0.05", f"gains.all=[{pole}]", *integral]
+    chosen = scenario("two_link_wall", *settings, "saturation=true", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.1, chosen.integrator)
+    limited = np.abs(wanted["excess"]).max(axis=1) > 0.0
+    assert 10 < np.count_nonzero(limited) < 90
+    if integral:
+        assert np.ptp(wanted["integral"][limited]) < np.ptp(wanted["integral"])
+    (found,) = rollout(
+        loop, start, parameters, grid(0.1, 1e-3), config=chosen.integrator, compiled=compiled
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
 def test_what_cannot_be_rolled_out_is_refused():
     chosen = scenario("two_link_wall", *fixed())
     loop, context = build_scenario(chosen)
