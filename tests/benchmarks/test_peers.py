@@ -3,7 +3,7 @@
 Accelerations are compared first: with Pinocchio's to 1e-9, with MuJoCo's without constraint to 1e-9
 and with it to 2e-3, since its constraints are soft and 0.9999 is the hardest that it takes. All are
 called from Python; less what a call takes there is what a program in C++ would see. Ours in C is a
-loop over 1,000 states in generated code. `mj_forward` also does what a robot without contact and
+loop over 200 states in generated code. `mj_forward` also does what a robot without contact and
 sensors has little of. Of a peer that is not installed a line says so.
 """
 

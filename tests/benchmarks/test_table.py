@@ -76,7 +76,7 @@ def test_law(label, compare):
     ):
         np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12 * np.abs(two).max())
     took = times(calls(functions, state, reference, law.all_parameters()))
-    for how in took.keys() - {"interpreted"}:
+    for how in [how for how in took if how != "interpreted"]:
         compare(f"law, {label}: {how}", took[how], "interpreted", took["interpreted"])
 
 
