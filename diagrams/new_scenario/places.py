@@ -30,6 +30,9 @@ _NORMALS = (
 _TRIES = 40
 """So many postures are tried for each normal."""
 
+_PATIENCE = 8
+"""After so many tries without a tool that is normal to the surface it is given up."""
+
 _SLANTED = 0.3
 """How much a posture counts in which the tool is not normal to the surface."""
 
@@ -130,21 +133,29 @@ class _Search:
 
     def best(self, axis: int, sign: float) -> Place | None:
         """The best place for a surface with a normal, None if none is any good."""
-        found = [self._place(axis, sign, guess) for guess in self._guesses]
+        tilts = [3 + 2 * axis, 4 + 2 * axis]
+        aligned: list[Posture] = []
+        for count, guess in enumerate(self._guesses):
+            if count == _PATIENCE and not aligned:
+                break  # A robot that moves in a plane never turns its tool some ways.
+            posture = near_posture(self._postures, tilts, np.zeros(2), guess)
+            aligned += [] if posture is None else [posture]
+        slanted = [self._postures.at(guess) for guess in self._guesses]
+        found = [self._place(axis, sign, posture, 1.0) for posture in aligned]
+        found += [self._place(axis, sign, posture, _SLANTED) for posture in slanted]
         good = [place for place in found if place is not None]
         return max(good, key=lambda one: one.quality * one.directions, default=None)
 
-    def _place(self, axis: int, sign: float, guess: FloatArray) -> Place | None:
+    def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> Place | None:
+        """The place of a posture, None where the tip cannot move along the surface."""
         tilts = [3 + 2 * axis, 4 + 2 * axis]
-        aligned = near_posture(self._postures, tilts, np.zeros(2), guess)
-        posture = aligned or self._postures.at(guess)
         first = [k for k in range(3) if k != axis]
         rows = first_independent(posture, [], [axis, *first, *tilts], posture.q.size)
         ways = tuple(row for row in rows if row in first)
         if axis not in rows or not ways:
             return None
         quality = posture.independence(rows) * self._postures.margin(posture.q)
-        quality *= self._surroundings(posture, axis, sign) * (_SLANTED if aligned is None else 1.0)
+        quality *= worth * self._surroundings(posture, axis, sign)
         return Place(
             posture.rows[:3],
             axis,

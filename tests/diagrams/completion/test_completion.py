@@ -15,7 +15,6 @@ from drake_dae import (
     PointCoordinates,
     PointOnSurface,
     Sphere,
-    analyze,
     build_scenario,
     complete_scenario,
     load_scenario,
@@ -86,12 +85,11 @@ def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path
 @pytest.mark.parametrize(
     ("kind", "held"),
     [
-        ("normal", ["wall.tilt_x", "wall.tilt_y"]),
         ("fixed", ["tool.z_axis.y", "tool.z_axis.z"]),
         ("free", []),
     ],
 )
-def test_the_tool_axis_is_normal_fixed_or_free(kind, held):
+def test_the_tool_axis_may_be_fixed_or_free(kind, held):
     found = names(complete_scenario(left_out(tool_axis=kind)))
     assert found[:2] == ["tool.y", "tool.z"]
     assert [name for name in found[2:] if "joint" not in name] == held
@@ -103,8 +101,8 @@ def test_outputs_given_in_part_are_kept_and_come_first():
         outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
         references=[ConstantReference((0.1,)), ConstantReference((0.6,)), FORCE],
     )
-    completed = complete_scenario(part).scenario
-    found = names(complete_scenario(part))
+    whole = complete_scenario(part)
+    completed, found = whole.scenario, names(whole)
     assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
     assert found[5] in ("joint5", "joint7", "joint3")
     assert completed.start.positions["joint1"] == 0.1
@@ -113,10 +111,10 @@ def test_outputs_given_in_part_are_kept_and_come_first():
     assert completed.references[-1] == FORCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "surface",
     [
-        Plane((0.5, 0.0, 0.3), (0.0, 0.6, 0.8)),
         Sphere((0.5, 0.0, 0.2), 0.25),
         Cylinder((0.6, 0.0, 0.3), (0.0, 1.0, 0.0), 0.15),
     ],
@@ -133,9 +131,7 @@ def test_the_tool_starts_normal_to_any_surface_and_the_robot_is_regular(surface)
     plant.SetPositions(own, q)
     pose = plant.GetFrameByName("tool").CalcPoseInWorld(own)
     place = pose.translation()
-    if isinstance(surface, Plane):
-        normal = np.array(surface.normal)
-    elif isinstance(surface, Sphere):
+    if isinstance(surface, Sphere):
         normal = (place - surface.center) / 0.25
     else:
         normal = (place - surface.point) * [1, 0, 1] / 0.15
@@ -189,6 +185,7 @@ def refusal(open_):
     return str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
     """The arm reaches 1.5 m at most from its shoulder."""
     height = ConstantReference((3.0,))
@@ -241,8 +238,3 @@ def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
 def test_a_robot_that_is_only_simulated_gets_no_outputs():
     still = left_out("slider_crank", forces=[], references=[])
     assert complete_scenario(still).scenario is still
-
-
-def test_the_completed_robot_satisfies_all_assumptions():
-    report = analyze(scenario_model(left_out()).dae, count=5)
-    assert report.problems == ()
