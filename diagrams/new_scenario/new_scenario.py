@@ -2,6 +2,7 @@
 
 from itertools import product
 from pathlib import Path
+from textwrap import shorten
 from typing import cast
 
 import numpy as np
@@ -80,7 +81,7 @@ def new_scenario(
             return whole, scenario_text(whole, robot, task, Path(folder).resolve())
         x, y, z = task.center
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
-        tried.append(f"{where}: {problems[0]}")
+        tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
     raise ScenarioError(
         (
             "robot",

@@ -110,7 +110,7 @@ class _Search:
         self._postures = Postures(links, ConstraintSet(()), rows, ca.SX(0, 0), [], {})
         bodies = ca.horzsplit(links.landmarks())
         still = [body for body in bodies if not ca.depends_on(body, links.q)]
-        moving = [body for body in bodies if ca.depends_on(body, links.q)]
+        moving = [place, *(body for body in bodies if ca.depends_on(body, links.q))]
         weight = ca.substitute(links.bias, links.v, ca.SX.zeros(links.v.numel()))
         self._function = TracedFunction(
             "places",

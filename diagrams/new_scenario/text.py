@@ -88,12 +88,12 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: Task) -> Iterator[str
     yield from _said(
         f"- {_flow(_short(path[0]))}",
         f"a {task.path} of {task.radius:g} m in {task.period:g} s: at {speed:.2g} m/s joints stay "
-        "below a third of their speed limits",
+        "well below their speed limits",
     )
     yield from (f"- {_flow(_short(one))}" for one in path[1:])
     for one in held:
         yield from _said(f"- {_flow(_short(one))}", "the other outputs keep what they start with")
-    least = "N: no more than 20, and than a sixth of what the effort limits allow"
+    least = "N: no more than 20, and than a sixth of what effort limits allow there"
     yield from _said(f"- {_flow(_short(force))}", least)
     yield "start:"
     positions = f"  positions: {_flow(data['start']['positions'])}"
