@@ -46,6 +46,7 @@ from .diagrams.closed_loop import make_closed_loop as make_closed_loop
 from .diagrams.contact_material import ContactMaterial as ContactMaterial
 from .diagrams.contact_plant import ContactPlant as ContactPlant
 from .diagrams.export.export import export_code as export_code
+from .diagrams.new_scenario.new_scenario import new_scenario as new_scenario
 from .diagrams.rollout.problems import start_values as start_values
 from .diagrams.rollout.rollout import rollout as rollout
 from .diagrams.scenario import load_scenario as load_scenario

@@ -95,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--json", action="store_true", help='print JSON; for an error, its text under "error"'
     )
     _add_sweep(commands, named)
+    _add_new(commands)
     written = commands.add_parser(
         "export",
         parents=[named],
@@ -145,6 +146,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from drake_dae.commands.export import run_command
         elif options.command == "film":
             from drake_dae.commands.film import run_command
+        elif options.command == "new":
+            from drake_dae.commands.new import run_command
         elif options.command == "sweep":
             from drake_dae.commands.sweep import run_command
         else:
@@ -190,6 +193,33 @@ def _warnings(*ignored: type[Warning]) -> Iterator[None]:
             warnings.simplefilter("ignore", category)
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         yield
+
+
+def _add_new(commands: Any) -> None:
+    begin = commands.add_parser(
+        "new",
+        help="write a scenario for a robot of your own",
+        description="Writes a scenario for a robot of which only the file is known: it finds base, "
+        "chain and tip, locks what grasps or rolls, puts a surface where the tip reaches it well, "
+        "and has it circle and press there within the limits. Each line says why.",
+    )
+    begin.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
+    begin.add_argument(
+        "--surface",
+        choices=["plane", "cylinder", "sphere"],
+        default="plane",
+        help="what it works on (default: plane)",
+    )
+    begin.add_argument(
+        "--tip",
+        default="",
+        metavar="LINK[:x,y,z]",
+        help="the link or frame that touches, and the point in it in m (default: the end of the "
+        "longest chain)",
+    )
+    begin.add_argument(
+        "--out", type=Path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
+    )
 
 
 def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:

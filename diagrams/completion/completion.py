@@ -278,13 +278,14 @@ def _posture(
 ) -> tuple[Posture, bool]:
     """Where the robot starts, and whether its tools are then normal to their surfaces."""
     candidates, wanted = task.candidates, task.at_start(rows)
+    both = [*rows, *candidates.tilts]
+    goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
     if task.scenario.start.positions:
-        near = near_posture(postures, rows, wanted, guess)
-        if near is not None and near.independence(rows) > REGULAR:
-            return near, False
+        for chosen, values in ((both, goal), (rows, wanted)):
+            near = near_posture(postures, chosen, values, guess)
+            if near is not None and near.independence(rows) > REGULAR:
+                return near, len(chosen) > len(rows)
     if candidates.tilts:
-        both = [*rows, *candidates.tilts]
-        goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
         found = best_posture(postures, both, goal, [guess, *postures.guesses(TRIES)])
         if found is not None:
             return found, True

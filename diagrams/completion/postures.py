@@ -21,6 +21,9 @@ EXACT = 1e-9
 NEAR_LIMIT = 0.1
 """A joint within this part of its range from a limit counts as close to it."""
 
+_STEPS = 25
+"""After so many steps another guess is better; a good one takes six."""
+
 _BELOW = 0.02
 """A body this far behind a surface, relative to the size of the robot, runs into it."""
 
@@ -189,7 +192,7 @@ class Postures:
             gradients = np.vstack([found["constraint_slopes"], found["slopes"][chosen]])
             return shortest_steps(gradients, residual)
 
-        return self._turned_back(newton(guess, linearize)[0])
+        return self._turned_back(newton(guess, linearize, _STEPS)[0])
 
     def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
         """What is left of the constraints and of wanted values of rows, shape (k + len(rows),)."""

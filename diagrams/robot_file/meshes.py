@@ -1,4 +1,4 @@
-"""Meshes that Drake cannot read, left out of a robot's files.
+"""What Drake cannot read, left out of a robot's files: meshes, and colours given twice.
 
 Vendors write collisions in .stl or .dae, which MultibodyPlant refuses as soon as it has a
 SceneGraph, and MJCF has .stl for all. The equations need none: what remains is read and drawn.
@@ -22,6 +22,9 @@ from drake_dae.diagrams.robot_file.mjcf import without_assets
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _COLLISION = re.compile(r"<collision\b[^<]*?(?:/>|>.*?</collision\s*>)", re.DOTALL)
+_MATERIAL = re.compile(
+    r"<material\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"'][^>]*?(?:/>|>(.*?)</material\s*>)", re.DOTALL
+)
 _FILE = {
     ".urdf": re.compile(r"(<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
     ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
@@ -81,7 +84,7 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
             own = _readable(model, packages, folder, copies) if needed else model
             if own != model:
                 directive.add_model.file = own.as_uri()
-    if copies.left_out:
+    if copies.originals:
         ProcessModelDirectives(directives, parser)
     else:
         parser.AddModels(str(file))
@@ -93,14 +96,15 @@ def _readable(file: Path, packages: PackageMap, folder: Path, copies: Copies) ->
     if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
         return file
     text = _COMMENT.sub(_blank, file.read_text("utf-8", errors="replace"))
+    one_colour = _with_first_materials(text) if file.suffix == ".urdf" else text
     change = without_assets if _is_mjcf(file) else partial(_without_collisions, packages=packages)
-    text, left_out = change(text, file)
-    if not left_out:
+    changed, left_out = change(one_colour, file)
+    if not left_out and one_colour == text:
         return file
     copies.left_out.extend(left_out)
     copy = folder / str(len(copies.originals)) / file.name
     copy.parent.mkdir()
-    copy.write_text(text, "utf-8")
+    copy.write_text(changed, "utf-8")
     copies.originals[copy] = file
     return copy
 
@@ -122,6 +126,22 @@ def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[st
     text = _COLLISION.sub(kept, text)
     # A copy lies elsewhere: relative names would lead nowhere.
     return name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text), left_out
+
+
+def _with_first_materials(text: str) -> str:
+    """A URDF in which a material keeps the colour that it has first.
+
+    Vendors give a name several colours, of which other readers take one and Drake none.
+    """
+    colours: dict[str, str] = {}
+
+    def kept(material: re.Match[str]) -> str:
+        name, colour = material[1], " ".join((material[2] or "").split())
+        if not colour or colours.setdefault(name, colour) == colour:
+            return material[0]
+        return f'<material name="{name}"/>' + _blank(material)
+
+    return _MATERIAL.sub(kept, text)
 
 
 def _blank(found: re.Match[str]) -> str:

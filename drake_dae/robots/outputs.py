@@ -156,8 +156,8 @@ class TiltFromNormal(PositionOutput):
         touch = self.contact.touch(links)
         if touch is None:
             raise ModelError(
-                f"constraint '{self.contact.name}' touches nothing that has a normal; use "
-                "AxisCoordinates"
+                f"constraint '{self.contact.name}' has no normal, as what touches a surface does; "
+                "use AxisCoordinates"
             )
         normal = ca.mtimes(links.rotation(touch.frame).T, touch.normal)
         return normal[["xyz".index(a) for a in self.components]]

@@ -49,7 +49,9 @@ class Linearization(NamedTuple):
 
 @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
 def newton(
-    start: FloatArray, linearize: Callable[[FloatArray], Linearization | None]
+    start: FloatArray,
+    linearize: Callable[[FloatArray], Linearization | None],
+    iterations: int = ITERATIONS,
 ) -> tuple[FloatArray, bool]:
     """Damped Newton's method; a step must make the next one, by the same matrix, shorter.
 
@@ -60,6 +62,7 @@ def newton(
     Args:
         start: The first iterate, shape (n,).
         linearize: The linearization at an iterate, None if it is not finite, or has no steps.
+        iterations: After so many steps it ends; few where there are other guesses.
 
     Returns:
         The last iterate, and whether it is a regular solution up to round-off.
@@ -70,7 +73,7 @@ def newton(
         return norm(step / unit)
 
     regular, size = False, np.inf
-    for _ in range(ITERATIONS):
+    for _ in range(iterations):
         linearization = linearize(x)
         if linearization is None:
             return x, False

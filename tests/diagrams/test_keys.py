@@ -32,10 +32,14 @@ def test_what_is_no_violation_is_told_as_it_is():
 @pytest.mark.parametrize(
     ("name", "setting", "words"),
     [
-        ("two_link_wall", "start={}", ["outputs: Assumption (4)", "start.positions"]),
+        (
+            "two_link_wall",
+            "start={positions: {joint1: 0}}",
+            ["outputs: Assumption (4)", "start.positions"],
+        ),
         (
             "seven_joint_wall",
-            "start={}",
+            "start={positions: {joint1: 0}}",
             ["outputs: Assumption (5)", "start.positions"],
         ),
         ("two_link_wall", "outputs.0.axes=xz", ["outputs: ", "Name in `forces`"]),

@@ -64,6 +64,27 @@ def test_a_collision_that_drake_can_read_stays(tmp_path: Path):
     assert count(scene_graph, Role.kProximity) == 7
 
 
+def test_a_material_keeps_the_colour_that_it_has_first(tmp_path: Path):
+    """Drake refuses a URDF that gives a name two colours, other readers take one."""
+    part = (
+        '<visual><geometry><sphere radius="0.1"/></geometry>\n<material name="paint">'
+        '<color\n rgba="{} 0 0 1"/></material></visual>\n'
+    )
+    links = "".join(
+        f'<link name="{n}">{part.format(red)}</link>' for n, red in (("a", 1), ("b", 0))
+    )
+    joint = '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
+    (tmp_path / "paint.urdf").write_text(f'<robot name="r">{links}{joint}</robot>')
+    scene_graph = SceneGraph()
+    read(tmp_path / "paint.urdf", scene_graph)
+    inspector = scene_graph.model_inspector()
+    found = [
+        inspector.GetProperties(one, Role.kIllustration).GetProperty("phong", "diffuse").r()
+        for one in inspector.GetAllGeometryIds(Role.kIllustration)
+    ]
+    assert found == [1.0, 1.0]
+
+
 def test_a_collision_with_too_few_points_is_left_out(tmp_path: Path):
     file = write_ur5(tmp_path)
     (tmp_path / "meshes" / "link.obj").write_text("v 0 0 0\n")

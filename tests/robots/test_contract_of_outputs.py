@@ -8,6 +8,7 @@ from members import subclasses
 
 from drake_dae import (
     AxisCoordinates,
+    CoincidentPoints,
     Cylinder,
     ExpressionOutput,
     JointPositions,
@@ -76,9 +77,47 @@ def test_rows_are_independent_functions_of_the_positions(output):
         (PointCoordinates("tol"), r"no frame 'tol'; did you mean 'tool'\?"),
         (AxisCoordinates("tol", "z", "xy"), r"no frame 'tol'; did you mean 'tool'\?"),
         (JointPositions(["joint9"]), r"no joint position 'joint9'; did you mean 'joint\d'\?"),
+        (TiltFromNormal(PointOnSurface("tol", WALL.surface), "z"), r"no frame 'tol'"),
+        (TiltFromNormal(CoincidentPoints("world", (0, 0, 0), "tool", (0, 0, 0)), "z"), "no normal"),
         (SurfaceCoordinates(PointOnSurface("tol", WALL.surface)), r"no frame 'tol'"),
     ],
 )
 def test_what_is_unknown_is_named(output, message):
     with pytest.raises(ModelError, match=message):
         output.expression(arm("seven_joint").model.links)
+
+
+@pytest.mark.parametrize(
+    ("axis", "components", "message"),
+    [
+        ("q", "", "axis"),
+        ("xy", "", "axis must be one of x, y, z, got 'xy'"),
+        ("z", "xz", "components must be of x and y, which are across the axis z, got 'xz'"),
+        ("z", "xx", "components"),
+    ],
+)
+def test_a_tilt_has_one_axis_and_components_across_it(axis, components, message):
+    with pytest.raises(ModelError, match=message):
+        TiltFromNormal(WALL, axis, components)
+
+
+def test_a_tilt_is_the_sine_of_the_angle_to_the_normal():
+    """The tool turned by joint7 and joint6, against the pose of MultibodyPlant."""
+    model = arm("seven_joint").model
+    links, plant = model.links, model.links.plant
+    parameters = (*links.parameters, *PIPE.parameters)
+    function = TracedFunction(
+        "tilt",
+        {"q": links.q, "p": ca.vertcat(*[p.symbol for p in parameters])},
+        {"rows": TiltFromNormal(PIPE, "z").expression(links)},
+    )
+    q = np.linspace(-0.9, 0.7, 7)
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    pose = plant.GetFrameByName("tool").CalcPoseInWorld(context)
+    across = (pose.translation() - PIPE.surface.position) * [1, 0, 1]
+    normal = pose.rotation().matrix().T @ (across / np.linalg.norm(across))
+    rows = function(q, np.concatenate([p.value for p in parameters]))[0]
+    np.testing.assert_allclose(rows, normal[:2], atol=1e-14)
+    sine = np.linalg.norm(np.cross(normal, [0, 0, 1]))
+    assert np.linalg.norm(rows) == pytest.approx(sine)

@@ -10,13 +10,11 @@ from runs import run_scenario, scenario
 from drake_dae import (
     CircleReference,
     ConstantReference,
-    Cylinder,
     JointPositions,
     Plane,
     PointCoordinates,
     PointOnSurface,
     Sphere,
-    analyze,
     build_scenario,
     complete_scenario,
     load_scenario,
@@ -90,12 +88,11 @@ def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path
 @pytest.mark.parametrize(
     ("kind", "held"),
     [
-        ("normal", ["wall.tilt_x", "wall.tilt_y"]),
         ("fixed", ["tool.z_axis.y", "tool.z_axis.z"]),
         ("free", []),
     ],
 )
-def test_the_tool_axis_is_normal_fixed_or_free(kind, held):
+def test_the_tool_axis_may_be_fixed_or_free(kind, held):
     found = names(complete_scenario(left_out(tool_axis=kind)))
     assert found[:2] == ["tool.y", "tool.z"]
     assert [name for name in found[2:] if "joint" not in name] == held
@@ -107,8 +104,8 @@ def test_outputs_given_in_part_are_kept_and_come_first():
         outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
         references={"joint1": 0.1, "tool.z": 0.6, "wall.force": FORCE},
     )
-    completed = complete_scenario(part).scenario
-    found = names(complete_scenario(part))
+    whole = complete_scenario(part)
+    completed, found = whole.scenario, names(whole)
     assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
     assert found[5] in ("joint5", "joint7", "joint3")
     assert completed.start.positions["joint1"] == 0.1
@@ -134,33 +131,19 @@ def test_what_references_name_becomes_an_output_and_follows_them():
     np.testing.assert_allclose(off, 0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    "surface",
-    [
-        Plane((0.5, 0.0, 0.3), (0.0, 0.6, 0.8)),
-        Sphere((0.5, 0.0, 0.2), 0.25),
-        Cylinder((0.6, 0.0, 0.3), (0.0, 1.0, 0.0), 0.15),
-    ],
-)
-def test_the_tool_starts_normal_to_any_surface_and_the_robot_is_regular(surface):
-    completed = complete_scenario(touching(PointOnSurface("tool", surface, name="part"))).scenario
-    loop, context = build_scenario(completed)
-    model = loop.plant.model
+@pytest.mark.slow
+def test_the_tool_starts_normal_to_a_surface_that_bends():
+    ball = Sphere((0.5, 0.0, 0.2), 0.25)
+    loop, context = build_scenario(touching(PointOnSurface("tool", ball, name="ball")))
+    links = loop.plant.model.links
     q = loop.plant.state(loop.plant.GetMyContextFromRoot(context))[:7]
-    low, high = model.links.position_limits
+    low, high = links.position_limits
     assert np.all((low < q) & (q < high))
-    plant = model.links.plant
-    own = plant.CreateDefaultContext()
-    plant.SetPositions(own, q)
-    pose = plant.GetFrameByName("tool").CalcPoseInWorld(own)
-    place = pose.translation()
-    if isinstance(surface, Plane):
-        normal = np.array(surface.normal)
-    elif isinstance(surface, Sphere):
-        normal = (place - surface.center) / 0.25
-    else:
-        normal = (place - surface.point) * [1, 0, 1] / 0.15
-    # The tool's z axis points into the surface; Newton's method leaves 1e-10.
+    own = links.plant.CreateDefaultContext()
+    links.plant.SetPositions(own, q)
+    pose = links.plant.GetFrameByName("tool").CalcPoseInWorld(own)
+    normal = (pose.translation() - ball.center) / 0.25
+    # The tool's z axis points into the ball; Newton's method leaves 1e-10.
     assert pose.rotation().matrix()[:, 2] == pytest.approx(-normal, abs=1e-8)
 
 
@@ -210,6 +193,7 @@ def refusal(open_):
     return str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
     """The arm reaches 1.5 m at most from its shoulder."""
     message = refusal(left_out(references={"tool": ConstantReference([0.0, 3.0])}))
@@ -265,8 +249,3 @@ def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
 def test_a_robot_that_is_only_simulated_gets_no_outputs():
     still = left_out("slider_crank", forces=[], references={})
     assert complete_scenario(still).scenario is still
-
-
-def test_the_completed_robot_satisfies_all_assumptions():
-    report = analyze(scenario_model(left_out()).dae, count=5)
-    assert report.problems == ()

@@ -1,0 +1,45 @@
+"""`drake-dae new`: writes a scenario for a robot of which only the file is known."""
+
+import argparse
+import logging
+import re
+import warnings
+from pathlib import Path
+
+from drake_dae.diagrams.new_scenario.new_scenario import new_scenario
+from drake_dae.errors import GeometryWarning, ScenarioError
+from drake_dae.robots.contact.surface import Vector
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """Writes the scenario that the options ask for; returns the exit code."""
+    robot = Path(options.robot)
+    out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
+    if out.exists():
+        raise ScenarioError(("--out", f"'{out}' exists, and is not written over; name another"))
+    # What the simulation will leave out it tells itself, and Drake's parser tells of every tag.
+    logging.getLogger("drake").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)
+        tip, point = _tip(options.tip)
+        _, text = new_scenario(options.robot, options.surface, tip, point, out.parent)
+    out.write_text(text, encoding="utf-8")
+    print(f"written: {out}\nnow run: drake-dae simulate {out}")
+    return 0
+
+
+def _tip(text: str) -> tuple[str, Vector]:
+    """The frame and the point of "LINK" or "LINK:x,y,z".
+
+    Raises:
+        ScenarioError: The point is not three numbers.
+    """
+    found = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
+    if found is None:
+        return text, (0.0, 0.0, 0.0)
+    try:
+        x, y, z = map(float, found[2].split(","))
+    except ValueError:
+        wanted = "LINK or LINK:x,y,z with three numbers in m"
+        raise ScenarioError(("--tip", f"expected {wanted}, got '{text}'")) from None
+    return found[1], (x, y, z)

@@ -1,0 +1,47 @@
+"""Robots as vendors wrote them, from `drake-dae new` to a run that keeps its prediction."""
+
+import sysconfig
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import run_scenario
+
+from drake_dae import load_scenario
+from drake_dae.cli import main
+
+FOLDER = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
+
+ROBOTS = {
+    "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "ur10": "ur_description/urdf/ur10_robot.urdf",
+    "kinova": "kinova_description/robots/kinova.urdf",
+    "xarm7": "xarm_description/urdf/xarm7.urdf",
+    "panda": "panda_description/urdf/panda.urdf",
+    "z1": "z1_description/urdf/z1.urdf",
+    "tiago": "tiago_description/robots/tiago.urdf",
+    "so100": "so_arm_description/urdf/so100.urdf",
+}
+
+# Kinova gives one colour's name two colours, tiago antennas that no inertia can be of; collisions
+# are in .dae or .stl.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),
+]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robot_runs_as_predicted_on_a_surface_that_new_finds(name, tmp_path):
+    file = tmp_path / "task.yaml"
+    assert main(["new", str(FOLDER / ROBOTS[name]), "--out", str(file)]) == 0
+    loop, _, record = run_scenario(load_scenario(file, ["duration=0.5"]))
+    off = np.abs(record["tracking_error"] - loop.predicted_error(record)).max()
+    assert off < 1e-8  # The accuracy of the integrator, in m, rad and N.
+    assert np.abs(record["constraint_residual"]).max() < 1e-8
+    model = loop.plant.model
+    assert np.all(np.abs(record["control"]) < model.control_limits)
+    assert record["constraint_force"].min() > 0.0
+    low, high = model.links.position_limits
+    q = record["state"][:, : low.size]
+    assert np.all((low < q) & (q < high))
