@@ -201,7 +201,13 @@ class SurfaceCoordinates(Written[outputs.PositionOutput]):
 
 @dataclass(frozen=True)
 class TiltFromNormal(Written[outputs.PositionOutput]):
-    """`robots.outputs.TiltFromNormal` of the constraint with a name."""
+    """How far a tool's axis is off the normal where it touches: `robots.outputs.TiltFromNormal`.
+
+    Attributes:
+        constraint: The name of a constraint with a free side, as a PointOnSurface.
+        axis: The axis of its frame, "x", "y" or "z".
+        components: Which of the two other axes are rows, "xy" for example; both if empty.
+    """
 
     constraint: str
     axis: str

@@ -161,7 +161,11 @@ ROBOTS = {
 def robot_of(path, changes):
     path.write_text(URDF.format(**FINE | changes))
     chosen = scenario(
-        "two_link_wall", "constraints=[]", "outputs=[!JointPositions {joints: [j]}]", "start={}"
+        "two_link_wall",
+        "constraints=[]",
+        "outputs=[!JointPositions {joints: [j]}]",
+        "references={j: 0}",
+        "start={}",
     )
     object.__setattr__(chosen, "robot", Robot(str(path)))
     return scenario_model(chosen, SceneGraph())

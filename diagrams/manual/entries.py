@@ -162,7 +162,7 @@ def _takes(schema: Mapping[str, Any]) -> str:
     """Which values a schema allows, in words."""
     if "oneOf" in schema:
         tags = (one["properties"][TAG]["const"] for one in schema["oneOf"] if "properties" in one)
-        texts = ("text" for one in schema["oneOf"] if "properties" not in one)
+        texts = (_takes(one) for one in schema["oneOf"] if "properties" not in one)
         return ", ".join([*texts, *tags])
     if "anyOf" in schema:
         return ", or ".join(dict.fromkeys(map(_takes, schema["anyOf"])))

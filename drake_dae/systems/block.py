@@ -13,6 +13,8 @@ from pydrake.systems.framework import (
     InputPort,
     LeafSystem,
     LeafSystem_,
+    OutputPort,
+    PortDataType,
     SystemScalarConverter,
 )
 
@@ -51,7 +53,7 @@ class DifferentiableSystem(LeafSystem):
         inputs = [self.get_input_port(i) for i in range(self.num_input_ports())]
         outputs = [self.get_output_port(i) for i in range(self.num_output_ports())]
         ports = [
-            f"{kind}={listed([f'{port.get_name()} ({port.size()})' for port in found])}"
+            f"{kind}={listed([_shown(port) for port in found])}"
             for kind, found in (("inputs", inputs), ("outputs", outputs))
         ]
         return f"{type(self).__name__}('{self.get_name()}', {', '.join(ports)})"
@@ -258,6 +260,12 @@ class ParameterizedSystem(DifferentiableSystem):
             if parameter.name == name:
                 parameter.check(values[place])
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+
+def _shown(port: InputPort | OutputPort) -> str:
+    """A port with its size, if it has vectors."""
+    is_vector = port.get_data_type() == PortDataType.kVectorValued
+    return f"{port.get_name()} ({port.size()})" if is_vector else port.get_name()
 
 
 def _converted(original: DifferentiableSystem) -> AutoDiffSystem:

@@ -22,7 +22,8 @@ outputs:
 - !JointPositions
   joints: [panda_joint1, panda_joint2, panda_joint3, panda_joint4, panda_joint5, panda_joint6,
     panda_joint7]
-references: [!Constant {values: [0.2, 0.3, 0.4, -0.5, 0.6, 0.7, 0.8]}]
+references: {panda_joint1: 0.2, panda_joint2: 0.3, panda_joint3: 0.4, panda_joint4: -0.5,
+  panda_joint5: 0.6, panda_joint6: 0.7, panda_joint7: 0.8}
 """
 
 

@@ -109,7 +109,7 @@ class LineReference(PathReference):
 
     Attributes:
         start: The values before, in the outputs' unit, shape (k,), or one number for all.
-        end: The values after, likewise.
+        end: The values after, in the outputs' unit.
         limits: The largest speed, acceleration and jerk.
         start_time: When the move begins, in s.
         order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
@@ -153,7 +153,7 @@ class CircleReference(PathReference):
 
     Attributes:
         center: The center, in the outputs' unit, shape (2,).
-        radius: The radius, likewise.
+        radius: The radius, in the outputs' unit.
         period: How long a turn takes, in s; None with limits.
         limits: The largest speed, acceleration and jerk; None with a period.
         turns: How many turns it makes with limits, negative for the other sense.
@@ -225,9 +225,10 @@ class SpiralReference(PathReference):
 
     Attributes:
         center: The center, in the outputs' unit, shape (2,).
-        start_radius: The radius at the start, likewise; larger than the other for a way inward.
-        end_radius: The radius at the end, likewise.
-        pitch: How far apart neighbouring turns are, likewise.
+        start_radius: The radius at the start, in the outputs' unit; larger than the other for a
+            way inward.
+        end_radius: The radius at the end, in the outputs' unit.
+        pitch: How far apart neighbouring turns are, in the outputs' unit.
         limits: The largest speed, acceleration and jerk.
         phase: The angle at the start, in rad.
         start_time: When the motion begins, in s.

@@ -161,7 +161,7 @@ class PolylineReference(SplineReference):
     Attributes:
         points: The points, in the outputs' unit, shape (n, k).
         limits: The largest speed, acceleration and jerk.
-        corner: How far before and behind a point the path leaves the edges, in the same unit.
+        corner: How far before and behind a point the path leaves the edges, in the outputs' unit.
         start_time: When the motion begins, in s.
         order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
 

@@ -32,12 +32,13 @@ class TextReference(SplineReference):
         text: The text: letters, digits, "-+.,!?" and spaces.
         origin: The left end of the line that the letters stand on, shape (2,), in the
             outputs' unit.
-        height: The height of the letters, likewise.
+        height: The height of the letters, in the outputs' unit.
         limits: The largest speed, acceleration and jerk of the two outputs.
         along: Where the text goes, shape (2,): by how much of the outputs for a unit of height.
         up: Where the letters go up, likewise.
         press: The force in strokes and that between them, in N, shape (2,); None for no force.
-        corner: How far before and behind a corner the path is rounded; None for height / 15.
+        corner: How far before and behind a corner the path is rounded, in the outputs' unit; None
+            for height / 15.
         start_time: When the motion begins, in s.
         order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
 

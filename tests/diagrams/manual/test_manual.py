@@ -25,6 +25,7 @@ PURE = {
     ("!Plane", "normal"),
     ("!Sphere", "axis"),
     ("!Cylinder", "axis"),
+    ("!Cylinder", "zero"),
     ("!Torus", "axis"),
     ("!HeightMap", "normal"),
     ("!MeshSurface", "normal"),
@@ -36,6 +37,9 @@ PURE = {
     ("!RollingWheel", "normal"),
     ("!RollingBall", "along"),
     ("!ForceCombination", "weights"),
+    ("!Circle", "turns"),
+    ("!Text", "along"),
+    ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),
     ("!MeasuredForce", "gain"),
     ("!MultibodyPlant", "friction"),
@@ -176,8 +180,8 @@ def test_editors_accept_shipped_scenarios_and_no_wrong_keys():
         data = plain(load_yaml(text, path.name))
         assert not list(validator.iter_errors(data)), path.stem
         assert list(validator.iter_errors({**data, "duratoin": 5}))
-    assert validator.is_valid({"robot": {"file": "a"}, "references": [], "_anchors": 1})
-    assert not validator.is_valid({"robot": {"file": "a", "bsae": {}}, "references": []})
+    assert validator.is_valid({"robot": {"file": "a"}, "references": {}, "_anchors": 1})
+    assert not validator.is_valid({"robot": {"file": "a", "bsae": {}}, "references": {}})
     assert used <= {tag.split()[0] for tag in custom_tags()}
     about = schema["properties"]["robot"]["properties"]["file"]["description"]
     assert about.startswith("A URDF")
