@@ -53,6 +53,7 @@ from drake_dae.robots.outputs import PositionOutput
 from drake_dae.simulation.course import Loop
 from drake_dae.simulation.record import Recorded
 from drake_dae.systems.unilateral.events import ContactChange
+from drake_dae.trace.functions import TracedFunction
 
 FOLDER = Path(__file__).parent / "made"
 
@@ -124,6 +125,7 @@ def scenario() -> Scenario:
 
 # A value of each type that is fine where nothing else is said.
 SAMPLES: dict[Any, Callable[[], Any]] = {
+    TracedFunction: lambda: TracedFunction("one", {"x": ca.SX.sym("x")}, {"y": ca.SX(1)}),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,
@@ -294,7 +296,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "times of WaypointsReference": lambda: [0.0, 1.0],
     "limits of WaypointsReference": lambda: None,
     "order of WaypointsReference": lambda: 2,
-    "columns of CsvReference": lambda: ["y"],
+    "file of CsvReference": lambda: str(Path(__file__).parent / "systems" / "steps.csv"),
+    "columns of CsvReference": lambda: ["x"],
     "origin of TextReference": lambda: [0.0, 0.0],
     "outputs of references_by_name": lambda: ["a"],
     "degrees of references_by_name": lambda: [1],

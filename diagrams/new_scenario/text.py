@@ -86,7 +86,7 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: Task) -> Iterator[str
     yield from _said(
         f"  {_flow(along)}: {_flow({key: path[key] for key in path if key in _PATH})}",
         f"a {task.path} of {task.radius:g} m in {task.period:g} s: at {speed:.2g} m/s joints stay "
-        "well below their speed limits",
+        "below their speed limits",
     )
     least = "N: no more than 20, and than a sixth of what effort limits allow there"
     yield from _said(f"  {_flow(pressing)}: {_flow(force)}", least)
@@ -116,7 +116,9 @@ def _short(value: Any) -> Any:
         return value
     unsaid: tuple[Any, ...] = ("", [], {}, None, [0.0, 0.0, 0.0], [0.0])
     found = {key: _short(inner) for key, inner in value.items()}
-    return {key: inner for key, inner in found.items() if inner not in unsaid or key == "values"}
+    return {
+        key: inner for key, inner in found.items() if inner is not False and inner not in unsaid
+    }
 
 
 def _flow(value: Any) -> str:

@@ -285,7 +285,7 @@ def test_defaults_are_those_of_the_dataclasses(tmp_path):
     assert scenario.write == forms.Write(True, True, True)
     assert scenario.integrator.integration_scheme == "runge_kutta5"
     assert scenario.integrator.use_error_control
-    assert scenario.gains == forms.Poles()
+    assert scenario.gains == forms.Poles(all=[-4.0])
 
 
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):

@@ -32,10 +32,10 @@ outputs:
 - {{frame: palm, axes: x}}
 - {{frame: finger, point: [0.12, 0, 0], axes: z, name: tip}}
 references:
-- {{values: [0.537]}}
-- !Sinusoids {SINE % (0.55, 0.03)}
-- {{values: [40]}}
-- !Sinusoids {SINE % (15, 5)}
+  palm.x: 0.537
+  tip.z: !Sinusoids {SINE % (0.55, 0.03)}
+  table.force: 40
+  wall.force: !Sinusoids {SINE % (15, 5)}
 start:
   positions: {{shoulder: -0.2, elbow: 1.355, wrist: -1.575, knuckle: -1.315}}
   errors: {{tip.z: 0.02}}
@@ -51,8 +51,8 @@ outputs:
 - {{frame: right_rod, point: [0.3, 0, 0], axes: z, name: tip}}
 forces: [wall.force]
 references:
-- !Sinusoids {SINE % (0.36, 0.03)}
-- !Sinusoids {SINE % (15, 5)}
+  tip.z: !Sinusoids {SINE % (0.36, 0.03)}
+  wall.force: !Sinusoids {SINE % (15, 5)}
 start: {{errors: {{tip.z: 0.02}}}}
 {REST}"""
 
@@ -152,7 +152,7 @@ PRESS = """
 robot: {file: press.sdf}
 outputs: [!JointPositions {joints: [motor]}]
 forces: []
-references: [!Constant {values: [-0.3]}]
+references: {motor: -0.3}
 """
 
 
@@ -195,7 +195,7 @@ robot: {file: linked.xml}
 constraints: [!JointCoupler {follower: j1, leader: j2, ratio: 2}]
 outputs: [!JointPositions {joints: [j1]}]
 forces: []
-references: [!Constant {values: [0.3]}]
+references: {j1: 0.3}
 gains: {all: [-4]}
 """
 
