@@ -100,7 +100,14 @@ def simulate(
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
     ending = Ending()
-    with ending_signals(ending), _Progress(duration, progress) as shown:
+    began: float | None = None
+
+    def stop(number: signal.Signals) -> None:
+        ending(number)
+        if began is not None:
+            simulator.set_monitor(monitor)
+
+    with ending_signals(stop), _Progress(duration, progress) as shown:
 
         def monitor(current: Context) -> EventStatus:
             if progress:
@@ -111,11 +118,12 @@ def simulate(
                 return EventStatus.ReachedTermination(diagram, "interrupted")
             return going_on
 
-        began = None
         try:
             simulator.Initialize()
-            simulator.set_monitor(monitor)
             began = time.perf_counter()
+            # A monitor in Python takes a tenth of a short step: without need there is none.
+            if progress or after_step is not None or ending.signal is not None:
+                simulator.set_monitor(monitor)
             simulator.AdvanceTo(start + duration)
             elapsed = time.perf_counter() - began
             steps = simulator.get_num_steps_taken()
