@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
 from math import isfinite
 from types import TracebackType
 from typing import Self
@@ -175,6 +176,12 @@ def _check_times(start: float, duration: float) -> None:
         )
 
 
+@cache
+def _schemes() -> tuple[str, ...]:
+    """Of Drake's schemes all but CENIC, which simulates a MultibodyPlant alone."""
+    return tuple(name for name in GetIntegrationSchemes() if name != "cenic")
+
+
 def check_config(config: SimulatorConfig) -> None:
     """Refuses settings that Drake takes and that then hang, fail late, or are ignored.
 
@@ -182,8 +189,7 @@ def check_config(config: SimulatorConfig) -> None:
         ModelError: A setting does not fit; the message names it, and what would.
     """
     scheme = config.integration_scheme
-    # CENIC simulates a MultibodyPlant, and a constrained robot is none.
-    schemes = [name for name in GetIntegrationSchemes() if name != "cenic"]
+    schemes = _schemes()
     if scheme not in schemes:
         near = get_close_matches(scheme, schemes, n=1)
         hint = f"did you mean '{near[0]}'? " if near else ""
