@@ -206,15 +206,22 @@ class Manifold:
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` without checks of its arguments, for a simulation.
+        """`project` without checks of its arguments; the state itself if it is consistent."""
+        found = self.first_steps(start, p)
+        if found is None:
+            return self.searched(start, p, crosses)
+        return found if found is start else found.copy()
+
+    def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
+        """`project` by its first few steps, without checks of its arguments: for a simulation.
 
         Args:
             start: The state, shape (n,).
             p: Values of all parameters, shape (k,).
-            crosses: As for `project`.
 
         Returns:
-            The consistent state, which is `start` itself if that is one.
+            The consistent state, overwritten by the next call; `start` itself if that is one; None
+            where `searched` finds more.
         """
         function = self._projection
         state, parameters = function.arguments
@@ -222,17 +229,35 @@ class Manifold:
         parameters[...] = p
         is_valid = function.run()
         sizes, found, _ = function.outputs
-        outcome, length = sizes.item(0), sizes.item(1)
+        outcome = sizes.item(0)
         if is_valid and outcome == FOUND:
-            return found.copy()
+            return found
+        return start if outcome == STAYS and function.is_finite else None
+
+    def searched(
+        self,
+        start: FloatArray,
+        p: FloatArray,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
+        """`project` where `first_steps` has found nothing.
+
+        Args:
+            start: The state, shape (n,).
+            p: Values of all parameters, shape (k,).
+            crosses: As for `project`.
+        """
+        function = self._projection
+        sizes, found, _ = function.evaluate(start, p)
         is_finite = function.is_finite
-        if is_finite and (
-            outcome == STAYS
-            or (length == 0.0 and not self.residual_function.evaluate(start, p)[0].any())
+        if (
+            is_finite
+            and sizes.item(1) == 0.0
+            and not self.residual_function.evaluate(start, p)[0].any()
         ):
             return start
-        known = found.copy() if is_finite and outcome == FOUND else None
-        if crosses is not None and not is_valid and self._is_near(start, p, crosses):
+        known = found.copy() if is_finite and sizes.item(0) == FOUND else None
+        if crosses is not None and not function.is_valid and self._is_near(start, p, crosses):
             known = self._nearly(start, p)
         return self._searched(start, p) if known is None else known
 

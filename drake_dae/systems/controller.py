@@ -1,6 +1,7 @@
 """The tracking law as a LeafSystem."""
 
 import warnings
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -148,6 +149,7 @@ class TrackingController(ParameterizedSystem):
             tickets = {self.xd_ticket()}
         else:
             self.DeclareContinuousState(count)
+            self.__class__ = _integrating(type(self))  # type: ignore[arg-type]
             tickets = state_tickets(self)
         self._evaluators.append(weakly(self._integrals))
         self._rate_evaluators = list(self._evaluators)
@@ -177,10 +179,6 @@ class TrackingController(ParameterizedSystem):
             context.SetDiscreteState(values)
         else:
             context.SetContinuousState(values)
-
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        if self.law.integral.outputs and not self.sample_period:
-            derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
 
     def _sum(self, context: Context, state: State) -> EventStatus:
         summed = self._integrals(context) + self.sample_period * self._integral_rate(context)
@@ -297,6 +295,19 @@ class TrackingController(ParameterizedSystem):
             own = TracedFunction("integral", {"state": sigma}, {"value": sigma})
             formulas["integral"] = TracedFormula(own)
         return formulas
+
+
+@cache
+def _integrating(kind: type[TrackingController]) -> type[TrackingController]:
+    """A class of controllers with a time derivative.
+
+    Drake would ask those for one too that have no state: a tenth of a short step.
+    """
+
+    def rate(self: TrackingController, context: Context, derivatives: ContinuousState) -> None:
+        derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
+
+    return type(kind.__name__, (kind,), {"__slots__": (), "DoCalcTimeDerivatives": rate})
 
 
 def _warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:

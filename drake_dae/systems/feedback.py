@@ -65,6 +65,28 @@ class Feedback(Immutable):
         parameters[...] = self.parameters
         return self.function.outputs[0] if self.function.run() else None
 
+    def motion(
+        self, function: TracedFunction, parameters: FloatArray, latest: list[FloatArray]
+    ) -> Callable[[float, FloatArray], FloatArray | None]:
+        """x' as a function of time and state, overwritten by the next call; None without a value.
+
+        Args:
+            function: Law and plant as `motion_under` makes them.
+            parameters: The plant's, not to be changed; an array of this motion alone.
+            latest: The `parameters` of the motion that called the function last.
+        """
+        x, r, of_law, of_plant = function.arguments
+        rate, reference, of_this_law = function.outputs[1], self.reference, self.parameters
+
+        def motion(time: float, state: FloatArray) -> FloatArray | None:
+            r[...] = reference(time)
+            x[...] = state
+            if latest[0] is not parameters:  # Else they stand there.
+                latest[0], of_law[...], of_plant[...] = parameters, of_this_law, parameters
+            return rate if function.run() else None
+
+        return motion
+
     def error(self, time: float, state: FloatArray) -> SimulationError:
         """Why the last call had no value, at its time and state."""
         return simulation_error(self.function.failure(), time, state, self._signals)

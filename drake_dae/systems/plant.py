@@ -51,13 +51,14 @@ class _FedBack(NamedTuple):
     Attributes:
         feedback: The law that is fed back; None where the control has a wire or a fixed value.
         parameters: Values of all parameters.
-        motion: The plant under that law; None without it.
+        motion: x' under that law as a function of time and state, whose array the next call
+            overwrites, None where it has no value; None without a law.
         entry: The cache entry that this is the value of: to find it again takes longer.
     """
 
     feedback: Feedback | None
     parameters: FloatArray
-    motion: TracedFunction | None
+    motion: Callable[[float, FloatArray], FloatArray | None] | None
     entry: CacheEntry
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
@@ -220,6 +221,7 @@ class DaePlant(ParameterizedSystem):
         # Whoever holds an entry holds its system: a context may, but not the system itself.
         self._entry: Callable[[], CacheEntry | None] = lambda: None
         self._motion: tuple[TracedFunction, TracedFunction] | None = None
+        self._latest = [np.zeros(0)]
         if not wanted:
             return
         if not self._is_controlled or self._exogenous is not None:
@@ -238,17 +240,20 @@ class DaePlant(ParameterizedSystem):
         is_fed_back = not self._control_port.HasValue(context)
         feedback = self._feedback_port.Eval(context) if is_fed_back else None
         motion = None
+        parameters = np.array(self._values(context))
         if feedback is not None:
             self._steps.note_law(context, feedback.parameters)
-            motion = self.motion_under(feedback.function)
+            function = self.motion_under(feedback.function)
+            motion = feedback.motion(function, parameters, self._latest)
         entry = self.get_cache_entry(self._fed_back)
         self._entry = ref(entry)
-        value.set_value(_FedBack(feedback, np.array(self._values(context)), motion, entry))
+        value.set_value(_FedBack(feedback, parameters, motion, entry))
 
     def motion_under(self, law: TracedFunction) -> TracedFunction:
         """Law and plant as one function; see `feedback.motion_under`."""
         if self._motion is None or self._motion[0] is not law:
             self._motion = law, motion_under(law, self.dynamics, self.dae.compiled)
+            self._latest[0] = np.zeros(0)
         return self._motion[1]
 
     def state(self, context: Context) -> FloatArray:
@@ -282,15 +287,12 @@ class DaePlant(ParameterizedSystem):
         # What an integrator calls most: without a call more where the values are of use.
         if self._fed_back is not None:
             entry = self._entry() or self.get_cache_entry(self._fed_back)
-            feedback, given, motion, _ = entry.Eval(context)
-            if feedback is not None:
-                x, r, of_law, of_plant = motion.arguments
-                r[...] = feedback.reference(context.get_time())
-                x[...] = context.get_continuous_state_vector().value()
-                of_law[...] = feedback.parameters
-                of_plant[...] = given
-                if motion.run():
-                    derivatives.SetFromVector(motion.outputs[1])
+            motion = entry.Eval(context).motion
+            if motion is not None:
+                state = context.get_continuous_state_vector().value()
+                rate = motion(context.get_time(), state)
+                if rate is not None:
+                    derivatives.SetFromVector(rate)
                     return
         elif self._is_controlled and self._exogenous is None:
             control = self._control_port.Eval(context)
@@ -518,12 +520,13 @@ class DaePlant(ParameterizedSystem):
             parameters = context.get_numeric_parameter(0).value()
         else:
             parameters = self._values(context)
-        try:
-            found = self.structure.manifold.projected(
-                x, parameters, lambda near: self._crosses(near, context)
-            )
-        except InconsistentStateError as error:
-            raise off_manifold(context.get_time(), x.copy(), error) from error
+        manifold = self.structure.manifold
+        found = manifold.first_steps(x, parameters)
+        if found is None:
+            try:
+                found = manifold.searched(x, parameters, lambda near: self._crosses(near, context))
+            except InconsistentStateError as error:
+                raise off_manifold(context.get_time(), x.copy(), error) from error
         if found is x:
             return _UNCHANGED
         state.get_mutable_continuous_state().SetFromVector(found)

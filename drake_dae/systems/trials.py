@@ -9,14 +9,16 @@ and the time of every trial lies after that of the last accepted one. So a block
 each accepted step, and looks at it where a function has no value, and nowhere else.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
-from weakref import proxy
+from typing import Any
+from weakref import proxy, ref
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
+    CacheEntry,
     Context,
     DependencyTicket,
     EventStatus,
@@ -71,6 +73,7 @@ class Progress:
         mark: The time after the last thousand steps, in s.
         parameters: After which time, in s, the block had which numeric parameters.
         laws: Likewise those of the law that is fed back to it, if any is.
+        entry: The cache entry that this is the value of: to find it again takes longer.
     """
 
     time: float = inf
@@ -83,6 +86,12 @@ class Progress:
     mark: float = 0.0
     parameters: list[tuple[float, FloatArray]] = field(default_factory=list)
     laws: list[tuple[float, FloatArray]] = field(default_factory=list)
+    entry: CacheEntry | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Progress":
+        return replace(
+            self, state=self.state.copy(), parameters=list(self.parameters), laws=list(self.laws)
+        )
 
 
 class StepWatch:
@@ -103,6 +112,8 @@ class StepWatch:
             ValueProducer(_no_simulation, _note_parameters),
             {system.all_parameters_ticket()},
         ).cache_index()
+        # Whoever holds an entry holds its system: a context may, but not the system itself.
+        self._entry: Callable[[], CacheEntry | None] = lambda: None
         if sees_steps:
             system.DeclareInitializationPublishEvent(weakly(self._begin))
             system.DeclarePerStepPublishEvent(weakly(self._accept))
@@ -145,9 +156,9 @@ class StepWatch:
         if begins:
             before = float(np.nextafter(context.get_time(), -inf))
             progress.laws = [entry for entry in progress.laws if entry[0] < before]
-            progress.laws.append((before, parameters))
+            _add(progress.laws, before, parameters)
         elif progress.laws:
-            progress.laws.append((progress.time, parameters))
+            _add(progress.laws, progress.time, parameters)
 
     def laws_along(self, context: Context, times: FloatArray) -> FloatArray | None:
         """The parameters of the law at accepted times, in s, one row for each; None if unknown."""
@@ -165,15 +176,19 @@ class StepWatch:
         before = float(np.nextafter(time, -inf))
         seen = [entry for entry in progress.parameters if entry[0] < before]
         if context.num_numeric_parameter_groups():
-            seen.append((before, _parameters(context)))
-        begun = Progress(time=time, start=time, mark=time, parameters=seen, laws=progress.laws)
+            _add(seen, before, _parameters(context))
+        entry = self._system.get_cache_entry(self._index)
+        self._entry = ref(entry)
+        laws = progress.laws
+        begun = Progress(time, start=time, mark=time, parameters=seen, laws=laws, entry=entry)
         vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
         return EventStatus.DidNothing()
 
     def _accept(self, context: Context) -> EventStatus:
-        progress = self._system.get_cache_entry(self._index).Eval(context)
+        entry = self._entry() or self._system.get_cache_entry(self._index)
+        progress = entry.Eval(context)
         time = context.get_time()
         if progress.state.size:
             state = context.get_continuous_state_vector().value()
@@ -198,6 +213,12 @@ class StepWatch:
             raise endless_steps(name, STEPS, before, time, progress.state.copy())
 
 
+def _add(seen: list[tuple[float, FloatArray]], time: float, values: FloatArray) -> None:
+    """Notes what a block has from a time on, if that is not what it had before."""
+    if not (seen and np.array_equal(seen[-1][1], values, equal_nan=True)):
+        seen.append((time, values))
+
+
 def _along(seen: Sequence[tuple[float, FloatArray]], times: FloatArray) -> FloatArray:
     """What was seen from after some times on, at other times, one row for each."""
     last = np.searchsorted([time for time, _ in seen], times) - 1
@@ -212,7 +233,7 @@ def _note_parameters(context: Context, value: AbstractValue) -> None:
     """Notes that the parameters of a context are others since the last accepted state."""
     progress: Progress = value.get_value()
     if progress.parameters:
-        progress.parameters.append((progress.time, _parameters(context)))
+        _add(progress.parameters, progress.time, _parameters(context))
 
 
 def _parameters(context: Context) -> FloatArray:

@@ -1,7 +1,7 @@
 """Traced expressions as fast functions of NumPy arrays, and what can be wrong with their values."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from math import isfinite
@@ -116,15 +116,15 @@ class TracedFunction:
         self.arguments = tuple(np.zeros(symbol.numel()) for symbol in inputs.values())
         self._num_inputs = len(self.arguments)
         self._results = results = [np.zeros(e.shape, order="F") for e in expressions]
-        self._bind(self._function)
-        self._compiled = compiled
-        self._attempts = attempts(compiled, self.num_operations) if often else []
-        self._calls_left = self._attempts[0].calls if self._attempts else 0
         results, checks = results[: len(dense)], results[len(dense) :]
         self._pivot, self._finite, self._valid = (checks[i].reshape(-1) for i in (0, 1, -1))
         self.outputs = tuple(
             array.reshape(-1, order="F") if array.shape[1] == 1 else array for array in results
         )
+        self._compiled = compiled
+        self._attempts = attempts(compiled, self.num_operations) if often else []
+        self._calls_left = self._attempts[0].calls if self._attempts else 0
+        self._bind(self._function)
 
     def _bind(self, function: ca.Function) -> None:
         """Makes a function the one that is called, on the same arrays."""
@@ -134,15 +134,17 @@ class TracedFunction:
             self._buffer.set_arg(index, array.data)
         for index, array in enumerate(self._results):
             self._buffer.set_res(index, array.reshape(-1, order="F").data)
+        if not self._calls_left:
+            vars(self)["run"] = _run(self._evaluate, self._valid)
 
     def _seek(self) -> None:
         """Seeks machine code, after as many calls as the choice says."""
         attempt = self._attempts.pop(0)
         code = machine_code(self._function, self._compiled, attempt.make)
-        if code is not None:
-            self._bind(code)
-        elif self._attempts:
+        if code is None and self._attempts:
             self._calls_left = self._attempts[0].calls
+        else:
+            self._bind(code or self._function)
 
     def evaluate(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
         """Calls the function without allocation.
@@ -169,12 +171,12 @@ class TracedFunction:
     def run(self) -> bool:
         """Calls the function on its `arguments`; returns whether its `outputs` are of use.
 
-        That is the call with the least around it, for who writes the arguments in place.
+        That is the call with the least around it, for who writes the arguments in place. Once no
+        machine code is sought any more, `_run` stands in its place.
         """
-        if self._calls_left:
-            self._calls_left -= 1
-            if not self._calls_left:
-                self._seek()
+        self._calls_left -= 1
+        if not self._calls_left:
+            self._seek()
         self._evaluate()
         return isfinite(self._valid[0])
 
@@ -266,6 +268,16 @@ class TracedFunction:
                 raise ModelError(f"{self.name}: '{label}' has shape {given.shape}, not {own.shape}")
         values = self.evaluate(*(array.reshape(-1) for array in arrays))
         return tuple(output.copy() for output in values)
+
+
+def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
+    """A call that looks up nothing of its function."""
+
+    def run() -> bool:
+        evaluate()
+        return isfinite(valid[0])
+
+    return run
 
 
 def _identifier(name: str) -> str:
