@@ -186,7 +186,7 @@ class UnilateralRobotPlant(ModalPorts):
             gaps, rates = self._checked(self._contacts.gaps, context, state)
             margins[:] = np.maximum(gaps, rates + MARGIN)
         if closed.any():
-            force = self._force(context)
+            force = self._shown_force(context)
             margins[closed] = force[self._contacts.normals][closed]
         value.set_value(margins)
 

@@ -10,11 +10,10 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError, SimulationError, SingularityError
-from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.robot_ports import RobotPorts
 from drake_dae.systems.trials import state_tickets
 from drake_dae.systems.unilateral.contacts import UnilateralContacts
 from drake_dae.systems.unilateral.modes import Mode, Modes, closed_of
@@ -22,7 +21,7 @@ from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
-class ModalPorts(ParameterizedSystem):
+class ModalPorts(RobotPorts):
     """State, mode and ports of a `UnilateralRobotPlant`; its mode stays as it is.
 
     Args:
@@ -74,38 +73,13 @@ class ModalPorts(ParameterizedSystem):
         self._declare("constraint_force", dae.num_constraints, self._calc_force, True)
         self._declare("constraint_residual", residual.numel(), self._calc_residual)
         self._declare("controlled_output", dae.num_outputs, self._calc_output, True)
-        self._declare_parts()
+        self._declare_robot_ports(self._by_state, self._by_control)
 
     def _declare(
         self, name: str, size: int, calc: Callable[..., None], by_control: bool = False
     ) -> None:
         tickets = self._by_control if by_control else self._by_state
         self.DeclareVectorOutputPort(name, size, weakly(calc), tickets)
-
-    def _declare_parts(self) -> None:
-        """The ports that a `RobotPlant` has besides those of a `DaePlant`."""
-        model = self.model
-        size = model.links.q.numel() + model.links.v.numel()
-        parts, start = {"link_state": slice(0, size)}, size
-        for stage in model.stages:
-            for name, part in stage.ports.items():
-                parts[name] = slice(start + part.start, start + part.stop)
-            start += stage.state.numel()
-        for name, part in parts.items():
-            calc = weakly(self._calc_part, part)
-            self.DeclareVectorOutputPort(name, part.stop - part.start, calc, self._by_state)
-        bound = ConstraintSet(model.constraints)
-        force = ca.SX.sym("force", bound.size)
-        wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
-        self._wrenches = self.dae.trace("wrenches", {"value": wrenches}, {"force": force})
-        self._declare("constraint_wrenches", wrenches.numel(), self._calc_wrenches, True)
-        loops = model.loop_joints
-        if loops.signals:
-            self._loops = self.dae.trace("loop state", {"value": loops.state})
-            self._declare("loop_state", len(loops.signals), self._calc_loop_state)
-        if model.joint_force is not None:
-            self._joint_force = self.dae.trace("joint torque", {"value": model.joint_force})
-            self._declare("joint_torque", model.joint_force.numel(), self._calc_joint_torque)
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
@@ -165,7 +139,7 @@ class ModalPorts(ParameterizedSystem):
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
 
-    def _force(self, context: Context) -> FloatArray:
+    def _shown_force(self, context: Context) -> FloatArray:
         mode = self._mode(context)
         return self._evaluated(mode.force, context, mode.force_needs_control)
 
@@ -191,7 +165,7 @@ class ModalPorts(ParameterizedSystem):
         output.SetFromVector(context.get_discrete_state_vector().value())
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._force(context))
+        output.SetFromVector(self._shown_force(context))
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         mode = self._mode(context)
@@ -199,16 +173,3 @@ class ModalPorts(ParameterizedSystem):
 
     def _calc_residual(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluated(self._residual, context, False))
-
-    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
-        force = self._force(context)
-        output.SetFromVector(self._wrenches(self.state(context), force, self._values(context))[0])
-
-    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.state(context)[part])
-
-    def _calc_loop_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluated(self._loops, context, False))
-
-    def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._evaluated(self._joint_force, context, False))
