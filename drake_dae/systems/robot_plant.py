@@ -61,7 +61,7 @@ class RobotPlant(DaePlant, RobotPorts):
         super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
         self.model = model
         tickets = self._by_control if self._force_needs_control else self._by_state
-        self._declare_robot_ports(self._by_state, tickets)
+        self._declare_robot_ports(model.dae, self._by_state, tickets)
         if model.loop_joints.signals:
             self.functions["loop_state"] = self._loops
 

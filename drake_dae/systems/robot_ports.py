@@ -4,6 +4,7 @@ import casadi as ca
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system import DaeSystem
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.block import ParameterizedSystem
@@ -30,11 +31,12 @@ class RobotPorts(ParameterizedSystem):
         raise NotImplementedError
 
     def _declare_robot_ports(
-        self, by_state: set[DependencyTicket], by_force: set[DependencyTicket]
+        self, dae: DaeSystem, by_state: set[DependencyTicket], by_force: set[DependencyTicket]
     ) -> None:
         """Declares the ports.
 
         Args:
+            dae: The robot's system, with all parameters that the block has.
             by_state: What a function of the state depends on.
             by_force: What the constraint force depends on.
         """
@@ -49,20 +51,19 @@ class RobotPorts(ParameterizedSystem):
         for name, part in parts.items():
             calc = weakly(self._calc_part, part)
             self.DeclareVectorOutputPort(name, part.stop - part.start, calc, state_tickets(self))
-        self._add_wrenches(by_force)
+        self._add_wrenches(dae, by_force)
         loops = model.loop_joints
         if loops.signals:
-            self._loops = self.dae.trace("loop state", {"value": loops.state})
+            self._loops = dae.trace("loop state", {"value": loops.state})
             size, calc = len(loops.signals), weakly(self._calc_loop_state)
             self.DeclareVectorOutputPort("loop_state", size, calc, by_state)
         if model.joint_force is not None:
-            self._joint_force = self.dae.trace("joint torque", {"value": model.joint_force})
+            self._joint_force = dae.trace("joint torque", {"value": model.joint_force})
             size, calc = model.joint_force.numel(), weakly(self._calc_joint_torque)
             self.DeclareVectorOutputPort("joint_torque", size, calc, by_state)
 
-    def _add_wrenches(self, by_force: set[DependencyTicket]) -> None:
-        model, dae = self.model, self.dae
-        bound = ConstraintSet(model.constraints)
+    def _add_wrenches(self, dae: DaeSystem, by_force: set[DependencyTicket]) -> None:
+        model, bound = self.model, ConstraintSet(self.model.constraints)
         force = ca.SX.sym("force", bound.size)
         wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
         inputs = {"state": dae.state, "force": force, "parameters": dae.parameter_symbol}
