@@ -28,6 +28,7 @@ from drake_dae.diagrams.scenario_model import (
     scenario_structure,
     start_guess,
 )
+from drake_dae.diagrams.unilateral import Unilateral
 from drake_dae.errors import (
     AssumptionError,
     InconsistentStateError,
@@ -36,6 +37,7 @@ from drake_dae.errors import (
 )
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -175,9 +177,12 @@ def wire_loop(
 
 def _plant(
     scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
-) -> RobotPlant | ContactPlant:
+) -> RobotPlant | ContactPlant | UnilateralRobotPlant:
     """What is simulated."""
     material = scenario.plant
+    if isinstance(material, Unilateral):
+        with at("plant.restitution"):
+            return material.plant(model, structure)
     if not isinstance(material, ContactMaterial):
         return RobotPlant(model, structure=structure, feedback=feedback)
     with at("plant or plant_parameters"):
@@ -241,7 +246,7 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
     """Sets parameters, state and sensor: at rest, where the references begin, plus the errors."""
     plant = loop.plant
     own = plant.GetMyMutableContextFromRoot(context)
-    if isinstance(plant, RobotPlant):
+    if not isinstance(plant, ContactPlant):
         with at("plant_parameters"):
             for name, numbers in scenario.plant_parameters.items():
                 plant.set_parameter(own, name, numbers)

@@ -26,6 +26,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.unilateral import with_events
 from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
@@ -36,6 +37,7 @@ from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 
 @checked(WiringError)
@@ -60,7 +62,7 @@ class ClosedLoop:
     """
 
     diagram: Diagram
-    plant: DaePlant | ContactPlant
+    plant: DaePlant | ContactPlant | UnilateralRobotPlant
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
@@ -101,11 +103,16 @@ class ClosedLoop:
                 which nobody knows since when.
         """
         logged = Record.from_logs(self.loggers, context, after)
-        if isinstance(self.plant, DaePlant):
+        if not isinstance(self.plant, ContactPlant):
             logged = self._completed(logged, self.plant, context)
-        return self.with_errors(logged).while_finite()
+        found = self.with_errors(logged).while_finite()
+        if isinstance(self.plant, UnilateralRobotPlant):
+            return with_events(found, self.plant, context, after)
+        return found
 
-    def _completed(self, logged: Record, plant: DaePlant, context: Context) -> Record:
+    def _completed(
+        self, logged: Record, plant: DaePlant | UnilateralRobotPlant, context: Context
+    ) -> Record:
         """A record with what follows from what was logged."""
         self._refuse_fixed_ports(plant, context)
         times, values = logged.time, {name: logged[name] for name in logged.signals}
@@ -114,12 +121,14 @@ class ClosedLoop:
             values["exogenous"] = self.plant_exogenous.along(times)
         values["reference"] = self.reference.along(times)
         if "control" not in known:
-            gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
-            is_fed_back = gains is not None
+            law = self.controller.law
+            gains = motion = None
+            if isinstance(plant, DaePlant):
+                gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
+                motion = plant.motion_under(law.function) if gains is not None else None
             if gains is None:
                 gains = self._parameters_along(self.controller, context, times)
             given = {**known, "reference": values["reference"], "parameters": gains}
-            law = self.controller.law
             if law.measured_force and "measured_force" not in known:
                 # Without a sensor; a law that does but integrate the force reads none here.
                 given["measured_force"] = (
@@ -127,7 +136,6 @@ class ClosedLoop:
                     if law.control_takes_force
                     else np.zeros((times.size, plant.dae.num_constraints))
                 )
-            motion = plant.motion_under(law.function) if is_fed_back else None
             if motion is not None and motion.is_machine_code:
                 # Machine code that is there, in place of some for the law alone.
                 given |= {"law": gains, "plant": known["parameters"]}
@@ -154,7 +162,7 @@ class ClosedLoop:
         }
         return Record(record.time, {**record.signals, **derived})
 
-    def _refuse_fixed_ports(self, plant: DaePlant, context: Context) -> None:
+    def _refuse_fixed_ports(self, plant: DaePlant | UnilateralRobotPlant, context: Context) -> None:
         taker, own = self.controller, self.controller.GetMyContextFromRoot(context)
         for giver, source, name in (
             (plant, "state", "estimated_state"),
@@ -175,7 +183,10 @@ class ClosedLoop:
                 raise _fixed("control", plant)
 
     def _parameters_along(
-        self, block: DaePlant | TrackingController, context: Context, times: FloatArray
+        self,
+        block: DaePlant | UnilateralRobotPlant | TrackingController,
+        context: Context,
+        times: FloatArray,
     ) -> FloatArray:
         """The parameters of a block at each time, those that move as they did."""
         values = block.parameters_along(block.GetMyContextFromRoot(context), times)
@@ -197,7 +208,7 @@ class ClosedLoop:
         return law.predicted_error(time, *start, parameters, integral)
 
 
-def _fixed(port: str, block: DaePlant | TrackingController) -> WiringError:
+def _fixed(port: str, block: DaePlant | UnilateralRobotPlant | TrackingController) -> WiringError:
     return WiringError(
         f"the port '{port}' of {block.get_name()} has a fixed value in this context, so that its "
         "control does not follow from the state; wire plant and controller in a diagram of your "
@@ -220,7 +231,7 @@ def can_be_fed_back(
 
 @checked(WiringError)
 def make_closed_loop(
-    system: DaePlant | ContactPlant,
+    system: DaePlant | ContactPlant | UnilateralRobotPlant,
     law: TrackingLaw,
     references: Sequence[Reference] | Mapping[str, Reference | float] | System,
     *,
@@ -236,7 +247,8 @@ def make_closed_loop(
 
     Args:
         system: A `RobotPlant`, any `DaePlant`, or a `ContactPlant`, with which everything is logged
-            at its steps.
+            at its steps; or a `UnilateralRobotPlant`: while a contact of it is open the law goes on
+            as it is, so that phi'' = -A(x) lambda_d, lambda_d being the force that is wanted.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
             -> reference, as `references_by_name` takes them; or a Drake System that gives R(t), as
@@ -338,8 +350,11 @@ def make_closed_loop(
         named["measured_force"] = (port, dae.constraint_input_signals)
     if isinstance(plant, RobotBlock) and plant.model.loop_joints.signals:
         named["loop_state"] = (plant.GetOutputPort("loop_state"), plant.model.loop_joints.signals)
+    if isinstance(plant, UnilateralRobotPlant):
+        named["mode"] = (plant.GetOutputPort("mode"), plant.mode_signals)
+        named["gap"] = (plant.GetOutputPort("gap"), plant.gap_signals)
     told: set[str] = set()
-    if isinstance(plant, DaePlant):
+    if not isinstance(plant, ContactPlant):
         told = {*plant.functions, "reference", "exogenous"}
         if control.get_system() is controller:
             told.add("control")
@@ -379,7 +394,9 @@ def make_closed_loop(
 
 
 def _log(
-    builder: DiagramBuilder, port: OutputPort, plant: DaePlant | ContactPlant
+    builder: DiagramBuilder,
+    port: OutputPort,
+    plant: DaePlant | ContactPlant | UnilateralRobotPlant,
 ) -> VectorLogSink:
     """Logs once per step.
 
@@ -391,7 +408,9 @@ def _log(
     return LogVectorOutput(port, builder, {TriggerType.kPerStep})
 
 
-def _hold_before(plant: DaePlant | ContactPlant, sampling: Sampling) -> Sampling:
+def _hold_before(
+    plant: DaePlant | ContactPlant | UnilateralRobotPlant, sampling: Sampling
+) -> Sampling:
     """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
     step = plant.time_step
     if step and sampling.delay < step * (1.0 - 1e-9):

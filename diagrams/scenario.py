@@ -19,7 +19,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed
 from drake_dae.dae import references
-from drake_dae.diagrams import contact_material
+from drake_dae.diagrams import contact_material, unilateral
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
@@ -100,7 +100,8 @@ Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     parts.IdealConstraints
-    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")],
+    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")]
+    | unilateral.Unilateral,
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
@@ -168,8 +169,8 @@ class Scenario:
             positions, and forces where `force` is measured.
         constraint_damping: What the law's model demands of constraints that give way, written as
             gains are, for r_i - 1 poles per constraint; none where left out.
-        plant: Whether constraints are ideal, or Drake's own contact is in their place: a discrete
-            MultibodyPlant, with the surfaces as geometry.
+        plant: Whether constraints are ideal; or open and close; or Drake's own contact is in their
+            place: a discrete MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
         references: Name -> reference, where a number is a constant. A name is that of an output,

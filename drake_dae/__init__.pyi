@@ -58,6 +58,7 @@ from .diagrams.sweep.sweep import sweep as sweep
 from .diagrams.sweep.variations import grid_variations as grid_variations
 from .diagrams.sweep.variations import listed_variations as listed_variations
 from .diagrams.sweep.variations import random_variations as random_variations
+from .diagrams.unilateral import Unilateral as Unilateral
 from .errors import DrakeDaeError as DrakeDaeError
 from .robots.actuation.dc_motors import DcMotors as DcMotors
 from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
@@ -113,6 +114,7 @@ from .systems.robot_plant import RobotPlant as RobotPlant
 from .systems.sampling import ControlHold as ControlHold
 from .systems.sampling import Sampling as Sampling
 from .systems.sensors import ForceSensor as ForceSensor
+from .systems.unilateral.events import ContactChange as ContactChange
 from .systems.unilateral.events import ContactEvent as ContactEvent
 from .systems.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant
 

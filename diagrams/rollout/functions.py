@@ -242,10 +242,11 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
 
     Raises:
         ModelError: A reference is no expression of time, or the loop has what no rollout has:
-            Drake's own contact, or a sampled law.
+            Drake's own contact, contacts that open and close, or a sampled law.
     """
     plant, law = loop.plant, loop.controller.law
-    unknown = "Drake's own contact" if not isinstance(plant, DaePlant) else ""
+    unknown = "Drake's own contact, and no contacts that open"
+    unknown = "" if isinstance(plant, DaePlant) else unknown
     unknown = unknown or ("a sampled law" if loop.diagram.HasSubsystemNamed(HOLD) else "")
     if unknown or not isinstance(plant, DaePlant):
         raise ModelError(f"a rollout does not know {unknown}; run the loop by simulate")

@@ -231,6 +231,7 @@ def _reasons(scenario: Scenario, record: Record) -> list[str]:
             scenario.plant_parameters
         ),
         "Drake's own contact gives way": isinstance(scenario.plant, ContactMaterial),
+        "a contact was open": "mode" in record.signals and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force.is_measured,
         "the law is sampled": scenario.sampling is not None,
     }

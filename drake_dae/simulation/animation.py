@@ -9,13 +9,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatAnimation, Rgba, SceneGraph
+from pydrake.geometry import Meshcat, MeshcatAnimation, Rgba, SceneGraph, Sphere
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.simulation.constraint_forces import PATH_COLOR, ConstraintLoads, path_of
+from drake_dae.simulation.constraint_forces import (
+    LEAST_SCALE,
+    PATH_COLOR,
+    ConstraintLoads,
+    path_of,
+)
 from drake_dae.simulation.course import Course, Loop, follow
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import (
@@ -28,6 +34,8 @@ from drake_dae.simulation.view import (
 )
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
+
+_FLASH = Rgba(1.0, 0.75, 0.1, 0.6)
 
 _FOREVER = 2**31 - 1
 """How often the animation is repeated."""
@@ -51,7 +59,8 @@ def make_animation(loop: Loop, record: Record, context: Context, title: str = ""
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
 
     The page shows the clock and the size of each constraint force at its arrow, draws the path that
-    the robot took as it takes it, over the one that was wanted, and begins again at the end.
+    the robot took as it takes it, over the one that was wanted, and begins again at the end. An
+    impact flashes; a contact that is open has no arrow.
 
     Args:
         loop: A loop of a `RobotPlant`.
@@ -95,8 +104,11 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
     # What moves: the links and the arrows, frame by frame.
     replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    rows = zip(course.times, course.states, course.loads, course.parameters, strict=True)
-    for time, state, load, own in rows:
+    rows = zip(
+        course.times, course.states, course.loads, course.parameters, course.flashes, strict=True
+    )
+    flashing = _add_flashes(meshcat, course, 0.05 * size)
+    for time, state, load, own, bright in rows:
         if links is not None and replay is not None:
             replay.SetTime(time)
             link_state = links.get_input_port()
@@ -104,12 +116,27 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
             links.ForcedPublish(replay)
         arrows.draw(load, time)
         arrows.place(own, time)
+        for row, path in flashing.items():
+            meshcat.SetTransform(path, RigidTransform(load.points[row]), time)
+            meshcat.SetProperty(f"{path}/ball", "scale", [max(bright[row], LEAST_SCALE)] * 3, time)
     meshcat.StopRecording()
     recording = meshcat.get_mutable_recording()
     recording.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     recording.set_repetitions(_FOREVER)
     meshcat.PublishRecording()
     return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, title or model.dae.name))
+
+
+def _add_flashes(meshcat: Meshcat, course: Course, radius: float) -> dict[int, str]:
+    """Adds a ball for each constraint with impacts, which shows them; row -> path."""
+    paths = {
+        row: path_of(constraint, "impact")
+        for row, constraint in enumerate(course.acting.constraints)
+        if course.flashes[:, row].any()
+    }
+    for path in paths.values():
+        meshcat.SetObject(f"{path}/ball", Sphere(radius), _FLASH)
+    return paths
 
 
 @contextmanager
@@ -192,6 +219,7 @@ def _with_overlay(page: str, course: Course, title: str) -> str:
             }
             for row, constraint in enumerate(constraints)
         ],
+        "impacts": bool(course.flashes.any()),
         "paths": [["paths", constraint.name, "actual"] for constraint in constraints],
     }
     # A name may hold what ends a script.

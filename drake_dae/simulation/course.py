@@ -13,6 +13,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.contact.surface import tangents
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import ConstraintLoads, Loads, own_values
+from drake_dae.simulation.events import flashes
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import FRAME_RATE, RobotBlock
 
@@ -46,6 +47,8 @@ class Course:
         wanted: Link states at rest with the desired outputs, as long as they are in reach,
             shape (j, nq + nv) with j <= k.
         acting: Where and how the constraints act, at the parameters of the start.
+        flashes: How bright each constraint flashes where an impact is shown, 0 to 1, shape
+            (k, constraints).
     """
 
     plant: RobotBlock
@@ -56,6 +59,7 @@ class Course:
     loads: Sequence[Loads]
     wanted: FloatArray
     acting: ConstraintLoads
+    flashes: FloatArray
 
     @property
     def points(self) -> FloatArray:
@@ -112,7 +116,9 @@ def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RAT
         values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
     loads = [acting(*row) for row in zip(states, forces, values, strict=True)]
     wanted = _desired_states(plant.model, states, desired, values)
-    return Course(plant, times, float(record.time[0]), states, values, loads, wanted, acting)
+    begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
+    bright = flashes(record.events, names, begin + times)
+    return Course(plant, times, begin, states, values, loads, wanted, acting, bright)
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:

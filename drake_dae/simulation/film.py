@@ -54,8 +54,8 @@ _WIDTH, _HEIGHT = 480, 400
 _ANGLE = 0.62  # Of view, upwards, in rad.
 _LEAST_FORCE = 0.02  # No arrow for what is less, beside the largest force of the run.
 
-ACTUAL, DESIRED, FORCE = "#1f3fbf", "#2e9d4a", "#d12b1f"
-"""Colors of the path so far, of the one that is wanted, and of forces."""
+ACTUAL, DESIRED, FORCE, IMPACT = "#1f3fbf", "#2e9d4a", "#d12b1f", "#ffb000"
+"""Colors of the path so far, of the one that is wanted, of forces, and of impacts."""
 
 _PLACES = 12  # So many states of a run tell how much room it takes.
 
@@ -66,7 +66,7 @@ Pixels = NDArray[np.uint8]
 def save_film(loop: Loop, record: Record, context: Context, path: str | Path) -> None:
     """Films a record of a robot with the paths and the forces of its contacts.
 
-    The path so far is blue, the one that the reference wants green.
+    The path so far is blue, the one that the reference wants green; a star is an impact.
 
     Args:
         loop: A loop of a `RobotPlant` whose links have geometry.
@@ -200,6 +200,9 @@ class _Scene:
                 axis.annotate(
                     f"{size:.1f} N", head, tail, color=FORCE, fontsize=11, arrowprops=shape
                 )
+            if bright := course.flashes[number, row]:
+                x, y = self._camera.project(load.points[row])[0]
+                axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
         time = course.start_time + course.times[number]
         axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")
         axis.set_xlim(-0.5, _WIDTH - 0.5)

@@ -20,6 +20,7 @@ from drake_dae.simulation.axes import (
     short,
     squares,
 )
+from drake_dae.simulation.open_contacts import mark_events, mark_labels
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 
@@ -89,7 +90,7 @@ def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
     drawn = np.flatnonzero(~held)
     figure, axes = grid(
         [labelled(signals[i]) for i in drawn],
-        ("actual", "reference") if len(drawn) else (),
+        ("actual", "reference", *mark_labels(record)) if len(drawn) else (),
         [
             f"{signals[i].name} = {short(desired[0, i])} {signals[i].unit}".rstrip()
             + (f" (within {short(off[i], 1)})" if off[i] > ROUND_OFF * size[i] else "")
@@ -100,6 +101,7 @@ def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
     for axis, i in zip(axes, drawn, strict=False):
         axis.plot(record.time, values[:, i], color="C0", label="actual")
         axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
+    mark_events(axes, record)
     if len(drawn):
         legend(figure, axes[0])
     return figure
@@ -127,7 +129,7 @@ def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = 
     titles = [labelled(Signal(f"|error of {signals[i].name}|", signals[i].unit)) for i in drawn]
     figure, axes = grid(
         titles,
-        ("predicted", "actual", label) if len(drawn) else (),
+        ("predicted", "actual", label, *mark_labels(record)) if len(drawn) else (),
         [
             f"{signals[i].name} ("
             + (
@@ -156,6 +158,7 @@ def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = 
         else:
             axis.axhspan(floor / 3.0, blurred[i], color="0.88", zorder=0.5, label=label)
         decades(axis, floor)
+    mark_events(axes, record)
     if len(drawn):
         legend(figure, axes[0])
     return figure
@@ -166,13 +169,14 @@ def plot_residual(record: Record) -> Figure:
     values = np.abs(record["constraint_residual"])
     labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
     title = "|constraint residual|, before each step's projection"
-    figure, (axis,) = grid([title], (*labels, "round-off"))
+    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record)))
     floor = round_off(np.ones(1))
     for i, label in enumerate(labels):
         axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
     decades(axis, floor)
+    mark_events([axis], record)
     legend(figure, axis)
     return figure
 
@@ -186,8 +190,12 @@ def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
         [
             labelled(signal) + (f", limit ±{bound:g}" if np.isfinite(bound) else "")
             for signal, bound in zip(signals, bounds, strict=True)
-        ]
+        ],
+        marks := mark_labels(record),
     )
+    mark_events(axes, record)
+    if axes and marks:
+        legend(figure, axes[0])
     for i, axis in enumerate(axes):
         axis.plot(record.time, values[:, i], color="C0")
         scale = max(np.max(np.abs(values[:, i])), 1e-3)

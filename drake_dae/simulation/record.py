@@ -18,6 +18,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.simulation.events import event_arrays, event_rows, events_of_arrays
+from drake_dae.systems.unilateral.events import ContactEvent
 
 
 @checked(ModelError)
@@ -41,14 +43,19 @@ class Record:
 
     On disk it is one `record.npz` that NumPy alone reads: `numpy.load("record.npz")` has "time"
     in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
+    Events stand in it as "events.time", "events.kind", "events.impulses" and others.
+
+    Velocities jump at impacts: the sample of that time is the one before it.
 
     Attributes:
         time: The times in s, shape (k,), strictly increasing.
         signals: Name of a signal -> its values.
+        events: What happened to contacts that open and close, in the order of time.
     """
 
     time: FloatArray
     signals: Mapping[str, Recorded]
+    events: tuple[ContactEvent, ...] = ()
 
     def __post_init__(self) -> None:
         lengths = {"time": np.shape(self.time)[:1]} | {
@@ -96,7 +103,8 @@ class Record:
     def _extent(self) -> str:
         if not self.time.size:
             return "empty"
-        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s"
+        events = f", {len(self.events)} events" if self.events else ""
+        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s{events}"
 
     def while_finite(self) -> Self:
         """The record up to the first moment at which some signal is not finite."""
@@ -109,7 +117,17 @@ class Record:
             name: Recorded(recorded.values[:count], recorded.signals)
             for name, recorded in self.signals.items()
         }
-        return type(self)(self.time[:count], signals)
+        last = self.time[count - 1] if count else -np.inf
+        events = tuple(event for event in self.events if event.time <= last)
+        return type(self)(self.time[:count], signals, events)
+
+    def event_rows(self) -> list[dict[str, Any]]:
+        """The events as rows of plain values, for `pandas.DataFrame` or a `csv.DictWriter`.
+
+        Each has "time [s]", "event", "contacts" (to which it happened) and "closed" (which are so
+        after it), separated by commas, "impulse [N s]" (the sum of theirs) and "energy lost [J]".
+        """
+        return event_rows(self.events)
 
     @classmethod
     def from_logs(
@@ -153,12 +171,14 @@ class Record:
             arrays[name] = recorded.values
             arrays[f"{name}.names"] = np.array([s.name for s in recorded.signals], dtype=str)
             arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
+        arrays |= event_arrays(self.events)
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
     def to_csv(self, path: str | Path) -> None:
         """Writes the record as text: a line of names with units, then one line for each time.
 
         The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
+        Events are not among them; see `event_rows`.
         """
         columns = [
             f"{name}.{_label(signal)}"
@@ -226,7 +246,7 @@ class Record:
             with np.load(path, allow_pickle=False) as file:
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
-                return cls(file["time"], signals)
+                return cls(file["time"], signals, events_of_arrays(file))
         except (
             AttributeError,
             EOFError,

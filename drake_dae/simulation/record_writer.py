@@ -34,6 +34,7 @@ class RecordWriter:
     Whatever ends the process, `Record.load` reads the file up to the last append. It is one line of
     JSON with names and units, and then rows of numbers (little-endian float64): the time in s and
     the signals in the order of that line. A file that was cut off anywhere lacks its last row.
+    Events of contacts are not in it, but which contacts are closed is a signal.
 
     The file is made with the first append, and never in the place of another one. Where appending
     fails, as on a full disk, this warns and tries again a second later; the run goes on.

@@ -11,6 +11,7 @@ from drake_dae.analysis.tables import Table
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.robots.model import RobotModel
+from drake_dae.simulation.open_contacts import contact_notes
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
@@ -77,7 +78,7 @@ def summary(
 
     Args:
         record: A record with state, desired_output, tracking_error, constraint_residual,
-            constraint_force and control.
+            constraint_force and control; and "mode" and "gap" where contacts open and close.
         predicted: The tracking error by theory, shape (k, p).
         limits: What the robot can take.
         run: What it took; None for a run that failed.
@@ -91,6 +92,7 @@ def summary(
     # Drake's own contact gives way, and is not projected.
     kind = "in contact that gives way" if "contact_force" in record.signals else _PROJECTED
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
+    notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
     ended = ""
     if run is not None:

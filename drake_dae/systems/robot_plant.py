@@ -1,22 +1,22 @@
 """A RobotModel as a LeafSystem."""
 
 import casadi as ca
-from pydrake.systems.framework import BasicVector, Context
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.formulas import Formula, TracedFormula
-from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.trials import state_tickets
+from drake_dae.systems.robot_ports import RobotPorts
 from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
-class RobotPlant(DaePlant):
+class RobotPlant(DaePlant, RobotPorts):
     """A constrained robot (37)-(40) with the ports of `DaePlant` and:
 
     Output ports:
@@ -60,63 +60,13 @@ class RobotPlant(DaePlant):
     ) -> None:
         super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
         self.model = model
-        size = model.links.q.numel() + model.links.v.numel()
-        parts = {"link_state": slice(0, size)}
-        start = size
-        for stage in model.stages:
-            for name, part in stage.ports.items():
-                parts[name] = slice(start + part.start, start + part.stop)
-            start += stage.state.numel()
-        self._parts = parts
-        for name, part in parts.items():
-            self.DeclareVectorOutputPort(
-                name,
-                part.stop - part.start,
-                weakly(self._calc_part, part),
-                state_tickets(self),
-            )
-        self._add_wrenches()
-        loops = model.loop_joints
-        if loops.signals:
-            self._loops = model.dae.trace("loop state", {"value": loops.state})
-            self.functions["loop_state"] = self._loops
-            size, calc = len(loops.signals), weakly(self._calc_loop_state)
-            self.DeclareVectorOutputPort("loop_state", size, calc, self._by_state)
-        if model.joint_force is not None:
-            self._joint_force = model.dae.trace("joint torque", {"value": model.joint_force})
-            self.DeclareVectorOutputPort(
-                "joint_torque",
-                model.joint_force.numel(),
-                weakly(self._calc_joint_torque),
-                self._by_state,
-            )
-
-    def _add_wrenches(self) -> None:
-        model, dae = self.model, self.dae
-        bound = ConstraintSet(model.constraints)
-        force = ca.SX.sym("force", bound.size)
-        wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), force)
-        inputs = {"state": dae.state, "force": force, "parameters": dae.parameter_symbol}
-        self._wrenches = TracedFunction("constraint wrenches", inputs, {"value": wrenches})
-        self._wrench_formula = wrenches, force
         tickets = self._by_control if self._force_needs_control else self._by_state
-        size, calc = len(self.wrench_signals), weakly(self._calc_wrenches)
-        self.DeclareVectorOutputPort("constraint_wrenches", size, calc, tickets)
+        self._declare_robot_ports(model.dae, self._by_state, tickets)
+        if model.loop_joints.signals:
+            self.functions["loop_state"] = self._loops
 
-    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
-        force = self._evaluate(self._force, context, self._force_needs_control)
-        state = context.get_continuous_state_vector().CopyToVector()
-        values = self._wrenches.evaluate(state, force, self._values(context))[0]
-        output.SetFromVector(values)
-
-    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.state(context)[part])
-
-    def _calc_loop_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._loops(self.state(context), self._values(context))[0])
-
-    def _calc_joint_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._joint_force(self.state(context), self._values(context))[0])
+    def _shown_force(self, context: Context) -> FloatArray:
+        return self._evaluate(self._force, context, self._force_needs_control)
 
     def _formulas(self) -> dict[str, Formula]:
         state = self.dae.state

@@ -102,7 +102,7 @@ def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
 SLOW = [
     pytest.param(name, marks=[] if name == "two_link_wall" else pytest.mark.slow)
     for name in shipped_scenarios()
-    if not name.startswith("wall_")  # Their dynamics are Drake's.
+    if not name.startswith("wall_")  # Their dynamics are Drake's, or those of modes.
 ]
 
 

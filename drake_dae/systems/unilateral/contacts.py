@@ -10,7 +10,6 @@ import numpy as np
 from drake_dae.arrays import FloatArray, number, show, unknown_name
 from drake_dae.dae.contacts import Jam, jam
 from drake_dae.dae.layout import Indices
-from drake_dae.dae.signals import Parameter
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import JammedContactError, ModelError
 from drake_dae.robots.contact.constraint_set import ConstraintSet
@@ -70,7 +69,8 @@ class UnilateralContacts:
 
     Attributes:
         names: The names of the contacts, in the order of the model's constraints.
-        dae: The system with all contacts closed, and with the parameters "<contact>.restitution".
+        dae: The system with all contacts closed.
+        restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
         kept: The rows of all other constraints.
         normals: The row of each contact that can only push.
@@ -120,9 +120,11 @@ class UnilateralContacts:
             [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
         )
         self.normals = [touch.normal for touch in self.touches]
-        self.dae = _with_restitution(model.dae, [(n, restitution[n]) for n in self.names])
-        self._restitution = [self.dae.parameter_slice(f"{n}.restitution") for n in self.names]
-        dae, links = self.dae, model.links
+        self.restitution = np.array(
+            [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names]
+        )
+        dae, links = model.dae, model.links
+        self.dae = dae
         rate = ca.jtimes(dae.k, dae.state, dae.f) + dae.exogenous.rate(dae.k)
         rows = [
             dae.k[i] if ca.depends_on(dae.k[i], links.v) else rate[i]
@@ -135,6 +137,7 @@ class UnilateralContacts:
             for i in range(dae.num_constraints)
         ]
         self.residual = ca.vertcat(ca.SX(0, 1), *holds)
+        self._sizes = [held.numel() for held in holds]
         found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
         self.gaps = dae.trace("gaps", found)
         positions, velocities = links.q.numel(), links.v.numel()
@@ -155,9 +158,12 @@ class UnilateralContacts:
             often=False,
         )
 
-    def restitution(self, parameters: FloatArray) -> FloatArray:
-        """e of each contact, shape (k,)."""
-        return np.array([parameters[part.start] for part in self._restitution])
+    def holds(self, closed: Sequence[bool]) -> FloatArray:
+        """For each entry of the residual 1, or 0 where it is that of a contact that is open."""
+        rows = np.ones(self.dae.num_constraints)
+        for touch, shut in zip(self.touches, closed, strict=True):
+            rows[touch.rows] = shut
+        return np.repeat(rows, self._sizes)
 
     def terms(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> Terms:
         """The numbers at a state; nan where a function has no value."""
@@ -226,14 +232,13 @@ def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArr
     )
 
 
-def _with_restitution(dae: DaeSystem, given: Sequence[tuple[str, float]]) -> DaeSystem:
-    added = []
-    for name, value in given:
-        e = number(f"{dae.name}: the coefficient of restitution of '{name}'", value)
-        if not 0.0 <= e <= 1.0:
-            raise ModelError(
-                f"{dae.name}: the coefficient of restitution of '{name}' must be between 0, no "
-                f"bounce, and 1, no loss; got {e:g}"
-            )
-        added.append(Parameter(f"{name}.restitution", np.array([e]), nonnegative=True))
-    return replace(dae, parameters=(*dae.parameters, *added))
+def coefficient(name: str, value: float) -> float:
+    """A coefficient of restitution.
+
+    Raises:
+        ModelError: It is none.
+    """
+    e = number(name, value)
+    if not 0.0 <= e <= 1.0:
+        raise ModelError(f"{name} must be between 0, no bounce, and 1, no loss; got {e:g}")
+    return e

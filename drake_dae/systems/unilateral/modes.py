@@ -28,6 +28,7 @@ class Mode:
         dynamics: x', a function of state, control if there is one, and parameters.
         force: All constraint forces, zero where open, likewise if `force_needs_control`.
         output: The controlled outputs, likewise if `output_needs_control`.
+        holds: For each entry of the constraint residual 1, or 0 where its contact is open.
         force_needs_control, output_needs_control: Whether the control enters them.
     """
 
@@ -37,6 +38,7 @@ class Mode:
     dynamics: TracedFunction
     force: TracedFunction
     output: TracedFunction
+    holds: FloatArray
     force_needs_control: bool
     output_needs_control: bool
 
@@ -46,10 +48,13 @@ class Modes:
 
     Args:
         contacts: The contacts.
+        structure: The structure of the system with all contacts closed, if it is known.
     """
 
-    def __init__(self, contacts: UnilateralContacts) -> None:
-        self._contacts = contacts
+    def __init__(
+        self, contacts: UnilateralContacts, structure: ConstraintStructure | None = None
+    ) -> None:
+        self._contacts, self._whole = contacts, structure
         self._known: dict[Closed, Mode] = {}
 
     @property
@@ -85,9 +90,10 @@ class Modes:
                 "the constraints depend on each other there"
             )
         rows = sorted(found.tolist())
-        system = subsystem(contacts, rows, state)
+        whole = self._whole if len(rows) == dae.num_constraints else None
+        system = subsystem(contacts, rows, state) if whole is None else whole.system
         try:
-            structure = find_constraint_structure(system)
+            structure = whole or find_constraint_structure(system)
         except DrakeDaeError as error:
             note = f"While {', '.join(names) or 'no contact'} is closed: {error}"
             error.args = (note, *error.args[1:])
@@ -108,6 +114,7 @@ class Modes:
             dynamics=structure.trace("dynamics", rate, dae.num_controls > 0),
             force=structure.trace("constraint force", ca.densify(force), by_control[0]),
             output=structure.trace("controlled output", output, by_control[1]),
+            holds=contacts.holds(closed),
             force_needs_control=by_control[0],
             output_needs_control=by_control[1],
         )

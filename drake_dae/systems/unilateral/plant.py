@@ -17,6 +17,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
+from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import (
     InconsistentStateError,
     ModelError,
@@ -79,9 +80,10 @@ class UnilateralRobotPlant(ModalPorts):
     Output ports:
         state: x, shape (n,).
         mode: For each contact 1 if it is closed and 0 if it is open, shape (k,).
+        gap: phi of each contact, m, shape (k,).
         constraint_force: lambda, zero where open, shape (m,).
         constraint_residual: phi_i, phi_i' of each constraint (or what restricts velocities alone),
-            constraint-major; of an open contact, the gap and its rate.
+            constraint-major; zero where a contact is open, which is no constraint then.
         controlled_output: z.
         link_state: (q, v) of the links, shape (nq + nv,).
         constraint_wrenches: What each constraint does to each of its frames; see `RobotPlant`.
@@ -94,11 +96,14 @@ class UnilateralRobotPlant(ModalPorts):
         contacts: Name of a constraint that can only push -> its coefficient of restitution, 0 (no
             bounce) to 1 (no loss). It becomes the parameter "<name>.restitution".
         settling_time: Bouncing that would end within this time, in s, ends at once; positive.
+        structure: The structure of `model.dae`; found if None, where all contacts are closed.
 
     Attributes:
         model: The robot.
         contacts: The names of the contacts that open and close, in the order of `mode`.
         modes: Which contacts are closed -> how the robot moves then; see `Mode`.
+        gap_signals: Names and units of `gap`.
+        mode_signals: Names of `mode`.
         wrench_signals: Names and units of `constraint_wrenches`.
 
     Raises:
@@ -120,9 +125,10 @@ class UnilateralRobotPlant(ModalPorts):
         contacts: Mapping[str, float],
         *,
         settling_time: float = 1e-3,
+        structure: ConstraintStructure | None = None,
     ) -> None:
         settling = positive(f"{model.name}: settling_time", settling_time)
-        super().__init__(model, contacts)
+        super().__init__(model, contacts, structure)
         self._resets = Resets(self._contacts, self.modes, settling)
         self._log_index = self.DeclareCacheEntry(
             "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
@@ -186,7 +192,7 @@ class UnilateralRobotPlant(ModalPorts):
             gaps, rates = self._checked(self._contacts.gaps, context, state)
             margins[:] = np.maximum(gaps, rates + MARGIN)
         if closed.any():
-            force = self._force(context)
+            force = self._shown_force(context)
             margins[closed] = force[self._contacts.normals][closed]
         value.set_value(margins)
 
@@ -245,7 +251,8 @@ class UnilateralRobotPlant(ModalPorts):
         time, x, values = context.get_time(), self.state(context), self._values(context)
         try:
             x = self._mode(context).structure.manifold.projected(x, values)
-            after = self._resets(time, x, closed, self._control(context), values)
+            e = context.get_numeric_parameter(1).value()
+            after = self._resets(time, x, closed, self._control(context), values, e)
         except InconsistentStateError as error:
             raise off_manifold(time, x, error) from error
         log, before = self._log(context), (time, x.tobytes())

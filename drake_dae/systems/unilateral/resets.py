@@ -86,8 +86,9 @@ class Resets:
         closed: Closed,
         control: FloatArray,
         parameters: FloatArray,
+        restitution: FloatArray,
     ) -> After:
-        """What follows at a time from a state, in a mode.
+        """What follows at a time from a state, in a mode, with the e of each contact.
 
         Raises:
             SimulationError: No set of contacts fits, or impacts do not end.
@@ -111,7 +112,8 @@ class Resets:
             touching = [i for i in touching if rates[i] <= SLOW]
             if not any(rates[i] < -SLOW for i in touching):
                 break
-            x, event = self._impact(time, x, touching, terms, control, parameters)
+            e = restitution[touching]
+            x, event = self._impact(time, x, touching, terms, control, parameters, e)
             events.append(event)
         else:
             raise SimulationError(
@@ -140,11 +142,11 @@ class Resets:
         terms: Terms,
         control: FloatArray,
         parameters: FloatArray,
+        e: FloatArray,
     ) -> tuple[FloatArray, ContactEvent]:
         contacts, before = self._contacts, terms.rates
         touches = [contacts.touches[i] for i in touching]
         normals = np.array([touch.normal for touch in touches])
-        e = contacts.restitution(parameters)[list(touching)]
         wanted = before.copy()
         wanted[normals] *= 1.0 + e
         matrix = terms.impulse_matrix

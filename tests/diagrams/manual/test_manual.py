@@ -43,6 +43,7 @@ PURE = {
     ("!DcMotors", "gear_ratio"),
     ("!MeasuredForce", "gain"),
     ("!MultibodyPlant", "friction"),
+    ("!Unilateral", "restitution"),
     ("SimulatorConfig", "accuracy"),
     ("SimulatorConfig", "target_realtime_rate"),
 }

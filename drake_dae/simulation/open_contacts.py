@@ -1,0 +1,79 @@
+"""What a record tells of contacts that open and close: in words, and as marks in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_dae.simulation.events import impacts
+from drake_dae.simulation.record import Record
+
+if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
+    from matplotlib.axes import Axes
+
+IMPACT, OPEN = "impact", "contact open"
+"""What marks in a picture mean."""
+
+
+def contact_notes(record: Record) -> list[tuple[str, str]]:
+    """What contacts did that open and close, as labels and texts; none where none can."""
+    if "mode" not in record.signals:
+        return []
+    hits = impacts(record.events)
+    text = "no impacts"
+    if hits:
+        hardest = max(hits, key=lambda event: max(event.impulses))
+        lost = sum(event.energy_lost for event in hits)
+        count = f"{len(hits)} impacts, the first" if len(hits) > 1 else "1 impact,"
+        text = (
+            f"{count} at {hits[0].time:.4g} s; the hardest with {max(hardest.impulses):.3g} N s at "
+            f"{hardest.time:.4g} s; {lost:.3g} J lost"
+        )
+    notes = [("contacts", text)]
+    modes, gaps, taken = record["mode"], record["gap"], np.diff(record.time, prepend=record.time[0])
+    for column, signal in enumerate(record.signals["gap"].signals):
+        # A sample tells of the step that it ends.
+        is_open = modes[:, column] == 0.0
+        is_open[0] = False
+        name, away = signal.name.removesuffix(".gap"), gaps[is_open, column]
+        if not away.size:
+            notes.append((name, "closed all the time"))
+            continue
+        first = record.time[int(np.argmax(is_open)) - 1]
+        notes.append(
+            (
+                name,
+                f"open for {taken[is_open].sum():.4g} s, first from {first:.4g} s on, up to "
+                f"{np.max(away):.3g} {signal.unit} away",
+            )
+        )
+    return notes
+
+
+def open_spans(record: Record) -> list[tuple[float, float]]:
+    """From when to when some contact was open, in s."""
+    if "mode" not in record.signals or record.time.size < 2:
+        return []
+    is_open = np.concatenate([[False], (record["mode"][1:] == 0.0).any(axis=1), [False]])
+    edges = np.flatnonzero(is_open[1:] != is_open[:-1])
+    times = record.time[edges]
+    return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
+
+
+def mark_labels(record: Record) -> tuple[str, ...]:
+    """What stands in the legend for the marks of a record, in any order."""
+    found = [OPEN] if open_spans(record) else []
+    return (*found, IMPACT) if impacts(record.events) else tuple(found)
+
+
+def mark_events(axes: Sequence[Axes], record: Record) -> None:
+    """Marks in axes over time where contacts were open, and impacts."""
+    for axis in axes:
+        for number, span in enumerate(open_spans(record)):
+            label = "" if number else OPEN
+            axis.axvspan(*span, color="0.9", linewidth=0.0, zorder=0.4, label=label)
+        for number, event in enumerate(impacts(record.events)):
+            label = "" if number else IMPACT
+            axis.axvline(event.time, color="C3", linewidth=0.8, alpha=0.7, zorder=0.6, label=label)
