@@ -28,6 +28,7 @@ from drake_dae.diagrams.scenario_model import (
     scenario_structure,
     start_guess,
 )
+from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.errors import (
     AssumptionError,
     InconsistentStateError,
@@ -158,6 +159,10 @@ def wire_loop(
     limits = _limits(scenario, model)
     feedback = can_be_fed_back(law, scenario.sampling, limits)
     plant = _plant(scenario, model, structure, feedback)
+    if scenario.encoders is not None:
+        with at("encoders"):
+            period = scenario.sampling.period if scenario.sampling else plant.time_step
+            make_sensor(plant, scenario.encoders, period)
     with at("force" if force.is_measured else "start.positions"):
         return make_closed_loop(
             plant,
@@ -166,6 +171,7 @@ def wire_loop(
             exogenous=exogenous,
             sensor=sensor,
             sampling=scenario.sampling,
+            encoders=scenario.encoders,
             control_limits=limits,
             scene_graph=scene_graph,
             meshcat=meshcat,
@@ -259,6 +265,8 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
         force = model.rest_forces(q, forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
         loop.set_seed(context, scenario.force.seed)
+    if loop.encoders is not None and scenario.encoders is not None:
+        loop.encoders.set_seed(context, scenario.encoders.seed)
 
 
 def _in_motion(

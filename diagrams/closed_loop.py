@@ -26,12 +26,14 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.encoders import Encoders
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
@@ -56,6 +58,7 @@ class ClosedLoop:
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
         plant_exogenous: That for the plant, or None.
+        encoders: What measures the state for the law, or None.
         memory: What `rollout` made of the loop, and uses again.
     """
 
@@ -70,6 +73,7 @@ class ClosedLoop:
     noise: RandomSource | None
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
+    encoders: MeasuredState | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
@@ -156,8 +160,11 @@ class ClosedLoop:
 
     def _refuse_fixed_ports(self, plant: DaePlant, context: Context) -> None:
         taker, own = self.controller, self.controller.GetMyContextFromRoot(context)
+        measured = (plant, "state", "estimated_state")
+        if self.encoders is not None:
+            measured = (self.encoders.sensor, "estimated_state", "estimated_state")
         for giver, source, name in (
-            (plant, "state", "estimated_state"),
+            measured,
             (self.reference, "reference", "reference"),
         ):
             port = taker.GetInputPort(name)
@@ -227,6 +234,7 @@ def make_closed_loop(
     exogenous: Sequence[Reference] = (),
     sensor: ForceSensor | None = None,
     sampling: Sampling | None = None,
+    encoders: Encoders | None = None,
     control_limits: ArrayLike | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
@@ -248,6 +256,8 @@ def make_closed_loop(
         sampling: When the law reads and acts: a period and a delay, and its control is held
             between. The error is that of the theory up to one order of these times. None for a law
             that acts continuously.
+        encoders: How the state is measured that the law gets, when it reads; the signal
+            "estimated_state" of the record tells it. None where it gets the state as it is.
         control_limits: The largest |u| that the drives give, shape (p,), such as
             `model.control_limits`; the signal "excess" of the record tells what was cut off, and
             when. Integrals stand still meanwhile. None for drives without limits.
@@ -292,7 +302,11 @@ def make_closed_loop(
         feedback=is_fed_back,
     )
     builder.AddSystem(controller)
-    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    state, measured = plant.GetOutputPort("state"), None
+    if encoders is not None:
+        measured = add_encoders(builder, plant, encoders, period)
+        state = measured.output
+    builder.Connect(state, controller.GetInputPort("estimated_state"))
     held = None if sampling is None else _hold_before(plant, sampling)
     control, limits = add_drives(builder, controller, held, control_limits)
     if is_fed_back:
@@ -329,6 +343,8 @@ def make_closed_loop(
     if isinstance(plant, ContactPlant):
         port = plant.GetOutputPort("contact_force")
         named["contact_force"] = (port, plant.contact_force_signals)
+    if measured is not None:
+        named["estimated_state"] = (measured.output, dae.state_signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     if law.integral.outputs:
@@ -375,6 +391,7 @@ def make_closed_loop(
         noise,
         moving[1],
         moving[0],
+        measured,
     )
 
 

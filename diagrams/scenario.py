@@ -27,7 +27,7 @@ from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems import sampling
+from drake_dae.systems import encoders, sampling
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -104,6 +104,7 @@ Plant = Annotated[
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
+Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
@@ -171,6 +172,8 @@ class Scenario:
         plant: Whether constraints are ideal, or Drake's own contact is in their place: a discrete
             MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
+        encoders: How positions and velocities are measured for the law, with `sampling`; left out,
+            it gets them as they are.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
         references: Name -> reference, where a number is a constant. A name is that of an output,
             tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
@@ -202,6 +205,7 @@ class Scenario:
     constraint_damping: Gains | None = None
     plant: Plant = field(default_factory=parts.IdealConstraints)
     sampling: Sampling | None = None
+    encoders: Encoders | None = None
     saturation: bool = False
     references: dict[str, Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)

@@ -103,6 +103,8 @@ from .simulation.simulate import simulate as simulate
 from .simulation.view import start_meshcat as start_meshcat
 from .symbolic import from_symbolic as from_symbolic
 from .systems.controller import TrackingController as TrackingController
+from .systems.encoders import Encoders as Encoders
+from .systems.encoders import StateSensor as StateSensor
 from .systems.limits import ControlLimits as ControlLimits
 from .systems.plant import DaePlant as DaePlant
 from .systems.realization import StateRealization as StateRealization

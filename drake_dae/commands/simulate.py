@@ -232,6 +232,7 @@ def _reasons(scenario: Scenario, record: Record) -> list[str]:
         ),
         "Drake's own contact gives way": isinstance(scenario.plant, ContactMaterial),
         "the force is measured by a sensor": scenario.force.is_measured,
+        "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
     return [reason for reason, holds in reasons.items() if holds]
