@@ -1,6 +1,6 @@
 """The closed loop that a scenario describes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import cast
 
@@ -13,6 +13,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_closed_loop
@@ -20,6 +21,7 @@ from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at, violated
+from drake_dae.diagrams.own_model import check_pushes, own_model
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
     add_robot,
@@ -153,12 +155,20 @@ def wire_loop(
             integral=scenario.integral,
         )
     references = _references(scenario.references, law)
-    exogenous = exogenous_references(scenario, law)
+    exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
 
     # The diagram.
     limits = _limits(scenario, model)
-    feedback = can_be_fed_back(law, scenario.sampling, limits)
-    plant = _plant(scenario, model, structure, feedback)
+    plant_exogenous = None
+    if isinstance(scenario.plant, ContactMaterial):
+        plant: RobotPlant | ContactPlant = _contact_plant(scenario, model, structure)
+    elif (own := own_model(scenario, model.links)) is not None:
+        plant, scene_graph = RobotPlant(own.model, structure=own.structure), own.scene_graph
+        degrees = plant.exogenous_layout.degrees
+        plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
+    else:
+        feedback = can_be_fed_back(law, scenario.sampling, limits)
+        plant = RobotPlant(model, structure=structure, feedback=feedback)
     if scenario.encoders is not None:
         with at("encoders"):
             period = scenario.sampling.period if scenario.sampling else plant.time_step
@@ -169,6 +179,7 @@ def wire_loop(
             law,
             references,
             exogenous=exogenous,
+            plant_exogenous=plant_exogenous,
             sensor=sensor,
             sampling=scenario.sampling,
             encoders=scenario.encoders,
@@ -179,21 +190,18 @@ def wire_loop(
         )
 
 
-def _plant(
-    scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
-) -> RobotPlant | ContactPlant:
-    """What is simulated."""
-    material = scenario.plant
-    if not isinstance(material, ContactMaterial):
-        return RobotPlant(model, structure=structure, feedback=feedback)
-    with at("plant or plant_parameters"):
-        return ContactPlant(
-            model,
-            partial(add_robot, scenario.robot),
-            material,
-            structure=structure,
-            parameters=scenario.plant_parameters,
-        )
+@at("plant or plant_parameters")
+def _contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+    check_pushes(scenario.plant_pushes, model.links)
+    assert isinstance(scenario.plant, ContactMaterial)
+    return ContactPlant(
+        model,
+        partial(add_robot, scenario.robot, scenario.plant_payloads),
+        scenario.plant,
+        structure=structure,
+        parameters=scenario.plant_parameters,
+        pushes=scenario.plant_pushes,
+    )
 
 
 @at("saturation")
@@ -217,15 +225,22 @@ def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -
         return in_order(found, outputs)
 
 
-def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference]:
+def exogenous_references(
+    scenario: Scenario, system: DaeSystem, needed: Sequence[int]
+) -> list[Reference]:
     """How each parameter moves that does, in the order of the system, each smooth enough.
+
+    Args:
+        scenario: The scenario.
+        system: The system of its plant or of its law.
+        needed: How many derivatives of each entry are needed.
 
     Raises:
         ScenarioError: There are too few or too many, or one is not smooth enough.
     """
     moving: list[Reference] = []
-    degrees = list(law.exogenous_degrees)
-    for parameter in law.system.exogenous.moving:
+    degrees = list(needed)
+    for parameter in system.exogenous.moving:
         key = f"exogenous.{parameter.name}"
         references = [
             one if isinstance(one, Reference) else ConstantReference(one)
@@ -258,7 +273,7 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
         guess = start_guess(scenario.start.positions, model.links)
         q = _configuration(model, positions, guess, parameters)
         state = model.rest_state(q, forces, parameters)
-        if model.dae.exogenous:
+        if scenario.exogenous:
             state = _in_motion(loop, context, wanted, state)
         plant.set_consistent_state(own, state)
     if loop.sensor is not None:

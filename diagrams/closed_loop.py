@@ -232,6 +232,7 @@ def make_closed_loop(
     references: Sequence[Reference] | Mapping[str, Reference | float] | System,
     *,
     exogenous: Sequence[Reference] = (),
+    plant_exogenous: Sequence[Reference] | None = None,
     sensor: ForceSensor | None = None,
     sampling: Sampling | None = None,
     encoders: Encoders | None = None,
@@ -251,6 +252,8 @@ def make_closed_loop(
             a `SystemReference` with all degrees of the law takes it.
         exogenous: The exogenous signals of the plant, which its law knows too, as references that
             together cover all entries of w, in their order; without any nothing moves.
+        plant_exogenous: Those of the plant, where its law knows others, or has none; None for the
+            same.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
             force is connected as it is, where that closes no algebraic loop.
         sampling: When the law reads and acts: a period and a delay, and its control is held
@@ -315,7 +318,8 @@ def make_closed_loop(
         builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
         builder.Connect(control, plant.GetInputPort("control"))
 
-    moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
+    own = exogenous if plant_exogenous is None else plant_exogenous
+    moving = [add_exogenous(builder, *pair) for pair in ((plant, own), (controller, exogenous))]
 
     noise = None
     if law.measured_force:

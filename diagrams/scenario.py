@@ -22,12 +22,13 @@ from drake_dae.dae import references
 from drake_dae.diagrams import contact_material
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
+from drake_dae.diagrams.robot_file import payloads
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems import encoders, sampling
+from drake_dae.systems import encoders, pushes, sampling
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -97,6 +98,8 @@ Reference = Annotated[
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
 Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
+Payload = Annotated[payloads.Payload, Form()]
+Push = Annotated[pushes.Push, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     parts.IdealConstraints
@@ -156,7 +159,9 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not; one
-            number for all entries, or a list.
+            number for all entries, or a list. A surface that may be tilted has `rpy`.
+        plant_payloads: Masses that the plant carries and the law's model does not.
+        plant_pushes: Forces on the plant for some time, which the law does not know.
         loads: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
             `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
@@ -197,6 +202,8 @@ class Scenario:
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, float | list[float]] = field(default_factory=dict)
+    plant_payloads: list[Payload] = field(default_factory=list)
+    plant_pushes: list[Push] = field(default_factory=list)
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None

@@ -107,6 +107,7 @@ from .systems.encoders import Encoders as Encoders
 from .systems.encoders import StateSensor as StateSensor
 from .systems.limits import ControlLimits as ControlLimits
 from .systems.plant import DaePlant as DaePlant
+from .systems.pushes import Push as Push
 from .systems.realization import StateRealization as StateRealization
 from .systems.references import ReferenceGenerator as ReferenceGenerator
 from .systems.references import SystemReference as SystemReference
