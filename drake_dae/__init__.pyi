@@ -29,6 +29,8 @@ from .dae.references import SpiralReference as SpiralReference
 from .dae.references import TextReference as TextReference
 from .dae.references import WaypointsReference as WaypointsReference
 from .dae.references import references_by_name as references_by_name
+from .dae.sampled import sampled_poles as sampled_poles
+from .dae.sampled import sampling_error as sampling_error
 from .dae.signals import Parameter as Parameter
 from .dae.signals import Signal as Signal
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
