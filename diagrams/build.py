@@ -1,6 +1,6 @@
 """The closed loop that a scenario describes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import cast
 
@@ -13,6 +13,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_closed_loop
@@ -20,6 +21,7 @@ from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at, violated
+from drake_dae.diagrams.own_model import check_pushes, own_model
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
     add_robot,
@@ -28,6 +30,7 @@ from drake_dae.diagrams.scenario_model import (
     scenario_structure,
     start_guess,
 )
+from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.unilateral import Unilateral
 from drake_dae.errors import (
     AssumptionError,
@@ -154,20 +157,43 @@ def wire_loop(
             integral=scenario.integral,
         )
     references = _references(scenario.references, law)
-    exogenous = exogenous_references(scenario, law)
+    exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
 
     # The diagram.
     limits = _limits(scenario, model)
-    feedback = can_be_fed_back(law, scenario.sampling, limits)
-    plant = _plant(scenario, model, structure, feedback)
+    plant: RobotPlant | ContactPlant | UnilateralRobotPlant
+    plant_exogenous = own = None
+    if isinstance(scenario.plant, ContactMaterial):
+        plant = _contact_plant(scenario, model, structure)
+    else:
+        own = own_model(scenario, model.links)
+    if own is not None:
+        model, structure, scene_graph = own.model, own.structure, own.scene_graph
+    if isinstance(scenario.plant, Unilateral):
+        with at("plant.restitution"):
+            plant = scenario.plant.plant(model, structure)
+    elif own is not None:
+        plant = RobotPlant(model, structure=structure)
+    elif not isinstance(scenario.plant, ContactMaterial):
+        feedback = can_be_fed_back(law, scenario.sampling, limits)
+        plant = RobotPlant(model, structure=structure, feedback=feedback)
+    if own is not None:
+        degrees = plant.exogenous_layout.degrees
+        plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
+    if scenario.encoders is not None:
+        with at("encoders"):
+            period = scenario.sampling.period if scenario.sampling else plant.time_step
+            make_sensor(plant, scenario.encoders, period)
     with at("force" if force.is_measured else "start.positions"):
         return make_closed_loop(
             plant,
             law,
             references,
             exogenous=exogenous,
+            plant_exogenous=plant_exogenous,
             sensor=sensor,
             sampling=scenario.sampling,
+            encoders=scenario.encoders,
             control_limits=limits,
             scene_graph=scene_graph,
             meshcat=meshcat,
@@ -175,24 +201,18 @@ def wire_loop(
         )
 
 
-def _plant(
-    scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
-) -> RobotPlant | ContactPlant | UnilateralRobotPlant:
-    """What is simulated."""
-    material = scenario.plant
-    if isinstance(material, Unilateral):
-        with at("plant.restitution"):
-            return material.plant(model, structure)
-    if not isinstance(material, ContactMaterial):
-        return RobotPlant(model, structure=structure, feedback=feedback)
-    with at("plant or plant_parameters"):
-        return ContactPlant(
-            model,
-            partial(add_robot, scenario.robot),
-            material,
-            structure=structure,
-            parameters=scenario.plant_parameters,
-        )
+@at("plant or plant_parameters")
+def _contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+    check_pushes(scenario.plant_pushes, model.links)
+    assert isinstance(scenario.plant, ContactMaterial)
+    return ContactPlant(
+        model,
+        partial(add_robot, scenario.robot, scenario.plant_payloads),
+        scenario.plant,
+        structure=structure,
+        parameters=scenario.plant_parameters,
+        pushes=scenario.plant_pushes,
+    )
 
 
 @at("saturation")
@@ -216,15 +236,22 @@ def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -
         return in_order(found, outputs)
 
 
-def exogenous_references(scenario: Scenario, law: TrackingLaw) -> list[Reference]:
+def exogenous_references(
+    scenario: Scenario, system: DaeSystem, needed: Sequence[int]
+) -> list[Reference]:
     """How each parameter moves that does, in the order of the system, each smooth enough.
+
+    Args:
+        scenario: The scenario.
+        system: The system of its plant or of its law.
+        needed: How many derivatives of each entry are needed.
 
     Raises:
         ScenarioError: There are too few or too many, or one is not smooth enough.
     """
     moving: list[Reference] = []
-    degrees = list(law.exogenous_degrees)
-    for parameter in law.system.exogenous.moving:
+    degrees = list(needed)
+    for parameter in system.exogenous.moving:
         key = f"exogenous.{parameter.name}"
         references = [
             one if isinstance(one, Reference) else ConstantReference(one)
@@ -257,13 +284,15 @@ def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Con
         guess = start_guess(scenario.start.positions, model.links)
         q = _configuration(model, positions, guess, parameters)
         state = model.rest_state(q, forces, parameters)
-        if model.dae.exogenous:
+        if scenario.exogenous:
             state = _in_motion(loop, context, wanted, state)
         plant.set_consistent_state(own, state)
     if loop.sensor is not None:
         force = model.rest_forces(q, forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
         loop.set_seed(context, scenario.force.seed)
+    if loop.encoders is not None and scenario.encoders is not None:
+        loop.encoders.set_seed(context, scenario.encoders.seed)
 
 
 def _in_motion(

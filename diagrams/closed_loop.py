@@ -26,6 +26,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.diagrams.unilateral import with_events
 from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
 from drake_dae.errors import DrakeDaeError, WiringError
@@ -33,6 +34,7 @@ from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.encoders import Encoders
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
@@ -58,6 +60,7 @@ class ClosedLoop:
         noise: The source of the sensor's noise, or None.
         exogenous: The generator of the exogenous signals for the law, or None.
         plant_exogenous: That for the plant, or None.
+        encoders: What measures the state for the law, or None.
         memory: What `rollout` made of the loop, and uses again.
     """
 
@@ -72,6 +75,7 @@ class ClosedLoop:
     noise: RandomSource | None
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
+    encoders: MeasuredState | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
@@ -164,8 +168,11 @@ class ClosedLoop:
 
     def _refuse_fixed_ports(self, plant: DaePlant | UnilateralRobotPlant, context: Context) -> None:
         taker, own = self.controller, self.controller.GetMyContextFromRoot(context)
+        measured = (plant, "state", "estimated_state")
+        if self.encoders is not None:
+            measured = (self.encoders.sensor, "estimated_state", "estimated_state")
         for giver, source, name in (
-            (plant, "state", "estimated_state"),
+            measured,
             (self.reference, "reference", "reference"),
         ):
             port = taker.GetInputPort(name)
@@ -236,8 +243,10 @@ def make_closed_loop(
     references: Sequence[Reference] | Mapping[str, Reference | float] | System,
     *,
     exogenous: Sequence[Reference] = (),
+    plant_exogenous: Sequence[Reference] | None = None,
     sensor: ForceSensor | None = None,
     sampling: Sampling | None = None,
+    encoders: Encoders | None = None,
     control_limits: ArrayLike | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
@@ -255,11 +264,15 @@ def make_closed_loop(
             a `SystemReference` with all degrees of the law takes it.
         exogenous: The exogenous signals of the plant, which its law knows too, as references that
             together cover all entries of w, in their order; without any nothing moves.
+        plant_exogenous: Those of the plant, where its law knows others, or has none; None for the
+            same.
         sensor: The sensor of the constraint force, for a law with measured force. Without one the
             force is connected as it is, where that closes no algebraic loop.
         sampling: When the law reads and acts: a period and a delay, and its control is held
             between. The error is that of the theory up to one order of these times. None for a law
             that acts continuously.
+        encoders: How the state is measured that the law gets, when it reads; the signal
+            "estimated_state" of the record tells it. None where it gets the state as it is.
         control_limits: The largest |u| that the drives give, shape (p,), such as
             `model.control_limits`; the signal "excess" of the record tells what was cut off, and
             when. Integrals stand still meanwhile. None for drives without limits.
@@ -304,7 +317,11 @@ def make_closed_loop(
         feedback=is_fed_back,
     )
     builder.AddSystem(controller)
-    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    state, measured = plant.GetOutputPort("state"), None
+    if encoders is not None:
+        measured = add_encoders(builder, plant, encoders, period)
+        state = measured.output
+    builder.Connect(state, controller.GetInputPort("estimated_state"))
     held = None if sampling is None else _hold_before(plant, sampling)
     control, limits = add_drives(builder, controller, held, control_limits)
     if is_fed_back:
@@ -313,7 +330,8 @@ def make_closed_loop(
         builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
         builder.Connect(control, plant.GetInputPort("control"))
 
-    moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
+    own = exogenous if plant_exogenous is None else plant_exogenous
+    moving = [add_exogenous(builder, *pair) for pair in ((plant, own), (controller, exogenous))]
 
     noise = None
     if law.measured_force:
@@ -341,6 +359,8 @@ def make_closed_loop(
     if isinstance(plant, ContactPlant):
         port = plant.GetOutputPort("contact_force")
         named["contact_force"] = (port, plant.contact_force_signals)
+    if measured is not None:
+        named["estimated_state"] = (measured.output, dae.state_signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     if law.integral.outputs:
@@ -390,6 +410,7 @@ def make_closed_loop(
         noise,
         moving[1],
         moving[0],
+        measured,
     )
 
 

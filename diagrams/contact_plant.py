@@ -1,7 +1,7 @@
 """Drake's own contact as the plant: a discrete MultibodyPlant in place of the ideal constraint."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ from pydrake.multibody.plant import (
     MultibodyPlant,
     MultibodyPlantConfig,
 )
-from pydrake.multibody.tree import Frame
+from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
@@ -30,10 +30,12 @@ from drake_dae.dae.layout import Layout
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.diagrams.contact_material import ContactMaterial, ball_properties, surface_properties
 from drake_dae.errors import ModelError
+from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.constraint_forces import ConstraintLoads, own_values
 from drake_dae.systems.contact_forces import ContactForces
 from drake_dae.systems.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.pushes import AppliedPushes, Push
 
 
 def _is_of_use(record: logging.LogRecord) -> bool:
@@ -70,7 +72,8 @@ class ContactPlant(Diagram):
         material: How it touches.
         structure: The structure of the model's system.
         parameters: Parameter name -> what the plant has otherwise: positions and friction of
-            surfaces.
+            surfaces, and masses of bodies.
+        pushes: Forces on the robot that its law does not know.
 
     Attributes:
         dae, model, structure, time_step: Of the plant.
@@ -91,6 +94,7 @@ class ContactPlant(Diagram):
         *,
         structure: ConstraintStructure,
         parameters: Mapping[str, ArrayLike] | None = None,
+        pushes: Sequence[Push] = (),
     ) -> None:
         super().__init__()
         _check_model(model)
@@ -109,6 +113,12 @@ class ContactPlant(Diagram):
         pairs = self._add_contacts(plant, scene_graph, material)
         plant.Finalize()
         _check_same(plant, model)
+        self._masses = self._other_masses()
+        if pushes:
+            frames = [frame_named(plant, push.frame) for push in pushes]
+            applied = builder.AddSystem(AppliedPushes(plant, pushes, frames))
+            port = plant.get_applied_spatial_force_input_port()
+            builder.Connect(applied.get_output_port(), port)
 
         forces = builder.AddSystem(ContactForces(model, structure, pairs, self._values))
         self.contact_force_signals = forces.contact_force_signals
@@ -190,6 +200,19 @@ class ContactPlant(Diagram):
             balls.append((GetScopedFrameByName(plant, name), center))
         return balls
 
+    def _other_masses(self) -> list[tuple[RigidBody, float]]:
+        """The bodies with another mass than in the model, each with its own."""
+        drawn = self.model.links.plant
+        assert drawn is not None  # _check_model.
+        bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
+        found = []
+        with_mass = (body for body in bodies if body.default_mass() > 0.0)
+        for body, parameter in zip(with_mass, self.model.links.parameters, strict=True):
+            value = self._values[self.dae.parameter_slice(parameter.name)].item()
+            if value != body.default_mass():
+                found.append((self.multibody.get_body(body.index()), value))
+        return found
+
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
         return self._values.copy()
@@ -206,7 +229,8 @@ class ContactPlant(Diagram):
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
 
-        The robot then touches without a force, and sinks in when the run begins.
+        The robot then touches without a force, and sinks in when the run begins. Bodies get the
+        masses that the plant has otherwise: Drake has these in its context.
 
         Raises:
             InconsistentStateError: None is found near the guess.
@@ -214,6 +238,8 @@ class ContactPlant(Diagram):
         state = self.structure.manifold.settle(guess, self._values)
         own = self.GetMutableSubsystemContext(self.multibody, context)
         self.multibody.SetPositionsAndVelocities(own, state)
+        for body, mass in self._masses:
+            body.SetMass(own, mass)
         return state
 
 
@@ -240,6 +266,7 @@ def _changed(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArr
     """The values of all parameters, those of what the robot touches as a plant has them."""
     values = model.dae.parameter_values
     own = [parameter for constraint in model.constraints for parameter in constraint.parameters]
+    own += model.links.parameters
     known = {parameter.name: parameter for parameter in own}
     for name, value in parameters.items():
         if name not in known:

@@ -54,7 +54,9 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
     # The law's model alone, without what it does not know of the plant.
-    ideal = replace(scenario, plant=IdealConstraints())
+    ideal = replace(
+        scenario, plant=IdealConstraints(), plant_payloads=[], plant_pushes=[], encoders=None
+    )
     loop, context = wire_scenario(ideal, model, structure)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 
@@ -64,7 +66,9 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 
     times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
     start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    exogenous = exogenous_references(scenario, loop.controller.law)
+    exogenous = exogenous_references(
+        scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
+    )
     analysis = analyze(
         model.dae, reference=reference, times=times, start=start, exogenous=exogenous
     )

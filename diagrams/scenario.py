@@ -22,12 +22,13 @@ from drake_dae.dae import references
 from drake_dae.diagrams import contact_material, unilateral
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
+from drake_dae.diagrams.robot_file import payloads
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems import sampling
+from drake_dae.systems import encoders, pushes, sampling
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -97,6 +98,8 @@ Reference = Annotated[
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
 Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
+Payload = Annotated[payloads.Payload, Form()]
+Push = Annotated[pushes.Push, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     parts.IdealConstraints
@@ -105,6 +108,7 @@ Plant = Annotated[
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
+Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
@@ -156,7 +160,9 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none is rigid joints.
         force: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not; one
-            number for all entries, or a list.
+            number for all entries, or a list. A surface that may be tilted has `rpy`.
+        plant_payloads: Masses that the plant carries and the law's model does not.
+        plant_pushes: Forces on the plant for some time, which the law does not know.
         loads: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
             `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
@@ -172,6 +178,8 @@ class Scenario:
         plant: Whether constraints are ideal; or open and close; or Drake's own contact is in their
             place: a discrete MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
+        encoders: How positions and velocities are measured for the law, with `sampling`; left out,
+            it gets them as they are.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
         references: Name -> reference, where a number is a constant. A name is that of an output,
             tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
@@ -195,6 +203,8 @@ class Scenario:
     actuation: list[Stage] = field(default_factory=list)
     force: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, float | list[float]] = field(default_factory=dict)
+    plant_payloads: list[Payload] = field(default_factory=list)
+    plant_pushes: list[Push] = field(default_factory=list)
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
@@ -203,6 +213,7 @@ class Scenario:
     constraint_damping: Gains | None = None
     plant: Plant = field(default_factory=parts.IdealConstraints)
     sampling: Sampling | None = None
+    encoders: Encoders | None = None
     saturation: bool = False
     references: dict[str, Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)

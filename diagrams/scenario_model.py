@@ -16,6 +16,7 @@ from drake_dae.diagrams.completion.completion import Completed, complete
 from drake_dae.diagrams.keys import at, each
 from drake_dae.diagrams.robot_file.changes import change_robot, finalize
 from drake_dae.diagrams.robot_file.loops import cut_loops, loop_constraints
+from drake_dae.diagrams.robot_file.payloads import Payload, add_payloads
 from drake_dae.diagrams.robot_file.reading import read_into, read_robot
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_parts import Robot, Written, made
@@ -74,10 +75,12 @@ def complete_scenario(scenario: Scenario) -> Completed:
 
 
 def completed_model(
-    scenario: Scenario, scene_graph: SceneGraph | None = None
+    scenario: Scenario,
+    scene_graph: SceneGraph | None = None,
+    payloads: Sequence[Payload] = (),
 ) -> tuple[Completed, RobotModel]:
-    """What `complete_scenario` and `scenario_model` return."""
-    robot = _read(scenario, scene_graph or SceneGraph())
+    """What `complete_scenario` and `scenario_model` return, of a robot with these payloads more."""
+    robot = _read(scenario, scene_graph or SceneGraph(), payloads)
     scenario = robot.completed.scenario
     outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
     with at("actuation" if robot.stages else "outputs"):
@@ -110,10 +113,10 @@ class _Robot:
     completed: Completed
 
 
-def _read(scenario: Scenario, scene_graph: SceneGraph) -> _Robot:
+def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()) -> _Robot:
     # The robot.
     name = scenario.robot.title
-    links, loops = robot_links(scenario.robot, scene_graph)
+    links, loops = robot_links(scenario.robot, scene_graph, payloads)
 
     # What it touches or holds.
     constraints = _constraints(scenario.constraints, loops, links)
@@ -156,11 +159,14 @@ def scenario_structure(model: RobotModel) -> Structure:
 
 
 @at("robot.file")
-def add_robot(robot: Robot, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def add_robot(
+    robot: Robot, payloads: Sequence[Payload], plant: MultibodyPlant, scene_graph: SceneGraph
+) -> None:
     """Adds the robot of a scenario to a plant that is not finalized.
 
     Args:
         robot: The robot.
+        payloads: What the scenario has under `plant_payloads`.
         plant: The plant, registered in the scene graph.
         scene_graph: The scene graph.
 
@@ -169,24 +175,27 @@ def add_robot(robot: Robot, plant: MultibodyPlant, scene_graph: SceneGraph) -> N
             says beside it does not fit.
     """
     change_robot(robot, plant, read_into(plant, robot, scene_graph))
+    add_payloads("plant_payloads", payloads, plant)
     cut_loops(plant)
 
 
 @at("robot.file")
 def robot_links(
-    robot: Robot, scene_graph: SceneGraph
+    robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
 ) -> tuple[MultibodyExpressions, list[Constraint]]:
     """The links of a scenario's robot, and the constraints that those joints are which close loops.
 
     Args:
         robot: What the scenario has under `robot`.
         scene_graph: Where its geometry is registered.
+        payloads: What the scenario has under `plant_payloads`, for the links of the plant.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
     plant, efforts = read_robot(robot, scene_graph)
     change_robot(robot, plant, efforts)
+    add_payloads("plant_payloads", payloads, plant)
     cuts = cut_loops(plant)
     finalize(plant)
     for index in plant.GetJointIndices():

@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from drake_dae.arrays import brief, unknown_name
 from drake_dae.dae.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.diagrams.forms import Form, Numbers, Triple
+from drake_dae.diagrams.robot_file.payloads import Payload
 from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import contact, outputs
@@ -139,6 +140,7 @@ class Robot:
             Drake takes that of a ball of water of the same mass; constraints, all those that the
             file has beside its joints, as <equality> of MJCF, which are then written under
             `constraints`.
+        payloads: Masses that it carries, which plant and law have both.
     """
 
     file: str = ""
@@ -151,6 +153,7 @@ class Robot:
         default_factory=list
     )
     description: str = ""
+    payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if bool(self.file) == bool(self.description):

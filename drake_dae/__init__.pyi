@@ -29,6 +29,8 @@ from .dae.references import SpiralReference as SpiralReference
 from .dae.references import TextReference as TextReference
 from .dae.references import WaypointsReference as WaypointsReference
 from .dae.references import references_by_name as references_by_name
+from .dae.sampled import sampled_poles as sampled_poles
+from .dae.sampled import sampling_error as sampling_error
 from .dae.signals import Parameter as Parameter
 from .dae.signals import Signal as Signal
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
@@ -104,8 +106,11 @@ from .simulation.simulate import simulate as simulate
 from .simulation.view import start_meshcat as start_meshcat
 from .symbolic import from_symbolic as from_symbolic
 from .systems.controller import TrackingController as TrackingController
+from .systems.encoders import Encoders as Encoders
+from .systems.encoders import StateSensor as StateSensor
 from .systems.limits import ControlLimits as ControlLimits
 from .systems.plant import DaePlant as DaePlant
+from .systems.pushes import Push as Push
 from .systems.realization import StateRealization as StateRealization
 from .systems.references import ReferenceGenerator as ReferenceGenerator
 from .systems.references import SystemReference as SystemReference

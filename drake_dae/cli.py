@@ -238,7 +238,8 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUES",
         help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
         '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
-        'or "force.seed=1..20:20"; may be repeated',
+        '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
+        '"force.seed=1..20:20"; may be repeated',
     )
     chosen = study.add_mutually_exclusive_group()
     chosen.add_argument(

@@ -60,6 +60,7 @@ PAPER = (
     "integral",
     "tracking",
     "linearization",
+    "sampled",
     "zero_dynamics",
     "extension",
 )

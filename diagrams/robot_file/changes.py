@@ -1,4 +1,4 @@
-"""What a scenario changes about the robot of its file: base, locked joints, actuators."""
+"""What a scenario changes about the robot of its file: base, locked joints, actuators, payloads."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +22,7 @@ from pydrake.multibody.tree import (
 from drake_dae.arrays import unknown_name
 from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.robot_file.efforts import Efforts, limits_of
+from drake_dae.diagrams.robot_file.payloads import add_payloads
 from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario_parts import Base, Robot
 from drake_dae.errors import DrakeDaeError, ModelError
@@ -51,6 +52,7 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
         add_free_joints(robot.free, plant)
         if robot.actuators is not None:
             drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
+        add_payloads("robot.payloads", robot.payloads, plant)
 
 
 def finalize(plant: MultibodyPlant) -> None:

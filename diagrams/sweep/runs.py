@@ -105,6 +105,8 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     own = dict(data)
     for key in ("description", "plant_parameters", "duration", "integrator", "write"):
         own[key] = base[key]
+    if own["plant"].get(TAG) == "!MultibodyPlant":  # It is built with its numbers.
+        own["plant_parameters"] = data["plant_parameters"]
     first, positions = base["start"], own["start"].get("positions", {})
     if positions.keys() == first["positions"].keys():
         positions = first["positions"]
@@ -114,6 +116,8 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
         own["gains"] = base["gains"]
     if "seed" in own["force"]:
         own["force"] = {**own["force"], "seed": 0}
+    if own["encoders"]:
+        own["encoders"] = {**own["encoders"], "seed": 0}
     return own
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import product
 from math import prod
 from typing import Any
@@ -10,7 +11,7 @@ from zlib import crc32
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import brief, check_whole_number, vector
+from drake_dae.arrays import FloatArray, brief, check_whole_number, vector
 from drake_dae.diagrams.scenario import Scenario, read_scenario, scenario_data, varied_data
 from drake_dae.diagrams.typed_yaml import load_yaml
 from drake_dae.errors import ScenarioError
@@ -50,7 +51,8 @@ def random_variations(ranges: Mapping[str, Any], count: int, seed: int = 0) -> l
 
     Args:
         ranges: Dotted key -> a tuple (low, high) for numbers in between, all equally likely; a
-            `range` for its whole numbers; any list for one of its values.
+            `range` for its whole numbers; any list for one of its values. A text "low..high" within
+            such a value, as in [["0.69..0.71", 0.0, 0.0]], is a number in between.
         count: How many runs.
         seed: The seed, from 0.
 
@@ -90,7 +92,7 @@ def parse_variations(
     """The runs that options "KEY=VALUES" of the command line ask for.
 
     VALUES is a list in YAML, one value, LOW..HIGH:COUNT for as many even values, or, where runs are
-    random, LOW..HIGH.
+    random, LOW..HIGH, which may then stand within a value, too.
 
     Args:
         texts: The options.
@@ -124,9 +126,7 @@ def _parse(key: str, text: str, data: Mapping[str, Any], is_random: bool) -> Any
     if not found:
         value = load_yaml(text, key)
         return value if isinstance(value, list) else [value]
-    low, high = (float(found[1]), float(found[2]))
-    if not (np.isfinite([low, high]).all() and low < high):
-        raise _wrong(key, f"{text.strip()} is an empty range; the first number is the lower one")
+    low, high = _ends(key, found)
     if found[3]:
         number = int(found[3])
         if number < 2:
@@ -142,6 +142,15 @@ def _parse(key: str, text: str, data: Mapping[str, Any], is_random: bool) -> Any
         )
     if low.is_integer() and high.is_integer() and _is_whole_number(key, low, high, data):
         return range(int(low), int(high) + 1)
+    return low, high
+
+
+def _ends(key: str, found: re.Match[str]) -> tuple[float, float]:
+    """The ends of an interval."""
+    low, high = (float(found[1]), float(found[2]))
+    if not (np.isfinite([low, high]).all() and low < high):
+        text = found[0].strip()
+        raise _wrong(key, f"{text} is an empty range; the first number is the lower one")
     return low, high
 
 
@@ -179,8 +188,28 @@ def _drawn(key: str, given: Any, count: int, seed: int) -> list[Any]:
         share = random.random(count)
         return (low * (1.0 - share) + high * share).tolist()
     # One number of the generator for each value, so that more runs begin with the same ones.
-    values = given if isinstance(given, range) and len(given) else _values(key, given)
-    return [values[int(len(values) * share)] for share in random.random(count)]
+    if isinstance(given, range) and len(given):
+        return [given[int(len(given) * share)] for share in random.random(count)]
+    values = _values(key, given)
+    chosen = [values[int(len(values) * share)] for share in random.random(count)]
+
+    @cache
+    def shares(path: str) -> FloatArray:
+        return np.random.default_rng([seed, crc32(f"{key}.{path}".encode())]).random(count)
+
+    def filled(value: Any, path: str, run: int) -> Any:
+        if isinstance(value, list):
+            return [filled(entry, f"{path}.{i}", run) for i, entry in enumerate(value)]
+        if isinstance(value, dict):
+            return {name: filled(entry, f"{path}.{name}", run) for name, entry in value.items()}
+        found = _INTERVAL.fullmatch(value) if path and isinstance(value, str) else None
+        if not found or found[3]:
+            return value
+        low, high = _ends(key, found)
+        share = shares(path)[run]
+        return low * (1.0 - share) + high * share
+
+    return [filled(value, "", run) for run, value in enumerate(chosen)]
 
 
 def plain(key: str, value: Any) -> Any:

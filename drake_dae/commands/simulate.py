@@ -230,9 +230,12 @@ def _reasons(scenario: Scenario, record: Record) -> list[str]:
         "the plant has numbers that the law does not know (plant_parameters)": bool(
             scenario.plant_parameters
         ),
+        "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
+        "the plant is pushed, and the law does not know it": bool(scenario.plant_pushes),
         "Drake's own contact gives way": isinstance(scenario.plant, ContactMaterial),
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force.is_measured,
+        "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
     return [reason for reason, holds in reasons.items() if holds]

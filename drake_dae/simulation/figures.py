@@ -11,7 +11,8 @@ from drake_dae.simulation.summary import SLACK, Limits
 def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     """The figures of a run, by names with units such as "largest error of tool.z [m]".
 
-    For each output the largest |z - r| and the last z - r, for each constraint force its least and
+    For each output the largest |z - r|, the last z - r, and the root mean square of z - r over the
+    second half of the time, the "late" error; for each constraint force its least and
     largest value, for each control the largest |u|, then the `margins`, the largest constraint
     residual before a projection, and the time at which the record ends.
 
@@ -26,6 +27,7 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
     for signal, values in _columns(record, "tracking_error"):
         found[_label("largest error of", signal)] = float(np.max(np.abs(values)))
         found[_label("final error of", signal)] = float(values[-1])
+        found[_label("late error of", signal)] = _late_size(record.time, values)
     for signal, values in _columns(record, "constraint_force"):
         found[_label("least", signal)] = float(np.min(values))
         found[_label("largest", signal)] = float(np.max(values))
@@ -42,6 +44,18 @@ def run_figures(record: Record, limits: Limits) -> dict[str, float]:
         "largest residual": float(residual),
         "end [s]": float(record.time[-1]),
     }
+
+
+def _late_size(times: FloatArray, values: FloatArray) -> float:
+    """The root mean square over the second half of values that are straight between their times."""
+    middle = 0.5 * (times[0] + times[-1])
+    late = times > middle
+    if not late.any():
+        return float(abs(values[-1]))
+    found = np.concatenate([[np.interp(middle, times, values)], values[late]])
+    steps = np.diff(np.concatenate([[middle], times[late]]))
+    squares = (found[:-1] ** 2 + found[:-1] * found[1:] + found[1:] ** 2) / 3.0
+    return float(np.sqrt(squares @ steps / steps.sum()))
 
 
 def margins(record: Record, limits: Limits) -> list[tuple[Signal, float]]:

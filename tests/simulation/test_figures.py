@@ -1,6 +1,7 @@
 """The figures of a run, of a record made by hand."""
 
 import numpy as np
+import pytest
 
 from drake_dae import Record, Signal
 from drake_dae.simulation.figures import exceeded, margins, run_figures
@@ -13,7 +14,7 @@ def recorded(names, unit, *columns):
 
 
 RECORD = Record(
-    np.array([0.0, 0.5, 2.0]),
+    np.array([0.0, 0.5, 1.0]),
     {
         "tracking_error": recorded(["z", "f"], "m", [0.1, -0.3, 0.05], [0.0, 1.0, -2.0]),
         "constraint_force": recorded(["wall.force", "weld.fx"], "N", [5, -1, 8], [-3, -4, -5]),
@@ -33,8 +34,10 @@ def test_figures_by_hand():
     assert run_figures(RECORD, LIMITS) == {
         "largest error of z [m]": 0.3,
         "final error of z [m]": 0.05,
+        "late error of z [m]": pytest.approx(np.sqrt((0.3**2 - 0.3 * 0.05 + 0.05**2) / 3)),
         "largest error of f [m]": 2.0,
         "final error of f [m]": -2.0,
+        "late error of f [m]": 1.0,
         "least wall.force [N]": -1.0,
         "largest wall.force [N]": 8.0,
         "least weld.fx [N]": -5.0,
@@ -45,7 +48,7 @@ def test_figures_by_hand():
         "margin of q1 [rad]": -0.5,
         "margin of q2 [rad]": 0.0,
         "largest residual": 3e-9,
-        "end [s]": 2.0,
+        "end [s]": 1.0,
     }
 
 

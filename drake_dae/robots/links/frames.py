@@ -61,7 +61,7 @@ class PlantFrames:
         Raises:
             ModelError: No frame, or more than one, has that name; or it belongs to another plant.
         """
-        found = self._by_name(frame) if isinstance(frame, str) else frame
+        found = frame_named(self._plant, frame) if isinstance(frame, str) else frame
         if found.GetParentPlant() is not self._plant:
             raise ModelError(f"frame '{found.name()}' belongs to another plant")
         return found
@@ -99,20 +99,25 @@ class PlantFrames:
                 )
         return None
 
-    def _by_name(self, name: str) -> Frame:
-        plant = self._plant
-        if name == "world":
-            return plant.world_frame()
-        frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
-        matches = [frame for frame in frames if name in (frame.name(), scoped_name(plant, frame))]
-        if len(matches) == 1:
-            return matches[0]
-        if matches:
-            scoped = ", ".join(scoped_name(plant, frame) for frame in matches)
-            raise ModelError(f"the plant has several frames '{name}'; say which: {scoped}")
-        # Drake's parser adds frames of its own at joints whose axis it has to turn.
-        names = [n for n in unique_names(plant, frames) if not n.endswith(("_parent_F", "_M"))]
-        raise ModelError(unknown_name("frame", name, names))
+
+def frame_named(plant: MultibodyPlant, name: str) -> Frame:
+    """A frame of a plant by its name; "instance::name" if several have that name.
+
+    Raises:
+        ModelError: No frame, or more than one, has that name.
+    """
+    if name == "world":
+        return plant.world_frame()
+    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
+    matches = [frame for frame in frames if name in (frame.name(), scoped_name(plant, frame))]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        scoped = ", ".join(scoped_name(plant, frame) for frame in matches)
+        raise ModelError(f"the plant has several frames '{name}'; say which: {scoped}")
+    # Drake's parser adds frames of its own at joints whose axis it has to turn.
+    names = [n for n in unique_names(plant, frames) if not n.endswith(("_parent_F", "_M"))]
+    raise ModelError(unknown_name("frame", name, names))
 
 
 def position_of(pose: tuple[ca.SX, ca.SX], point: ArrayLike) -> ca.SX:

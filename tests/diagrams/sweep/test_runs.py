@@ -81,6 +81,19 @@ def test_seeds_of_the_sensor():
     assert found[0].figures == found[2].figures != found[1].figures
 
 
+def test_seed_of_encoders_needs_no_loop_of_its_own():
+    base = scenario_data(scenario("two_link_wall", "encoders={position_noise: 1.0e-5, seed: 1}"))
+    keys = {structure_key(varied_data(base, {"encoders.seed": seed}), base) for seed in (1, 2)}
+    assert len(keys) == 1
+
+
+def test_what_drakes_contact_has_otherwise_needs_a_loop_of_its_own():
+    """Its geometry and its masses are built in, and are not in a context."""
+    base = scenario_data(scenario("two_link_wall", "plant=!MultibodyPlant {}"))
+    moved = {"plant_parameters.wall.position": [1.21, 0.0, 0.0]}
+    assert structure_key(varied_data(base, moved), base) != structure_key(base, base)
+
+
 @pytest.mark.slow
 def test_another_structure_is_built():
     base = scenario_data(scenario("two_link_wall", *SHORT))

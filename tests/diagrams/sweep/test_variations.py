@@ -95,6 +95,19 @@ def test_a_random_range_is_whole_where_the_key_is():
     assert max(v["force.seed"] for v in found) <= 9
 
 
+def test_ranges_within_a_value_are_drawn_each_on_its_own():
+    option = "plant_parameters.wall.position=[[1.19..1.21, 0, 0.5..0.6], [1.3, 0, 0]]"
+    found = [v["plant_parameters.wall.position"] for v in parsed(option, count=200, seed=3)]
+    drawn = np.array([value for value in found if value != [1.3, 0, 0]])
+    assert 60 < len(drawn) < 140
+    assert np.all(np.abs(drawn[:, 0] - 1.2) < 0.01)
+    assert np.all(np.abs(drawn[:, 2] - 0.55) < 0.05)
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2])[0, 1]) < 0.5
+    assert found[:50] == [
+        v["plant_parameters.wall.position"] for v in parsed(option, count=50, seed=3)
+    ]
+
+
 @pytest.mark.parametrize(
     ("texts", "options", "words"),
     [
@@ -106,6 +119,7 @@ def test_a_random_range_is_whole_where_the_key_is():
         (["duration=1..1"], {"count": 3}, "duration: 1..1 is an empty range"),
         (["duration=1..2:1"], {}, "at least 2 values"),
         (["duration=1..2"], {}, "1..2:11, or --random COUNT"),
+        (["start.errors=[{tool.z: 2..1}]"], {"count": 3}, "2..1 is an empty range"),
         (["duration=[1"], {}, "duration: line 1"),
         (["duration=1", "duration=2"], {}, "duration: the key varies twice"),
         (["duration=[1, 2]", "force.seed=1"], {"together": True}, "duration has 2, force.seed has"),

@@ -1,0 +1,94 @@
+"""The wire from a plant's state to its law, through encoders."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import RandomSource
+
+from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.errors import ModelError, WiringError
+from drake_dae.simulation.view import RobotBlock
+from drake_dae.systems.encoders import Encoders, StateSensor
+from drake_dae.systems.plant import DaePlant
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredState:
+    """What stands between a plant's state and its law.
+
+    Attributes:
+        sensor: The encoders.
+        noise: The source of their noise, if they have any.
+    """
+
+    sensor: StateSensor
+    noise: RandomSource | None
+
+    @property
+    def output(self) -> OutputPort:
+        """The state that the law gets."""
+        return self.sensor.GetOutputPort("estimated_state")
+
+    def set_seed(self, context: Context, seed: int) -> None:
+        """Chooses the noise.
+
+        Args:
+            context: The context of the diagram around.
+            seed: The seed of the random numbers, below 2^32.
+        """
+        if self.noise is not None:
+            own = self.noise.GetMyMutableContextFromRoot(context)
+            # Other numbers than those of a force sensor with the same seed.
+            self.noise.SetRandomContext(own, RandomGenerator((seed + 2**31) % 2**32))
+
+
+def make_sensor(plant: DaePlant | ContactPlant, encoders: Encoders, period: float) -> StateSensor:
+    """The encoders of a robot; the arguments and errors are those of `add_encoders`."""
+    if not period:
+        raise WiringError(
+            "encoders are read at samples, and this law acts continuously; give it a sampling"
+        )
+    if not isinstance(plant, RobotBlock):
+        raise WiringError(
+            "encoders measure the positions of a robot: a RobotPlant or a ContactPlant"
+        )
+    links = plant.model.links
+    slope = links.velocity_map - ca.SX.eye(links.velocity_map.shape[0])
+    if encoders.velocity_bandwidth is not None and not ca.simplify(slope).is_zero():
+        raise WiringError(
+            "velocities from differences need q' = v, and this robot has a body with q' = N(q) v; "
+            "leave velocity_bandwidth out"
+        )
+    try:
+        return StateSensor(plant.dae.num_states, links.q.numel(), encoders, period)
+    except ModelError as error:
+        raise WiringError(str(error)) from None
+
+
+def add_encoders(
+    builder: DiagramBuilder, plant: DaePlant | ContactPlant, encoders: Encoders, period: float
+) -> MeasuredState:
+    """Adds the encoders of a robot, which measure when its law reads.
+
+    Args:
+        builder: The builder of the diagram, with the plant in it.
+        plant: The robot.
+        encoders: How its state is measured.
+        period: The time between samples in s; 0 for a law that acts continuously.
+
+    Raises:
+        WiringError: The law reads no samples, or this is no robot; or the velocities are no
+            derivatives of the positions, and are to be differences of these.
+    """
+    sensor = make_sensor(plant, encoders, period)
+    builder.AddSystem(sensor)
+    builder.Connect(plant.GetOutputPort("state"), sensor.GetInputPort("state"))
+    noise = None
+    if sensor.HasInputPort("noise"):
+        size = sensor.GetInputPort("noise").size()
+        noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, size, period))
+        noise.set_name("encoder_noise")
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    return MeasuredState(sensor, noise)

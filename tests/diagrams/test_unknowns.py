@@ -1,0 +1,150 @@
+"""What the plant has and its law does not know, against MultibodyPlant and statics by hand."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pydrake.math import RollPitchYaw
+from pydrake.multibody.tree import JacobianWrtVariable
+from runs import run_scenario, scenario
+
+from drake_dae import Push, build_scenario
+from drake_dae.diagrams.scenario_model import scenario_model
+from drake_dae.errors import ModelError, ScenarioError
+
+W = 25.0
+STILL = (
+    "references={tool.z: 0.3, wall.force: 20}",
+    f"gains.all=[-{W}]",
+    "constraint_damping=!Poles {all: [-50.0]}",
+    "start.errors={}",
+    "duration=0.6",
+)
+IDEAL = ("plant=!IdealConstraints {}",)
+CONTACT = ("plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, radius: 1.0e-5}",)
+PLANTS = pytest.mark.parametrize(
+    "plant", [pytest.param(IDEAL, id="ideal"), pytest.param(CONTACT, id="contact")]
+)
+
+
+def two_link(*settings):
+    """The arm that holds still on its wall and presses."""
+    return scenario("two_link_wall", *STILL, *settings)
+
+
+def statics():
+    """M, and the rows of the tool's Jacobian in x and z, by MultibodyPlant where it stands."""
+    loop, context = build_scenario(two_link())
+    plant = loop.plant.model.links.plant
+    own = plant.CreateDefaultContext()
+    plant.SetPositionsAndVelocities(own, loop.plant.state(loop.plant.GetMyContextFromRoot(context)))
+    world, tool = plant.world_frame(), plant.GetFrameByName("tool")
+    jacobian = plant.CalcJacobianTranslationalVelocity(
+        own, JacobianWrtVariable.kV, tool, [0, 0, 0], world, world
+    )
+    return plant.CalcMassMatrix(own), jacobian[[0]], jacobian[[2]]
+
+
+def left_behind(force):
+    """e = A_h F / w^2 where F acts on the tool, and what the constraint takes of it is gone."""
+    mass, normal, along = statics()
+    inverse = np.linalg.inv(mass)
+    held = normal.T @ np.linalg.solve(normal @ inverse @ normal.T, normal @ inverse)
+    free = along @ inverse @ (np.eye(2) - held)
+    return (free @ np.vstack([normal, along]).T @ force).item() / W**2
+
+
+@PLANTS
+def test_push_leaves_the_error_of_statics(plant):
+    """A push of 5 N up the wall; second order in the error, 4e-3 m beside a metre, is left out.
+
+    It is smooth over 10 ms, and 0.5 s later the poles at -25 1/s have left 5e-5 of it.
+    """
+    push = "plant_pushes=[{frame: tool, force: [0, 0, 5], start_time: 0.1}]"
+    _, _, record = run_scenario(two_link(push, *plant))
+    expected = left_behind([0.0, 5.0])
+    assert 1e-3 < expected < 2e-2
+    assert_allclose(record["tracking_error"][-1, 0], expected, rtol=2e-2)
+
+
+@PLANTS
+def test_payload_that_nobody_knows_pulls_with_its_weight(plant):
+    payload = "plant_payloads=[{frame: tool, mass: 0.5}]"
+    _, _, record = run_scenario(two_link(payload, *plant))
+    # Its inertia adds 0.5 J^T J to M, which changes A_h in the plant; at rest the law's counts.
+    assert_allclose(record["tracking_error"][-1, 0], left_behind([0.0, -0.5 * 9.81]), rtol=2e-2)
+
+
+def test_payload_that_is_known_is_no_error():
+    """The law of `robot.payloads` has them: what is left is the accuracy of the integrator."""
+    found = two_link("robot.payloads=[{frame: tool, mass: 0.5}]")
+    _, _, record = run_scenario(found)
+    assert np.abs(record["tracking_error"][:, 0]).max() < 1e-8
+    mass, normal, along = statics()
+    expected = mass + 0.5 * np.vstack([normal, along]).T @ np.vstack([normal, along])
+    dae = scenario_model(found).dae
+    matrix = dae.trace("mass", {"mass": dae.mass_matrix})
+    inertia = np.array(matrix(record["state"][0], dae.parameter_values)[0])
+    assert_allclose(inertia.reshape(4, 4)[2:, 2:], expected, rtol=1e-7)
+
+
+def test_contact_has_the_masses_of_its_own():
+    settings = "plant_parameters={link1.mass: 11.0}", "plant_payloads=[{frame: tool, mass: 0.5}]"
+    totals = []
+    for more in ((), settings):
+        loop, context = build_scenario(two_link(*CONTACT, *more))
+        own = loop.plant.GetSubsystemContext(
+            loop.plant.multibody, loop.plant.GetMyContextFromRoot(context)
+        )
+        totals.append(loop.plant.multibody.CalcTotalMass(own))
+    nominal = loop.plant.dae.parameter_values[loop.plant.dae.parameter_slice("link1.mass")]
+    assert_allclose(totals[1] - totals[0], 0.5 + 11.0 - nominal.item(), atol=1e-12)
+
+
+def test_surface_may_be_tilted():
+    """The force is along the normal that is turned, where nothing rubs."""
+    turned = [0.0, 0.05, 0.0]
+    found = two_link(
+        *CONTACT,
+        "constraints.0.rpy=[0.0, 0.0, 0.0]",
+        f"plant_parameters={{wall.rpy: {turned}}}",
+        "duration=0.3",
+    )
+    _, _, record = run_scenario(found)
+    force = record["contact_force"][-1]
+    normal = RollPitchYaw(turned).ToRotationMatrix() @ [-1.0, 0.0, 0.0]
+    assert_allclose(force / np.linalg.norm(force), normal, atol=1e-9)
+
+
+def test_push_grows_and_fades_smoothly():
+    push = Push("tool", (0.0, 0.0, 10.0), 1.0, 2.0, 0.2)
+    rows = push.reference.derivatives([0, 0, 0])
+    for time, share in ((0.0, 0.0), (1.05, 3 / 16 - 2 / 64), (1.1, 0.5), (1.5, 1.0), (2.1, 0.5)):
+        assert_allclose(rows(time), [0.0, 0.0, 10.0 * share], atol=1e-12)
+    assert rows(9.0)[2] == 0.0
+    assert Push("tool", (1.0, 0.0, 0.0)).reference.derivatives([0, 0, 0])(1e6)[0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ("plant_pushes=[{frame: tol, force: [0, 0, 1]}]", "plant_pushes.0: no frame 'tol'.*'tool'"),
+        (
+            "plant_payloads=[{frame: tol, mass: 1}]",
+            "plant_payloads.0: no frame 'tol'.*'tool'",
+        ),
+        ("plant_payloads=[{frame: tool, mass: 0}]", "mass of a payload must be positive"),
+        (
+            "plant_payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]",
+            "plant_payloads.1: a payload needs a name of its own",
+        ),
+        ("plant_parameters={wall.rpy: [0, 0, 0]}", "no parameter 'wall.rpy'"),
+    ],
+)
+def test_what_is_not_there_is_refused(settings, message):
+    with pytest.raises(ScenarioError, match=message):
+        build_scenario(two_link(settings, *CONTACT))
+
+
+def test_push_that_ends_before_it_begins_is_refused():
+    with pytest.raises(ModelError, match="must end after it begins"):
+        Push("tool", (1.0, 0.0, 0.0), 2.0, 1.0)
