@@ -32,7 +32,8 @@ def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Pa
         assert outcome.kind == RESULT, outcome
 
 
-@pytest.mark.parametrize("seed", each(range(10), range(10, 30)))
+# In drop 46 a corner dips into the floor and comes out again, nearly within one step.
+@pytest.mark.parametrize("seed", each((*range(9), 46), range(9, 30)))
 def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path: Path):
     outcome = drops.attempt(seed, tmp_path, duration=0.5)
     assert outcome.kind == RESULT, outcome

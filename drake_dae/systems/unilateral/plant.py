@@ -1,7 +1,6 @@
 """A RobotModel whose contacts open and close, as a LeafSystem."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -28,27 +27,10 @@ from drake_dae.systems.failures import off_manifold
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.unilateral.events import ContactChange, ContactEvent
 from drake_dae.systems.unilateral.graph import ContactGraph
+from drake_dae.systems.unilateral.log import Log, clearance
 from drake_dae.systems.unilateral.modes import Closed, closed_of, numbers_of
 from drake_dae.systems.unilateral.ports import ModalPorts
 from drake_dae.systems.unilateral.resets import TOUCHING, Resets
-
-MARGIN = 1e-13
-"""How far below zero, in m/s, the rate of a contact that begins to leave is still round-off."""
-
-
-@dataclass
-class Log:
-    """What is known of one run, in one context.
-
-    Attributes:
-        events: What happened to contacts.
-        time: When the step began that is being made, in s.
-        before: Time and state before the last reset.
-    """
-
-    events: list[ContactEvent] = field(default_factory=list)
-    time: float = np.nan
-    before: tuple[float, bytes] = (np.nan, b"")
 
 
 @checked(ModelError)
@@ -187,10 +169,10 @@ class UnilateralRobotPlant(ModalPorts):
         closed = context.get_discrete_state_vector().value() > 0.5
         margins = np.zeros(closed.size)
         if not closed.all():
-            # A contact that leaves has a gap of round-off, whatever its sign.
             state = context.get_continuous_state_vector().value()
             gaps, rates = self._checked(self._contacts.gaps, context, state)
-            margins[:] = np.maximum(gaps, rates + MARGIN)
+            log = self._log(context)
+            margins[:] = clearance(log, context.get_time(), gaps, rates)
         if closed.any():
             force = self._shown_force(context)
             margins[closed] = force[self._contacts.normals][closed]
@@ -244,7 +226,13 @@ class UnilateralRobotPlant(ModalPorts):
         except InconsistentStateError as error:
             raise off_manifold(context.get_time(), x, error) from error
         state.get_mutable_continuous_state().SetFromVector(x)
+        self._begin_step(context, x, values)
         return EventStatus.Succeeded()
+
+    def _begin_step(self, context: Context, state: FloatArray, values: FloatArray) -> None:
+        """Notes where a step begins."""
+        log = self._log(context)
+        log.gaps, log.rates = (v.copy() for v in self._contacts.gaps.evaluate(state, values))
 
     def _reset(self, context: Context, state: State) -> EventStatus:
         closed: Closed = closed_of(context.get_discrete_state_vector().value())
@@ -261,6 +249,7 @@ class UnilateralRobotPlant(ModalPorts):
             log.events += after.events
         state.get_mutable_continuous_state().SetFromVector(after.state)
         state.get_mutable_discrete_state().set_value(numbers_of(after.closed))
+        self._begin_step(context, after.state, values)
         return EventStatus.Succeeded()
 
 
