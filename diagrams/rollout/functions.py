@@ -242,11 +242,12 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
 
     Raises:
         ModelError: A reference is no expression of time, or the loop has what no rollout has:
-            Drake's own contact, or a sampled law.
+            Drake's own contact, a sampled law, or exogenous signals of the plant alone.
     """
     plant, law = loop.plant, loop.controller.law
     unknown = "Drake's own contact" if not isinstance(plant, DaePlant) else ""
     unknown = unknown or ("a sampled law" if loop.diagram.HasSubsystemNamed(HOLD) else "")
+    unknown = unknown or ("pushes that the law does not know" if loop.moves_otherwise else "")
     if unknown or not isinstance(plant, DaePlant):
         raise ModelError(f"a rollout does not know {unknown}; run the loop by simulate")
     dae, structure = plant.dae, plant.structure
