@@ -247,6 +247,8 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
     plant, law = loop.plant, loop.controller.law
     unknown = "Drake's own contact" if not isinstance(plant, DaePlant) else ""
     unknown = unknown or ("a sampled law" if loop.diagram.HasSubsystemNamed(HOLD) else "")
+    watched = loop.diagram.HasSubsystemNamed("tolerance_watch")
+    unknown = unknown or ("tolerances" if watched else "")
     unknown = unknown or ("pushes that the law does not know" if loop.moves_otherwise else "")
     if unknown or not isinstance(plant, DaePlant):
         raise ModelError(f"a rollout does not know {unknown}; run the loop by simulate")
