@@ -184,6 +184,9 @@ def wire_loop(
         with at("encoders"):
             period = scenario.sampling.period if scenario.sampling else plant.time_step
             make_sensor(plant, scenario.encoders, period)
+    if scenario.tolerances is not None:
+        with at("tolerances"):
+            scenario.tolerances.places(model.dae.output_signals)
     with at("force" if force.is_measured else "start.positions"):
         return make_closed_loop(
             plant,
@@ -195,6 +198,7 @@ def wire_loop(
             sampling=scenario.sampling,
             encoders=scenario.encoders,
             control_limits=limits,
+            tolerances=scenario.tolerances,
             scene_graph=scene_graph,
             meshcat=meshcat,
             start_time=scenario.integrator.start_time,

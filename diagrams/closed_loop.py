@@ -28,7 +28,13 @@ from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.diagrams.unilateral import with_events
-from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
+from drake_dae.diagrams.wiring import (
+    add_block,
+    add_drives,
+    add_exogenous,
+    add_watch,
+    check_sizes,
+)
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import RobotBlock, add_live_view
@@ -39,6 +45,7 @@ from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.tolerances import Tolerances
 from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 
@@ -80,6 +87,13 @@ class ClosedLoop:
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.signals)})"
+
+    @property
+    def moves_otherwise(self) -> bool:
+        """Whether the plant has other exogenous signals than its law knows."""
+        pair = (self.exogenous, self.plant_exogenous)
+        known, own = ([id(one) for one in each.references] if each else [] for each in pair)
+        return known != own
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Chooses the noise of the sensor; without a call it is the same in every run.
@@ -248,6 +262,7 @@ def make_closed_loop(
     sampling: Sampling | None = None,
     encoders: Encoders | None = None,
     control_limits: ArrayLike | None = None,
+    tolerances: Tolerances | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     start_time: float = 0.0,
@@ -276,6 +291,7 @@ def make_closed_loop(
         control_limits: The largest |u| that the drives give, shape (p,), such as
             `model.control_limits`; the signal "excess" of the record tells what was cut off, and
             when. Integrals stand still meanwhile. None for drives without limits.
+        tolerances: How large errors may be, or a run ends with an exception that tells it.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
             its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
@@ -283,7 +299,8 @@ def make_closed_loop(
             integrator's steps. None draws nothing; `make_animation` needs none.
         start_time: When a run begins, in s: the zero dynamics are judged at the references then.
 
-    A loop that draws, samples and limits nothing converts to AutoDiffXd, for Drake's Linearize.
+    A loop that draws, samples, limits and watches nothing converts to AutoDiffXd, for Drake's
+    Linearize.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
@@ -368,6 +385,8 @@ def make_closed_loop(
     if law.measured_force and sensor is not None:
         port = sensor.GetOutputPort("measured_force")
         named["measured_force"] = (port, dae.constraint_input_signals)
+    if tolerances is not None:
+        add_watch(builder, plant, reference, law, tolerances)
     if isinstance(plant, RobotBlock) and plant.model.loop_joints.signals:
         named["loop_state"] = (plant.GetOutputPort("loop_state"), plant.model.loop_joints.signals)
     if isinstance(plant, UnilateralRobotPlant):

@@ -55,7 +55,12 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         return Feasibility(analyze(model.dae), scenario.duration)
     # The law's model alone, without what it does not know of the plant.
     ideal = replace(
-        scenario, plant=IdealConstraints(), plant_payloads=[], plant_pushes=[], encoders=None
+        scenario,
+        plant=IdealConstraints(),
+        plant_payloads=[],
+        plant_pushes=[],
+        encoders=None,
+        tolerances=None,
     )
     loop, context = wire_scenario(ideal, model, structure)
     reference, begin = loop.reference.reference, scenario.integrator.start_time

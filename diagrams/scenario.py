@@ -28,7 +28,7 @@ from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems import encoders, pushes, sampling
+from drake_dae.systems import encoders, pushes, sampling, tolerances
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -109,6 +109,7 @@ Plant = Annotated[
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
+Tolerances = Annotated[tolerances.Tolerances, Form()]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
@@ -181,6 +182,7 @@ class Scenario:
         encoders: How positions and velocities are measured for the law, with `sampling`; left out,
             it gets them as they are.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
+        tolerances: How large errors may be; a run that leaves them ends there, with the reason.
         references: Name -> reference, where a number is a constant. A name is that of an output,
             tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
             "tool.y, elbow". Outputs that complete others may be without; they hold what they start
@@ -215,6 +217,7 @@ class Scenario:
     sampling: Sampling | None = None
     encoders: Encoders | None = None
     saturation: bool = False
+    tolerances: Tolerances | None = None
     references: dict[str, Reference] = field(kw_only=True)
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0

@@ -10,7 +10,8 @@ from pydrake.systems.primitives import MatrixGain
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.errors import WiringError
+from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.limits import ControlLimits
@@ -18,6 +19,7 @@ from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.sampling import ControlHold, Sampling
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.tolerances import Tolerances, ToleranceWatch
 
 Block = TypeVar("Block", DaePlant, ForceSensor)
 
@@ -103,3 +105,32 @@ def add_drives(
             builder.Connect(limits.GetOutputPort("is_limited"), hold.get_input_port())
             builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
     return control, limits
+
+
+def add_watch(
+    builder: DiagramBuilder,
+    plant: DaePlant | ContactPlant,
+    reference: ReferenceGenerator,
+    law: TrackingLaw,
+    tolerances: Tolerances,
+) -> None:
+    """Adds what ends a run whose errors are too large.
+
+    Raises:
+        WiringError: There is no such output.
+    """
+    dae = plant.dae
+    sizes = law.layout.reference_size, dae.num_states
+    # Of a continuous plant often enough for what is recent.
+    period = plant.time_step or tolerances.window / 20.0
+    lowest = law.layout.lowest
+    try:
+        made = ToleranceWatch(
+            tolerances, dae.output_signals, dae.force_signals, lowest, sizes, period
+        )
+    except ModelError as error:
+        raise WiringError(str(error)) from None
+    watch = builder.AddSystem(made)
+    builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
+    for name in ("controlled_output", "constraint_force", "state"):
+        builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))

@@ -119,6 +119,7 @@ from .systems.robot_plant import RobotPlant as RobotPlant
 from .systems.sampling import ControlHold as ControlHold
 from .systems.sampling import Sampling as Sampling
 from .systems.sensors import ForceSensor as ForceSensor
+from .systems.tolerances import Tolerances as Tolerances
 from .systems.unilateral.events import ContactChange as ContactChange
 from .systems.unilateral.events import ContactEvent as ContactEvent
 from .systems.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant

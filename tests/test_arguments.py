@@ -154,6 +154,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.FeedbackGains: lambda: law("two_link").gains,
     dd.ForceSensor: lambda: dd.ForceSensor(1, 0.1),
     dd.Sampling: lambda: dd.Sampling(0.01),
+    dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.LinkExpressions: textbook,
     dd.NormalForm: normal_form,

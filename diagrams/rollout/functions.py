@@ -242,12 +242,16 @@ def loop_functions(loop: ClosedLoop) -> LoopFunctions:
 
     Raises:
         ModelError: A reference is no expression of time, or the loop has what no rollout has:
-            Drake's own contact, contacts that open and close, or a sampled law.
+            Drake's own contact, contacts that open and close, a sampled law, or exogenous signals
+            of the plant alone.
     """
     plant, law = loop.plant, loop.controller.law
     unknown = "Drake's own contact, and no contacts that open"
     unknown = "" if isinstance(plant, DaePlant) else unknown
     unknown = unknown or ("a sampled law" if loop.diagram.HasSubsystemNamed(HOLD) else "")
+    watched = loop.diagram.HasSubsystemNamed("tolerance_watch")
+    unknown = unknown or ("tolerances" if watched else "")
+    unknown = unknown or ("pushes that the law does not know" if loop.moves_otherwise else "")
     if unknown or not isinstance(plant, DaePlant):
         raise ModelError(f"a rollout does not know {unknown}; run the loop by simulate")
     dae, structure = plant.dae, plant.structure

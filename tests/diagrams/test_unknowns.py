@@ -7,7 +7,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
-from drake_dae import Push, build_scenario
+from drake_dae import Push, build_scenario, rollout, start_values
 from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ModelError, ScenarioError
 
@@ -143,6 +143,19 @@ def test_push_grows_and_fades_smoothly():
 def test_what_is_not_there_is_refused(settings, message):
     with pytest.raises(ScenarioError, match=message):
         build_scenario(two_link(settings, *CONTACT))
+
+
+def test_rollouts_know_payloads_and_refuse_pushes():
+    """An accuracy of 1e-6 a step, of which some hundred go to round-off or to the poles."""
+    settings = "plant_payloads=[{frame: tool, mass: 0.5}]", "duration=0.2"
+    loop, context = build_scenario(two_link(*settings))
+    found = rollout(loop, *start_values(loop, context), [0.0, 0.1, 0.2])[0].record
+    _, _, record = run_scenario(two_link(*settings))
+    assert_allclose(found["state"][-1], record["state"][-1], atol=1e-6)
+    pushed = two_link("plant_pushes=[{frame: tool, force: [0, 0, 1]}]")
+    loop, context = build_scenario(pushed)
+    with pytest.raises(ModelError, match="pushes that the law does not know"):
+        rollout(loop, *start_values(loop, context), [0.0, 0.1])
 
 
 def test_push_that_ends_before_it_begins_is_refused():
