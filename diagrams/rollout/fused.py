@@ -242,25 +242,19 @@ class Fused:
         return ca.Function("between", symbols, [ca.horzcat(*parts)])
 
     def _project_function(self) -> ca.Function:
-        """(t, state, the plant's parameters) -> the state after two Newton steps, and the last."""
+        """(t, state, the plant's parameters) -> the state on N*, as `projection` has it."""
         functions, loop = self.functions, self.functions.loop
-        dae = loop.plant.dae
         sizes = [1, functions.size, functions.plant.sizes[-1]]
         symbols = [ca.SX.sym("x", size) for size in sizes]
         time, state, plant = symbols
-        x, left = state[: dae.num_states], ca.SX(0.0)
+        x, left = state[: loop.plant.dae.num_states], ca.SX(0.0)
         if loop.plant.projects:
-            moving, own = functions.signals.function(time)[1], plant
+            own = ca.SX(plant)
             if loop.exogenous is not None:
-                own = ca.SX(plant)
-                own[loop.plant.exogenous_places] = moving
-            at = x
-            for _ in range(2):
-                change = functions.newton.function(x, at, own)[0]
-                x, left = x + ca.DM(dae.scale) * change, ca.norm_2(change)
-        # Gradients of both steps are those at the start: they are computed once.
-        values = ca.cse([ca.densify(ca.vertcat(x, state[dae.num_states :])), ca.densify(left)])
-        return ca.Function("projection", symbols, values, {"cse": False})
+                own[loop.plant.exogenous_places] = functions.signals.function(time)[1]
+            x, left = functions.projection(x, own)
+        found = ca.densify(ca.vertcat(x, state[loop.plant.dae.num_states :]))
+        return ca.Function("projection", symbols, [found, ca.densify(left)], {"cse": False})
 
 
 def _weighted(weights: FloatArray, rates: Sequence[ca.MX]) -> ca.MX:
