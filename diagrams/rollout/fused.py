@@ -55,7 +55,7 @@ class Fused:
     Attributes:
         functions: The closed loop.
         controlled: A step of DOP853, as `controlled_step` has it.
-        between: What lies between its ends, as `interpolant` has it.
+        rates: The derivative of the state at many moments, and what `rate` has with it.
     """
 
     def __init__(self, functions: LoopFunctions) -> None:
@@ -86,13 +86,13 @@ class Fused:
         valid += checks[-1] + of_rest[-1]
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
         row = ca.vertcat(row, state[size - functions.num_integrals :], excess)
-        self._rows = Many(ca.Function("rows", inputs, [row, valid], options))
+        self._rows = Many(ca.Function("rows", inputs, ca.cse([row, valid]), options))
         self._projection = self._project_function()
         self._projections = Many(self._projection)
         self._steps: dict[bytes, tuple[Called, Called]] = {}
         self._called = Called(self._rate)
         self.controlled = Called(self._controlled_step())
-        self.between = Called(self._interpolant())
+        self.rates = Many(self._rate)
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
         """The derivative of the state, a fresh array; nan where it has no value."""
@@ -216,30 +216,6 @@ class Fused:
         checks = ca.vertcat(*errors, finite, left, valid)
         symbols = [*symbols, first, step, absolute, relative]
         return ca.Function("controlled", symbols, [found, last, checks, ca.horzcat(*rates)])
-
-    def _interpolant(self) -> ca.Function:
-        """What lies between the ends of a step of DOP853.
-
-        A function of what all functions take, of the step, its stages, the state that it reached
-        and the rate there. It returns the coefficients of the interpolant side by side.
-        """
-        symbols = time, state, hold, plant, law = self._symbols()
-        size, step = self._sizes[1], ca.MX.sym("step")
-        stages = ca.MX.sym("stages", size, len(DOP853.B))
-        reached, last = ca.MX.sym("reached", size), ca.MX.sym("last", size)
-        rates = [*ca.horzsplit(stages), last]
-        for row, part in zip(DOP853.A_EXTRA, DOP853.C_EXTRA, strict=True):
-            stage = state + step * _weighted(row, rates)
-            rates.append(self._rate(time + part * step, stage, hold, plant, law)[0])
-        change = reached - state
-        parts = [
-            change,
-            step * rates[0] - change,
-            2.0 * change - step * (last + rates[0]),
-            *(step * _weighted(row, rates) for row in DOP853.D),
-        ]
-        symbols = [*symbols, step, stages, reached, last]
-        return ca.Function("between", symbols, [ca.horzcat(*parts)])
 
     def _project_function(self) -> ca.Function:
         """(t, state, the plant's parameters) -> the state on N*, as `projection` has it."""
