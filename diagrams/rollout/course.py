@@ -7,7 +7,9 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.rollout.dense import Span, fill
 from drake_dae.diagrams.rollout.fused import Fused
+from drake_dae.diagrams.rollout.many import BLOCK
 from drake_dae.diagrams.rollout.run import Ending, Problem, Run
 from drake_dae.errors import InconsistentStateError
 from drake_dae.systems.trials import SLOWEST, STEPS
@@ -76,6 +78,7 @@ class Course:
     state: FloatArray
     hold: FloatArray
     rows: list[Rows] = field(default_factory=list)
+    spans: list[Span] = field(default_factory=list)
     event: int = 0
     steps: int = 0
     before: float = 0.0
@@ -152,23 +155,28 @@ class Course:
         self.rows.append(Rows(np.array([time]), state[None], self.hold, False))
 
     def write_between(self, step: "Step", times: FloatArray) -> None:
-        """Keeps rows that lie within a step, from its interpolant."""
-        problem = self.problem
-        start = self.time, self.state, self.hold, problem.plant, problem.law
-        (parts,) = self.fused.between(*start, step.size, step.stages, step.reached, step.rate)
-        share = ((times - self.time) / step.size)[:, None]
-        values = np.zeros((times.size, self.state.size))
-        for j in reversed(range(len(parts))):
-            values = (values + parts[j]) * (1.0 - share if j % 2 else share)
-        self.rows.append(Rows(times, values + self.state, self.hold, True))
+        """Keeps rows that lie within a step, for its interpolant to be computed with others."""
+        found = np.zeros((times.size, self.state.size))
+        rates = np.concatenate([step.stages, step.rate[None]])
+        ends = self.time, step.size, self.state, step.reached
+        self.spans.append(Span(*ends, rates, self.hold, times, found))
+        self.rows.append(Rows(times, found, self.hold, True))
+        if len(self.spans) == BLOCK:
+            self.fill()
+
+    def fill(self) -> None:
+        """Computes the rows within steps."""
+        fill(self.spans, self.fused.rates, self.problem.plant, self.problem.law)
+        self.spans.clear()
 
     def boundary(self) -> float:
         """The next time at which a sample changes what is held, or the last one."""
-        end, events = self.problem.times[-1], self.problem.events[self.event :]
-        return float(min(end, events[0])) if events.size else float(end)
+        end, events = float(self.problem.times[-1]), self.problem.events
+        return min(end, float(events[self.event])) if self.event < events.size else end
 
     def finish(self, ending: Ending) -> Run:
         """What the run came to."""
+        self.fill()
         counts = [len(rows.times) for rows in self.rows]
         times = np.concatenate([rows.times for rows in self.rows])
         states = np.concatenate([rows.states for rows in self.rows])

@@ -45,10 +45,22 @@ class LoopFunctions:
         """The law: (x, R, measured forces if it takes them, parameters) -> u, and the error."""
         return self.loop.controller.law.function
 
-    @property
-    def newton(self) -> TracedFunction:
-        """The Newton step to N*, in states over their scale."""
-        return self.loop.plant.structure.manifold.newton_step
+    @cached_property
+    def projection(self) -> ca.Function:
+        """(x, the plant's parameters) -> x after two Newton steps to N*, and how long the last was.
+
+        Its length is that in states over their scale. Gradients of both are those at the start.
+        """
+        dae, newton = self.loop.plant.dae, self.loop.plant.structure.manifold.newton_step.function
+        sizes = {"x": dae.num_states, "plant": self.plant.sizes[-1]}
+        inputs = [ca.SX.sym(name, size) for name, size in sizes.items()]
+        start, plant = inputs
+        x, left = start, ca.SX(0.0)
+        for _ in range(2):
+            change = newton(x, start, plant)[0]
+            x, left = x + ca.DM(dae.scale) * change, ca.norm_2(change)
+        values = ca.cse([ca.densify(x), ca.densify(left)])
+        return ca.Function("projection", inputs, values, {"cse": False})
 
     @cached_property
     def motion(self) -> ca.Function:
@@ -137,18 +149,12 @@ class LoopFunctions:
             law[places] = plant[places]
         return law[: plant.numel()], law
 
-    @cached_property
-    def residual(self) -> TracedFunction:
-        """What is zero on N*, as a function of state and parameters."""
-        manifold = self.loop.plant.structure.manifold
-        return manifold.system.trace("manifold", {"residual": manifold.residual_expression})
-
     @property
     def is_direct(self) -> bool:
         """Whether the law reads the constraint force without a sensor."""
         return bool(self.loop.controller.law.measured_force) and self.loop.sensor is None
 
-    @property
+    @cached_property
     def num_lags(self) -> int:
         """How many states the sensor has."""
         sensor = self.loop.sensor
@@ -163,12 +169,12 @@ class LoopFunctions:
         found: FloatArray = diagram.GetSubsystemByName(LIMITS).limits
         return found
 
-    @property
+    @cached_property
     def num_integrals(self) -> int:
         """How many errors the law integrates."""
         return len(self.loop.controller.law.integral.outputs)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many states there are: those of the plant, of the sensor, and of the law."""
         return self.loop.plant.dae.num_states + self.num_lags + self.num_integrals
@@ -214,13 +220,12 @@ class LoopFunctions:
     @property
     def num_operations(self) -> int:
         """How many operations all functions have together."""
-        traced = (self.signals, self.rest, self.residual, self.newton)
-        own = [self.motion] if self.rate is self.motion else [self.motion, self.rate]
-        return sum(function.num_operations for function in traced) + sum(
-            int(function.n_instructions()) for function in own
-        )
+        own = [self.signals.function, self.motion, self.rest.function, self.projection]
+        if self.rate is not self.motion:
+            own.append(self.rate)
+        return sum(int(function.n_instructions()) for function in own)
 
-    @property
+    @cached_property
     def columns(self) -> dict[str, Sequence[Signal]]:
         """The columns of a row of the record: name -> names and units."""
         loop, dae = self.loop, self.loop.plant.dae

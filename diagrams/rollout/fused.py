@@ -55,7 +55,7 @@ class Fused:
     Attributes:
         functions: The closed loop.
         controlled: A step of DOP853, as `controlled_step` has it.
-        between: What lies between its ends, as `interpolant` has it.
+        rates: The derivative of the state at many moments, and what `rate` has with it.
     """
 
     def __init__(self, functions: LoopFunctions) -> None:
@@ -86,13 +86,13 @@ class Fused:
         valid += checks[-1] + of_rest[-1]
         row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
         row = ca.vertcat(row, state[size - functions.num_integrals :], excess)
-        self._rows = Many(ca.Function("rows", inputs, [row, valid], options))
+        self._rows = Many(ca.Function("rows", inputs, ca.cse([row, valid]), options))
         self._projection = self._project_function()
         self._projections = Many(self._projection)
         self._steps: dict[bytes, tuple[Called, Called]] = {}
         self._called = Called(self._rate)
         self.controlled = Called(self._controlled_step())
-        self.between = Called(self._interpolant())
+        self.rates = Many(self._rate)
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
         """The derivative of the state, a fresh array; nan where it has no value."""
@@ -217,50 +217,20 @@ class Fused:
         symbols = [*symbols, first, step, absolute, relative]
         return ca.Function("controlled", symbols, [found, last, checks, ca.horzcat(*rates)])
 
-    def _interpolant(self) -> ca.Function:
-        """What lies between the ends of a step of DOP853.
-
-        A function of what all functions take, of the step, its stages, the state that it reached
-        and the rate there. It returns the coefficients of the interpolant side by side.
-        """
-        symbols = time, state, hold, plant, law = self._symbols()
-        size, step = self._sizes[1], ca.MX.sym("step")
-        stages = ca.MX.sym("stages", size, len(DOP853.B))
-        reached, last = ca.MX.sym("reached", size), ca.MX.sym("last", size)
-        rates = [*ca.horzsplit(stages), last]
-        for row, part in zip(DOP853.A_EXTRA, DOP853.C_EXTRA, strict=True):
-            stage = state + step * _weighted(row, rates)
-            rates.append(self._rate(time + part * step, stage, hold, plant, law)[0])
-        change = reached - state
-        parts = [
-            change,
-            step * rates[0] - change,
-            2.0 * change - step * (last + rates[0]),
-            *(step * _weighted(row, rates) for row in DOP853.D),
-        ]
-        symbols = [*symbols, step, stages, reached, last]
-        return ca.Function("between", symbols, [ca.horzcat(*parts)])
-
     def _project_function(self) -> ca.Function:
-        """(t, state, the plant's parameters) -> the state after two Newton steps, and the last."""
+        """(t, state, the plant's parameters) -> the state on N*, as `projection` has it."""
         functions, loop = self.functions, self.functions.loop
-        dae = loop.plant.dae
         sizes = [1, functions.size, functions.plant.sizes[-1]]
         symbols = [ca.SX.sym("x", size) for size in sizes]
         time, state, plant = symbols
-        x, left = state[: dae.num_states], ca.SX(0.0)
+        x, left = state[: loop.plant.dae.num_states], ca.SX(0.0)
         if loop.plant.projects:
-            moving, own = functions.signals.function(time)[1], plant
+            own = ca.SX(plant)
             if loop.exogenous is not None:
-                own = ca.SX(plant)
-                own[loop.plant.exogenous_places] = moving
-            at = x
-            for _ in range(2):
-                change = functions.newton.function(x, at, own)[0]
-                x, left = x + ca.DM(dae.scale) * change, ca.norm_2(change)
-        # Gradients of both steps are those at the start: they are computed once.
-        values = ca.cse([ca.densify(ca.vertcat(x, state[dae.num_states :])), ca.densify(left)])
-        return ca.Function("projection", symbols, values, {"cse": False})
+                own[loop.plant.exogenous_places] = functions.signals.function(time)[1]
+            x, left = functions.projection(x, own)
+        found = ca.densify(ca.vertcat(x, state[loop.plant.dae.num_states :]))
+        return ca.Function("projection", symbols, [found, ca.densify(left)], {"cse": False})
 
 
 def _weighted(weights: FloatArray, rates: Sequence[ca.MX]) -> ca.MX:

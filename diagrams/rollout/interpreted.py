@@ -1,5 +1,6 @@
 """A closed loop stepped without a compiler: a step, or many, are one call of CasADi."""
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from math import isfinite, sqrt
 
@@ -48,9 +49,10 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
 def _control(course: Course, settings: Settings) -> None:
     """Error control by DOP853 as in stepper.c; rows between steps from its interpolant, on N*."""
     times, row, tried = course.problem.times, 1, 0.0
+    moments = times.tolist()
     rate: FloatArray | None = None
     course.write(course.time, course.state)
-    while course.time < times[-1]:
+    while course.time < moments[-1]:
         if course.update(is_on=rate is not None):
             rate = None
         if rate is None:
@@ -58,13 +60,13 @@ def _control(course: Course, settings: Settings) -> None:
         limit = course.boundary()
         tried = tried or _first_step(course, rate, settings)
         step = _controlled(course, settings, rate, min(tried, settings.longest), limit)
-        stop = min(int(np.searchsorted(times, step.end)), times.size - 1)
+        stop = min(bisect_left(moments, step.end, row), times.size - 1)
         if row < stop:
             course.write_between(step, times[row:stop])
         row = stop
         course.accept(step.end, step.reached)
         rate = step.rate if step.is_on else None
-        if row < times.size - 1 and times[row] == course.time:
+        if row < times.size - 1 and moments[row] == course.time:
             if not step.is_on:
                 course.state = course.projected(course.time, course.state)
             course.write(course.time, course.state)

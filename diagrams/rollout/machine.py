@@ -102,7 +102,7 @@ def run(code: Library, functions: LoopFunctions, problem: Problem, settings: Set
 
 def _argument(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return value.ctypes.data_as(ctypes.c_void_p)
+        return ctypes.c_void_p(value.ctypes.data)
     return ctypes.c_double(value) if isinstance(value, float) else ctypes.c_longlong(value)
 
 
@@ -114,8 +114,7 @@ def _source(functions: LoopFunctions) -> str:
         "signals": functions.signals.function,
         "motion": functions.motion,
         "rest": functions.rest.function,
-        "residual": functions.residual.function,
-        "newton": functions.newton.function,
+        "projection": functions.projection,
     }
     if functions.rate is not functions.motion:
         calls["rate"] = functions.rate
@@ -132,7 +131,6 @@ def _source(functions: LoopFunctions) -> str:
         "NUM_FORCES": dae.num_constraints,
         "NUM_CONTROLS": dae.num_controls,
         "NUM_REFERENCES": len(columns["reference"]),
-        "NUM_RESIDUALS": len(columns["constraint_residual"]),
         "NUM_REST": sum(map(len, functions.rest_signals.values())),
         "NUM_MEASURED": len(columns["measured_force"]),
         "NUM_PLANT_MOVING": moving[0],
@@ -144,13 +142,12 @@ def _source(functions: LoopFunctions) -> str:
         "PROJECTS": int(plant.projects),
     }
     for name, function in calls.items():
-        sizes[f"{name.upper()}_ARG"] = function.sz_arg()
         # At least as many as the initializers in stepper.c.
+        sizes[f"{name.upper()}_ARG"] = function.sz_arg()
         sizes[f"{name.upper()}_RES"] = max(7, function.sz_res())
     zeros = np.zeros(dae.num_constraints)
     places = [plant.exogenous_places, loop.controller.exogenous_places]
     tables = {
-        "scale": dae.scale,
         "bias": sensor.bias if sensor else zeros,
         "deviation": sensor.noise_deviation if sensor else zeros,
         "dop_a": DOP853.A,

@@ -85,19 +85,22 @@ class Many:
             self._steps = self._program(codes)
 
     def _program(self, codes: list[int]) -> list[tuple[Callable[..., Any], tuple[Any, ...]]]:
-        """What is called in turn, each with its arrays."""
+        """What is called in turn, each with its arrays; constants and inputs are not copied."""
         function, work = self._function, np.zeros((self._function.sz_w(), BLOCK))
+        places: dict[int, FloatArray] = {}
         steps: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         for i, code in enumerate(codes):
             given, found = function.instruction_input(i), function.instruction_output(i)
             if code == ca.OP_CONST:
-                steps.append((work[found[0]].fill, (function.instruction_constant(i),)))
+                places[found[0]] = np.array([function.instruction_constant(i)])
             elif code == ca.OP_INPUT:
-                steps.append((np.copyto, (work[found[0]], self._given[given[0]][given[1]])))
+                places[found[0]] = self._given[given[0]][given[1]]
             elif code == ca.OP_OUTPUT:
-                steps.append((np.copyto, (self._found[found[0]][found[1]], work[given[0]])))
+                steps.append((np.copyto, (self._found[found[0]][found[1]], places[given[0]])))
             else:
-                steps.append((UFUNCS[code], (*(work[j] for j in given), work[found[0]])))
+                operands = [places[j] for j in given]
+                places[found[0]] = work[found[0]]
+                steps.append((UFUNCS[code], (*operands, work[found[0]])))
         return steps
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:

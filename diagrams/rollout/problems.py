@@ -53,7 +53,7 @@ def checked_times(times: ArrayLike) -> FloatArray:
     found = numbers("times", times)
     if found.ndim != 1 or found.size < 2 or not np.isfinite(found).all():
         raise ModelError(f"times must be two or more finite numbers, shape (j,), got {times!r}")
-    if np.any(np.diff(found) <= 0.0):
+    if not (found[1:] > found[:-1]).all():
         raise ModelError("times must be strictly increasing")
     return found
 

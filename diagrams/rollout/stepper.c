@@ -10,6 +10,9 @@ $generated
 #include <string.h>
 
 $constants
+/* The last Newton step to a state on N*, and one after which those that follow are sure to reach. */
+static const double REACHED = 1e-11, NEAR = 1e-5;
+
 /* How a call ended; Python has the same list. */
 enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW };
 
@@ -93,95 +96,25 @@ static int write(double time, const double *x, Moment *m, double *row) {
   return valid & (isfinite(checks[1]) != 0);
 }
 
-/* The Newton step from z by the gradients at another state, both in states over their scale. */
-static void newton(const double *z, const double *other, Moment *m, double *step) {
-  double x[NUM_STATES], y[NUM_STATES], checks[2];
-  const double *arg[NEWTON_ARG] = {x, y, m->plant};
-  double *res[NEWTON_RES] = {step, checks, checks + 1};
-  int i;
-  for (i = 0; i < NUM_STATES; i++) {
-    x[i] = scale[i] * z[i];
-    y[i] = scale[i] * other[i];
-  }
-  dae_newton(arg, res, 0, 0, 0);
-}
-
-static double norm(const double *vector, const double *unit) {
-  double sum = 0.0;
-  int i;
-  for (i = 0; i < NUM_STATES; i++) {
-    double entry = unit ? vector[i] / unit[i] : vector[i];
-    sum += entry * entry;
-  }
-  return sqrt(sum);
-}
-
-static void move(const double *from, double length, const double *step, double *to) {
-  int i;
-  for (i = 0; i < NUM_STATES; i++) to[i] = from[i] + length * step[i];
-}
-
-static int is_zero(const double *x, Moment *m) {
-  double residual[NUM_RESIDUALS + 1], checks[2];
-  const double *arg[RESIDUAL_ARG] = {x, m->plant};
-  double *res[RESIDUAL_RES] = {residual, checks, checks + 1};
-  int i;
-  dae_residual(arg, res, 0, 0, 0);
-  for (i = 0; i < NUM_RESIDUALS; i++) {
-    if (residual[i] != 0.0) return 0;
-  }
-  return 1;
-}
-
-/* The projection onto N* as trace/newton.py has it; 0 where that has to decide. */
+/* The state on N*, by two Newton steps, or by as many again; 0 where Python has to decide. */
 static int project(double time, double *x, Moment *m) {
-  double z[NUM_STATES], y[NUM_STATES], unit[NUM_STATES], step[NUM_STATES], next[NUM_STATES];
-  double size, left = 0.0, length, moved = 0.0;
-  int i, iteration, halving;
+  double found[NUM_STATES], start[NUM_STATES], left;
+  const double *arg[PROJECTION_ARG] = {start, m->plant};
+  double *res[PROJECTION_RES] = {found, &left};
+  int attempt;
   if (!PROJECTS) return 1;
   if (NUM_PLANT_MOVING) set_time(time, m);
-  for (i = 0; i < NUM_STATES; i++) {
-    z[i] = x[i] / scale[i];
-    unit[i] = fmax(1.0, fabs(z[i]));
-  }
-  newton(z, z, m, step);
-  size = norm(step, 0);
-  if (size > 0.0 ? size <= 1e-15 : size == 0.0 && is_zero(x, m)) return 1;
-  for (iteration = 0;; iteration++) {
-    if (iteration == 20) return 0;
-    if (iteration) newton(z, z, m, step);
-    size = norm(step, unit);
-    if (size <= 1e-15) {
-      memcpy(y, z, sizeof(z));
-      memcpy(next, step, sizeof(step));
-      break;
+  memcpy(start, x, sizeof(start));
+  for (attempt = 0; attempt < 4; attempt++) {
+    dae_projection(arg, res, 0, 0, 0);
+    if (left <= REACHED) {
+      memcpy(x, found, sizeof(found));
+      return 1;
     }
-    for (halving = 0, length = 1.0;; halving++, length *= 0.5) {
-      if (halving == 30) return 0;
-      move(z, length, step, y);
-      newton(y, z, m, next);
-      left = norm(next, unit);
-      if (left * left <= 1e-16 * size || left <= (1.0 - 0.25 * length) * size) break;
-    }
-    if (left * left <= 1e-16 * size) break;
-    memcpy(z, y, sizeof(z));
+    if (!(left <= NEAR)) return 0;
+    memcpy(start, found, sizeof(start));
   }
-  /* The steps that follow, by the matrix of z, until they are round-off. */
-  for (size = norm(next, 0); size > 1e-15; size = left) {
-    move(y, 1.0, next, y);
-    newton(y, z, m, next);
-    left = norm(next, 0);
-    if (!(left < 0.5 * size)) break;
-  }
-  for (i = 0; i < NUM_STATES; i++) {
-    double found = scale[i] * y[i];
-    moved = fmax(moved, fabs(found - x[i]) / (scale[i] * unit[i]));
-    if (!isfinite(found)) return 0;
-    y[i] = found;
-  }
-  if (moved == 0.0 && !(size <= 1e-12)) return 0;
-  memcpy(x, y, sizeof(y));
-  return 1;
+  return 0;
 }
 
 /* What happens at the start of a step: the projection, then a sample. */
@@ -320,16 +253,18 @@ static double first_step(Run *run, const double *x, const double *rate, const do
 
 static double error_of(double step, const double *x, const double *reached, double (*k)[SIZE],
                        const double *absolute, double relative) {
-  double fifth = 0.0, third = 0.0;
+  double fifth = 0.0, third = 0.0, e5[SIZE] = {0.0}, e3[SIZE] = {0.0};
   int i, j;
-  for (i = 0; i < SIZE; i++) {
-    double unit = absolute[i] + fmax(fabs(x[i]), fabs(reached[i])) * relative, e5 = 0.0, e3 = 0.0;
-    for (j = 0; j < 12; j++) {
-      e5 += dop_e5[j] * k[j][i];
-      e3 += dop_e3[j] * k[j][i];
+  for (j = 0; j < 12; j++) {
+    for (i = 0; i < SIZE; i++) {
+      e5[i] += dop_e5[j] * k[j][i];
+      e3[i] += dop_e3[j] * k[j][i];
     }
-    fifth += e5 / unit * (e5 / unit);
-    third += e3 / unit * (e3 / unit);
+  }
+  for (i = 0; i < SIZE; i++) {
+    double unit = absolute[i] + fmax(fabs(x[i]), fabs(reached[i])) * relative;
+    fifth += e5[i] / unit * (e5[i] / unit);
+    third += e3[i] / unit * (e3[i] / unit);
   }
   if (fifth == 0.0 && third == 0.0) return 0.0;
   return step * fifth / sqrt((fifth + 0.01 * third) * SIZE);

@@ -327,8 +327,11 @@ class Manifold:
     @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
     def _residual_size(self, state: FloatArray, parameters: FloatArray) -> float:
         """The residual relative to how it changes over the scale of the states, if it does."""
+        residual = self.residual_function.evaluate(state, parameters)[0]
+        if not residual.any():
+            return 0.0
         length = np.linalg.norm(self.gradients(state, parameters) * self._scale, axis=1)
-        return norm(self.residual_function.evaluate(state, parameters)[0] / positive(length))
+        return norm(residual / positive(length))
 
     def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""

@@ -182,6 +182,13 @@ def _schemes() -> tuple[str, ...]:
     return tuple(name for name in GetIntegrationSchemes() if name != "cenic")
 
 
+@cache
+def _has_error_control(scheme: str) -> bool:
+    trial = Simulator(Integrator(1))
+    ApplySimulatorConfig(SimulatorConfig(integration_scheme=scheme, use_error_control=True), trial)
+    return not trial.get_integrator().get_fixed_step_mode()
+
+
 def check_config(config: SimulatorConfig) -> None:
     """Refuses settings that Drake takes and that then hang, fail late, or are ignored.
 
@@ -206,14 +213,11 @@ def check_config(config: SimulatorConfig) -> None:
             f"target_realtime_rate must not be negative, got {config.target_realtime_rate}; 0 is "
             "as fast as possible"
         )
-    if config.use_error_control:
-        trial = Simulator(Integrator(1))
-        ApplySimulatorConfig(config, trial)
-        if trial.get_integrator().get_fixed_step_mode():
-            raise ModelError(
-                f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
-                "step, or choose runge_kutta5"
-            )
+    if config.use_error_control and not _has_error_control(scheme):
+        raise ModelError(
+            f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
+            "step, or choose runge_kutta5"
+        )
 
 
 class _Progress:

@@ -42,11 +42,16 @@ FLAGS = (
     "-shared",
     "-fno-fast-math",  # CC may hold options too.
     "-ffp-contract=off",
+    "-fno-math-errno",  # Nobody reads errno, and a square root is one instruction.
     # Small functions of CasADi's are put in line only where no other library can replace them.
     "-fvisibility=hidden",
     "-DGCC_HASCLASSVISIBILITY",
 )
 """-O1 comes with them: -O2 takes twice the time for code that is at most a tenth faster."""
+
+NATIVE = "-march=native"
+"""All that the processor at hand can do. Where the older instructions of x86-64 meet the newer ones
+of libm and memcpy, a call takes up to twice as long. The values have the same bits."""
 
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
 """Options of Python that make it a C compiler, where ziglang is installed. Code for any processor:
@@ -205,10 +210,12 @@ class Compiler(NamedTuple):
         command: How it is called.
         identity: What tells it from others: its own words on its version, and for what machine it
             works.
+        target: Its options that choose the processor.
     """
 
     command: tuple[str, ...]
     identity: str
+    target: tuple[str, ...] = ()
 
     def compile(self, source: str, file: Path, level: str, seconds: float) -> None:
         """Writes a source to file.c and its machine code to file.so.
@@ -219,7 +226,7 @@ class Compiler(NamedTuple):
         """
         code, library = file.with_suffix(".c"), file.with_suffix(".so")
         code.write_text(source)
-        options = [*FLAGS, level, str(code), "-o", str(library), "-lm"]
+        options = [*FLAGS, *self.target, level, str(code), "-o", str(library), "-lm"]
         done = _run([*self.command, *options], seconds)
         if done.returncode == 0 and library.exists():
             return
@@ -259,8 +266,22 @@ def _find_compiler(named: str, _: str) -> Compiler:
         )
     version = _run([*command, "--version"], PATIENCE * LIMIT)
     library = "CS_GNU_LIBC_VERSION" in os.confstr_names and os.confstr("CS_GNU_LIBC_VERSION")
-    words = (shutil.which(command[0]), version.stdout, version.stderr, library)
-    return Compiler(tuple(command), repr((words, platform.system(), platform.machine())))
+    target, processor = _native(command)
+    machine = (library, platform.system(), platform.machine(), processor)
+    words = (shutil.which(command[0]), version.stdout, version.stderr, *machine)
+    return Compiler(tuple(command), repr(words), target)
+
+
+def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
+    """The option for the processor at hand, and what a compiler takes it for.
+
+    None where the command chooses a processor, or where the compiler does not know this one. A
+    cache that several machines share has code for each of them, by what the compiler says.
+    """
+    if any(word.startswith(("-march", "-mcpu")) for word in command):
+        return (), ""
+    told = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], PATIENCE * LIMIT)
+    return ((NATIVE,), told.stdout) if told.returncode == 0 else ((), "")
 
 
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":
@@ -299,7 +320,7 @@ def _level(compiled: Compiled, operations: int) -> str:
 
 
 def _key(source: str, compiler: Compiler, level: str) -> str:
-    parts = (source, *compiler.command, compiler.identity, *FLAGS, level)
+    parts = (source, *compiler.command, compiler.identity, *FLAGS, *compiler.target, level)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 

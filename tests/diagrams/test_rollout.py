@@ -153,6 +153,22 @@ def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass):
         np.testing.assert_allclose(other.record[name], recorded.values, rtol=1e-9, atol=1e-9)
 
 
+def test_rows_within_a_thousand_short_steps_are_those_of_long_ones():
+    """To 1e-9, as error control agrees: they are computed in parts, so that memory is bounded."""
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-8", "compiled=false")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    found = []
+    for longest in (1e-3, 0.1):
+        config = SimulatorConfig(accuracy=1e-8, max_step_size=longest)
+        times = np.linspace(0.0, 1.0, 778)
+        found += rollout(loop, start, parameters, times, config=config)
+    assert found[0].steps >= 1000 > 20 * found[1].steps
+    for signal in ("state", "constraint_force", "control"):
+        short, long = (each.record[signal] for each in found)
+        np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9)
+
+
 @both
 @pytest.mark.parametrize(
     "settings",

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import platform
 import resource
 import shutil
 import subprocess
@@ -412,6 +413,39 @@ def test_a_compiler_that_is_told_to_be_careless_is_not(cache, monkeypatch):
     function([-1.0, 2.0, 3.0], P)
     assert function.is_machine_code
     assert not function.is_finite
+
+
+@needs_compiler
+def test_code_for_the_processor_at_hand_has_the_same_bits(cache, monkeypatch):
+    """As for any of its kind: nothing is contracted, and no sum is taken in another order."""
+    x = ca.SX.sym("x", 20)
+    sums = {"sums": x[:18] * ca.sin(x[1:19]) + x[2:]}
+    at = np.random.default_rng(0).normal(size=20)
+    commands = [" ".join(find_compiler().command)]
+    if platform.machine() == "x86_64":
+        commands.append(f"{commands[0]} -march=x86-64")
+    found = []
+    for command in commands:
+        monkeypatch.setenv("CC", command)
+        function = TracedFunction("sums", {"x": x}, sums, compiled=True)
+        found.append(function(at)[0])
+        assert function.is_machine_code
+    assert len(contents()) == len(commands)
+    np.testing.assert_array_equal(found[0], found[-1])
+
+
+@needs_compiler
+def test_each_processor_has_code_of_its_own(cache, monkeypatch, tmp_path):
+    """Where machines share a home; a compiler that does not know its processor makes code, too."""
+    command = " ".join(find_compiler().command)
+    for index, says in enumerate(("echo one", "echo two", "exit 1")):
+        text = f'for w in "$@"; do [ "$w" = -dM ] && {{ {says}; exit; }}; done; exec {command} "$@"'
+        monkeypatch.setenv("CC", script(tmp_path / "launcher", text))
+        monkeypatch.setenv("PATH", f"{os.environ['PATH']}:/nowhere/{index}")
+        function = made(True)
+        function(X, P)
+        assert function.is_machine_code
+        assert len(contents()) == index + 1
 
 
 PROCESS = """
