@@ -339,7 +339,7 @@ def make_closed_loop(
         measured = add_encoders(builder, plant, encoders, period)
         state = measured.output
     builder.Connect(state, controller.GetInputPort("estimated_state"))
-    held = None if sampling is None else _hold_before(plant, sampling)
+    held = None if sampling is None else hold_before(plant, sampling)
     control, limits = add_drives(builder, controller, held, control_limits)
     if is_fed_back:
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
@@ -401,7 +401,7 @@ def make_closed_loop(
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
         if name not in told:
-            loggers[name] = (_log(builder, port, plant), signals)
+            loggers[name] = (log_steps(builder, port, plant), signals)
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
@@ -433,7 +433,7 @@ def make_closed_loop(
     )
 
 
-def _log(
+def log_steps(
     builder: DiagramBuilder,
     port: OutputPort,
     plant: DaePlant | ContactPlant | UnilateralRobotPlant,
@@ -448,7 +448,7 @@ def _log(
     return LogVectorOutput(port, builder, {TriggerType.kPerStep})
 
 
-def _hold_before(
+def hold_before(
     plant: DaePlant | ContactPlant | UnilateralRobotPlant, sampling: Sampling
 ) -> Sampling:
     """The sampling of the hold: a discrete plant takes what was held one step of its own before."""

@@ -60,6 +60,8 @@ from .diagrams.sweep.sweep import sweep as sweep
 from .diagrams.sweep.variations import grid_variations as grid_variations
 from .diagrams.sweep.variations import listed_variations as listed_variations
 from .diagrams.sweep.variations import random_variations as random_variations
+from .diagrams.task_loop import TaskLoop as TaskLoop
+from .diagrams.task_loop import make_task_loop as make_task_loop
 from .diagrams.unilateral import Unilateral as Unilateral
 from .errors import DrakeDaeError as DrakeDaeError
 from .robots.actuation.dc_motors import DcMotors as DcMotors
@@ -119,6 +121,16 @@ from .systems.robot_plant import RobotPlant as RobotPlant
 from .systems.sampling import ControlHold as ControlHold
 from .systems.sampling import Sampling as Sampling
 from .systems.sensors import ForceSensor as ForceSensor
+from .systems.task.controller import TaskController as TaskController
+from .systems.task.open_contact import open_contact as open_contact
+from .systems.task.phases import Approach as Approach
+from .systems.task.phases import Dwell as Dwell
+from .systems.task.phases import Move as Move
+from .systems.task.phases import Press as Press
+from .systems.task.phases import Release as Release
+from .systems.task.phases import Retreat as Retreat
+from .systems.task.progress import PhaseChange as PhaseChange
+from .systems.task.task import Task as Task
 from .systems.tolerances import Tolerances as Tolerances
 from .systems.unilateral.events import ContactChange as ContactChange
 from .systems.unilateral.events import ContactEvent as ContactEvent

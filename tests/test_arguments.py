@@ -22,6 +22,7 @@ from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
+from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -52,6 +53,7 @@ from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.simulation.course import Loop
 from drake_dae.simulation.record import Recorded
+from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.unilateral.events import ContactChange
 from drake_dae.trace.functions import TracedFunction
 
@@ -84,8 +86,14 @@ def record() -> dd.Record:
     return loop().record(context)
 
 
+@cache
+def task() -> dd.TaskLoop:
+    return task_loop([dd.Approach(), dd.Press(20.0)])
+
+
 def context_of(owner: Any) -> Context:
-    return (owner if isinstance(owner, System) else loop().diagram).CreateDefaultContext()
+    of_loop = owner if isinstance(owner, dd.TaskLoop) else loop()
+    return (owner if isinstance(owner, System) else of_loop.diagram).CreateDefaultContext()
 
 
 def state() -> np.ndarray:
@@ -171,6 +179,9 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Signal: lambda: dd.Signal("a"),
     dd.ConstraintStructure: lambda: arm("two_link").structure,
     dd.Structure: lambda: arm("two_link").structure,
+    dd.Task: lambda: dd.Task([dd.Approach(), dd.Press(20.0)]),
+    dd.TaskController: lambda: task().controller,
+    dd.TaskLoop: task,
     dd.TrackingController: lambda: loop().controller,
     dd.WaypointsReference: lambda: dd.WaypointsReference([[0.0], [1.0]], [0.0, 1.0]),
     dd.TrackingLaw: lambda: law("two_link"),
@@ -242,6 +253,23 @@ PLACES: dict[str, Callable[[], Any]] = {
     "system of make_closed_loop": lambda: dd.RobotPlant(
         arm("two_link").model, structure=arm("two_link").structure
     ),
+    "phases": lambda: [dd.Approach()],
+    "references of Move": lambda: {"tool.z": 0.3},
+    "force of Press": lambda: 20.0,
+    "task": lambda: dd.Task([dd.Approach()]),
+    "law of TaskController": lambda: laws()[0],
+    "free_law": lambda: laws()[1],
+    "force of open_contact": lambda: "wall.force",
+    "system of open_contact": lambda: arm("two_link").model.dae,
+    "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
+    "name of TaskController.set_parameter": lambda: "wall.position",
+    "value of TaskController.set_parameter": lambda: [1.2, 0.0, 0.0],
+    "integrals": lambda: {},
+    "plant of make_task_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
+    "controller of make_task_loop": lambda: dd.TaskController(
+        dd.Task([dd.Approach()]), laws()[0], laws()[1]
+    ),
+    "plant of TaskLoop": lambda: task().plant,
     "integrators": lambda: {"joint1_motor": 1},
     "nominal_control": lambda: None,
     "spread": lambda: None,
@@ -407,7 +435,7 @@ def public() -> Iterator[tuple[str, Any]]:
 
 
 # What the library calls on its members, with arguments of its own: rules for who writes one.
-CONTRACTS = (Surface, Constraint, PositionOutput, dd.ForceOutput, Stage, dd.Reference)
+CONTRACTS = (Surface, Constraint, PositionOutput, dd.ForceOutput, Stage, dd.Reference, Phase)
 
 
 def methods(cls: type) -> set[str]:

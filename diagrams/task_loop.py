@@ -1,0 +1,212 @@
+"""The wiring of a task: a plant whose contact opens and closes, and its controller in phases."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.geometry import SceneGraph
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import VectorLogSink
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Signal
+from drake_dae.diagrams.closed_loop import hold_before, log_steps
+from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.diagrams.wiring import add_block
+from drake_dae.errors import WiringError
+from drake_dae.simulation.record import Record, Recorded
+from drake_dae.systems.along import function_along
+from drake_dae.systems.robot_plant import RobotPlant
+from drake_dae.systems.sampling import ControlHold, Sampling
+from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.task.progress import PhaseChange
+from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
+
+Plant = UnilateralRobotPlant | ContactPlant | RobotPlant
+
+
+@checked(WiringError)
+@dataclass(frozen=True, eq=False)
+class TaskLoop:
+    """A plant under a `TaskController`.
+
+    Attributes:
+        diagram: The diagram, with the output ports `state`, `constraint_force`, `control`, `phase`
+            and `desired_output`.
+        plant, controller: The systems in it.
+        loggers: Port name -> (sink, names and units), one sample per step.
+        scene_graph: The geometry of the robot, or None.
+    """
+
+    diagram: Diagram
+    plant: Plant
+    controller: TaskController
+    loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
+    scene_graph: SceneGraph | None = None
+
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Starts the robot at a state, shape (n,), in contact or not.
+
+        Args:
+            context: The diagram's context.
+            state: x; `rest_state` makes one.
+
+        Raises:
+            ModelError: The shape is wrong.
+        """
+        own = self.plant.GetMyMutableContextFromRoot(context)
+        x = self.plant.dae.state_vector(state)
+        if isinstance(self.plant, ContactPlant):
+            inner = self.plant.GetMutableSubsystemContext(self.plant.multibody, own)
+            self.plant.multibody.SetPositionsAndVelocities(inner, x)
+        else:
+            self.plant.set_state(own, x)
+
+    def changes(self, context: Context) -> tuple[PhaseChange, ...]:
+        """When each phase of a run began, and why."""
+        return self.controller.changes(self.controller.GetMyContextFromRoot(context))
+
+    def record(self, context: Context, after: float | None = None) -> Record:
+        """What was logged up to now, and what follows from it.
+
+        The outputs are the positions, the force and the distance; in contact the distance that is
+        wanted is zero, and else the force. "distance" has the distance and its derivative by the
+        law's model. At a moment of an event or of a change of phases it is what was before.
+
+        Args:
+            context: The diagram's context.
+            after: Only what was logged later than this time, in s; None for all.
+        """
+        logged = Record.from_logs(self.loggers, context, after)
+        own, controller = self.controller.GetMyContextFromRoot(context), self.controller
+        count = controller.law.system.parameter_values.size
+        parameters = self.plant.parameters(self.plant.GetMyContextFromRoot(context))[:count]
+        given = {
+            "state": logged["state"],
+            "force": logged["constraint_force"],
+            "parameters": np.tile(parameters, (logged.time.size, 1)),
+        }
+        found = function_along(controller.outputs, given)
+        outputs, signals = found[:, :-1], controller.output_signals
+        desired = controller.desired_along(own, logged.time)
+        rates = (signals[-1], signals[-1].derivative(1))
+        derived = {
+            "distance": Recorded(found[:, -2:], rates),
+            "controlled_output": Recorded(outputs, signals),
+            "desired_output": Recorded(desired, signals),
+            "tracking_error": Recorded(outputs - desired, signals),
+        }
+        return Record(logged.time, {**logged.signals, **derived}).while_finite()
+
+    def predicted_error(self, record: Record, context: Context) -> FloatArray:
+        """The error that theory predicts for a record of a run, shape (k, p + 1).
+
+        See `TaskController.predicted_error`. Where a contact is lost there is none.
+
+        Args:
+            record: What `record` returned.
+            context: The diagram's context after the run.
+        """
+        names = [name for name in ("integral", "free_integral") if name in record.signals]
+        own = self.controller.GetMyContextFromRoot(context)
+        return self.controller.predicted_error(
+            own, record.time, record["state"], {name: record[name] for name in names}
+        )
+
+
+@checked(WiringError)
+def make_task_loop(
+    plant: Plant,
+    controller: TaskController,
+    *,
+    sampling: Sampling | None = None,
+    scene_graph: SceneGraph | None = None,
+) -> TaskLoop:
+    """Wires a plant and the controller of a task, with loggers.
+
+    Args:
+        plant: A `UnilateralRobotPlant` whose contact opens and closes, a `ContactPlant`, with which
+            everything is logged at its steps, or a `RobotPlant`, for a task without Approach.
+        controller: The controller; its laws are for the plant's robot.
+        sampling: When the control is computed and acts; it is held between. None for a controller
+            that acts at all times, or, with a `ContactPlant`, at each of its steps.
+        scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then its
+            geometry can be drawn.
+
+    Raises:
+        WiringError: The controller's laws are for another robot, its guards would be looked at at
+            all times where the plant has steps, or a law would close an algebraic loop.
+    """
+    _check(plant, controller)
+    builder = DiagramBuilder()
+    add_block(builder, plant)
+    add_block(builder, controller)
+    control = controller.GetOutputPort("control")
+    if sampling is not None:
+        hold = builder.AddSystem(ControlHold(control.size(), hold_before(plant, sampling)))
+        builder.Connect(control, hold.get_input_port())
+        control = hold.get_output_port()
+    builder.Connect(control, plant.GetInputPort("control"))
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    builder.Connect(
+        plant.GetOutputPort("constraint_force"), controller.GetInputPort("measured_force")
+    )
+    loggers = {}
+    for name, (port, signals) in _signals(plant, controller, control).items():
+        builder.ExportOutput(port, name)
+        loggers[name] = (log_steps(builder, port, plant), signals)
+    builder.ExportOutput(controller.GetOutputPort("desired_output"), "desired_output")
+    builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+    diagram = builder.Build()
+    diagram.set_name("task_loop")
+    return TaskLoop(diagram, plant, controller, loggers, scene_graph)
+
+
+def _signals(
+    plant: Plant, controller: TaskController, control: OutputPort
+) -> dict[str, tuple[OutputPort, Sequence[Signal]]]:
+    """What is logged: the rest follows."""
+    dae, law = plant.dae, controller.law
+    named: dict[str, tuple[OutputPort, Sequence[Signal]]] = {
+        name: (plant.GetOutputPort(name), signals)
+        for name, signals in (
+            ("state", dae.state_signals),
+            ("constraint_force", dae.force_signals),
+            ("constraint_residual", law.structure.manifold.residual_signals),
+        )
+    }
+    named["control"] = (control, dae.control_signals)
+    named["phase"] = (controller.GetOutputPort("phase"), (Signal("phase"),))
+    if isinstance(plant, UnilateralRobotPlant):
+        signals = tuple(Signal(f"{name}.closed") for name in plant.contacts)
+        named["mode"] = (plant.GetOutputPort("mode"), signals)
+    if isinstance(plant, ContactPlant):
+        named["contact_force"] = (plant.GetOutputPort("contact_force"), plant.contact_force_signals)
+    for name, one in (("integral", law), ("free_integral", controller.free_law)):
+        if one.integral.outputs:
+            named[name] = (controller.GetOutputPort(name), one.integral.signals)
+    return named
+
+
+def _check(plant: Plant, controller: TaskController) -> None:
+    own, other = plant.dae, controller.law.system
+    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
+    if sizes[0] != sizes[1]:
+        has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
+        raise WiringError(
+            f"the task is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. Make "
+            "the laws for the plant's robot"
+        )
+    if plant.time_step and not controller.sample_period:
+        raise WiringError(
+            f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
+            f"controller with sample_period={plant.time_step:g} or a multiple of it"
+        )
+    name = other.force_signals[controller.force].name
+    if isinstance(plant, UnilateralRobotPlant) and name.split(".")[0] not in plant.contacts:
+        raise WiringError(
+            f"the contact with the force '{name}' does not open in this plant; what does is "
+            f"{', '.join(plant.contacts)}"
+        )

@@ -1,0 +1,313 @@
+"""A task as a controller: a law for each member, and what leads from one to the other."""
+
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain, PortSwitch
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.layout import Indices
+from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import ModelError
+from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.task.open_contact import output_of_force
+from drake_dae.systems.task.progress import PhaseChange, Segment
+from drake_dae.systems.task.supervisor import CONTACT, FREE, TaskSupervisor
+from drake_dae.systems.task.task import Task
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class TaskController(Diagram):
+    """A task in phases: approach, touch, press, move, release, retreat.
+
+    In contact the law (28) of the robot with the contact acts, which tracks the contact's force;
+    else that of the robot without it, which tracks the distance in its place. Each phase has goals
+    and a guard that ends it, on what is measured: the force, the distance by the model, the time.
+    A phase takes over without a bump: its references begin with the values of those before and with
+    all derivatives that the law has, and lead to its goals by a polynomial. What has no reference
+    before, as a force when the robot touches, begins with what is measured.
+
+    The control itself may jump where the law changes, since the other law explains the same motion
+    by other forces. Where the robot touches while the free law presses with lambda, so that
+    phi'' = w = -A lambda is what it wants there, it is
+
+        B (u_c - u_f) = lambda (A M [P; J]^-1 (0, 1) - J^T),
+
+    zero where pressing moves none of the other outputs, P M^-1 J^T = 0; P is the Jacobian of these.
+    Where it lets go, lambda is the task's `contact_force` at most, and the jump is J^T lambda. A
+    touch that is slow, and a free law that is soft along the distance, keep the first one small.
+
+    It needs of a plant the state x and the constraint forces, as measured; no more. Guards are
+    found by Drake's Simulator as zeros of a witness function, which needs a context with an
+    accuracy as `simulate` sets it, or are looked at in samples. All that a run has done stands in
+    its context.
+
+    Input ports:
+        estimated_state: x, shape (n,).
+        measured_force: All constraint forces, shape (m,). The control does not depend on it in the
+            same instant, unless a law takes a measured force.
+
+    Output ports:
+        control: u, shape (p,).
+        phase: The place of the phase in the task, shape (1,); the number of phases after the last.
+        desired_output: The positions, the force and the distance that are wanted, shape (p + 1,).
+            In contact the distance is zero, and else the force.
+        integral, free_integral: The integrals of each law, if it has any. They stand still while
+            the other law acts, and those in contact also while no force is felt, and while the
+            first references after a touch fade in: the force of an impact is no error.
+
+    Args:
+        task: The phases.
+        law: The law in contact. Its force, "wall.force" for example, is one of its outputs.
+        free_law: The law without: of `open_contact(law.system, "wall.force")`.
+        sample_period: When guards are looked at and errors are summed, in s; 0 for at all times.
+
+    Attributes:
+        task, law, free_law, sample_period: The arguments.
+        supervisor, controller, free_controller: The blocks in it.
+        place: Which output is the force, or the distance.
+        force: Which of the constraint forces is the contact's.
+        output_signals: Names and units of `desired_output`.
+        outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
+            derivative of the distance, shape (p + 2,).
+
+    Raises:
+        ModelError: The laws do not belong together, or a phase has a reference that does not fit.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        task: Task,
+        law: TrackingLaw,
+        free_law: TrackingLaw,
+        *,
+        sample_period: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if not (np.isfinite(sample_period) and sample_period >= 0.0):
+            raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
+        self.task, self.law, self.free_law = task, law, free_law
+        self.sample_period = sample_period
+        self.place, self.force = _check_laws(law, free_law)
+        self.outputs = self._trace_outputs()
+        distance = law.system.constraint_output_signals[self.force]
+        self.output_signals = (*law.system.output_signals, distance)
+        builder = DiagramBuilder()
+        size = law.system.num_constraints
+        self.supervisor = builder.AddSystem(
+            TaskSupervisor(task, (free_law, law), self.place, self.force, size, sample_period)
+        )
+        builder.ExportInput(self.supervisor.GetInputPort("estimated_state"), "estimated_state")
+        builder.ExportInput(self.supervisor.GetInputPort("measured_force"), "measured_force")
+        switch = builder.AddSystem(PortSwitch(law.system.num_controls))
+        builder.Connect(
+            self.supervisor.GetOutputPort("chosen_law"), switch.get_port_selector_input_port()
+        )
+        added = []
+        for which, name, own in ((FREE, "free", free_law), (CONTACT, "contact", law)):
+            controller = builder.AddSystem(TrackingController(own, sample_period=sample_period))
+            controller.set_name(f"{name}_controller")
+            builder.ConnectInput("estimated_state", controller.GetInputPort("estimated_state"))
+            reference = self.supervisor.GetOutputPort(f"{name}_reference")
+            builder.Connect(reference, controller.GetInputPort("reference"))
+            if own.measured_force:
+                builder.ConnectInput("measured_force", controller.GetInputPort("measured_force"))
+            if count := len(own.integral.outputs):
+                hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
+                hold.set_name(f"{name}_hold")
+                builder.Connect(
+                    self.supervisor.GetOutputPort(f"{name}_hold"), hold.get_input_port()
+                )
+                builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
+                shown = "integral" if which == CONTACT else "free_integral"
+                builder.ExportOutput(controller.GetOutputPort("integral"), shown)
+            passed = switch.DeclareInputPort(name)
+            assert int(passed.get_index()) == which + 1  # The first port chooses.
+            builder.Connect(controller.GetOutputPort("control"), passed)
+            added.append(controller)
+        self.free_controller, self.controller = added
+        builder.ExportOutput(switch.get_output_port(), "control")
+        for name in ("phase", "desired_output"):
+            builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
+        builder.BuildInto(self)
+        self.set_name("task_controller")
+
+    def _trace_outputs(self) -> TracedFunction:
+        system, chain = self.law.system, self.free_law.structure.output_chains[self.place]
+        force = ca.SX.sym("force", system.num_constraints)
+        outputs = ca.vertcat(system.l + ca.mtimes(system.m, force), chain[0], chain[1])
+        return system.trace("task outputs", {"value": ca.densify(outputs)}, {"force": force})
+
+    def rest_state(
+        self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """The state at rest, of the free robot, with given outputs.
+
+        Args:
+            outputs: The outputs of the free law, shape (p,): the distance in place of the force.
+            guess: x near it, shape (n,).
+            parameters: Values of all parameters of the law's system; the defaults if None.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
+        law = self.free_law
+        wanted = vector(f"{self.get_name()}: outputs", outputs, len(law.degrees))
+        goal = np.zeros(law.layout.reference_size)
+        goal[law.layout.lowest] = wanted
+        values = law.system.parameter_vector(parameters)
+        return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, values)
+
+    def changes(self, context: Context) -> tuple[PhaseChange, ...]:
+        """The record of a run: when each phase began, and why; empty before a run.
+
+        Args:
+            context: The context of this system.
+        """
+        return tuple(segment.change for segment in self.segments(context))
+
+    def segments(self, context: Context) -> tuple[Segment, ...]:
+        """The references of a run, from one change of phases to the next.
+
+        Args:
+            context: The context of this system.
+        """
+        own = self.GetSubsystemContext(self.supervisor, context)
+        return self.supervisor.progress(own).segments
+
+    def desired_along(self, context: Context, times: ArrayLike) -> FloatArray:
+        """What was wanted at times of a run, in s, shape (k, p + 1), as `desired_output` was.
+
+        At the moment of a change it is what was wanted before.
+
+        Args:
+            context: The context of this system after the run.
+            times: The times, in s, shape (k,).
+        """
+        moments, segments = vector("times", times, None), self.segments(context)
+        if not segments:
+            raise ModelError(f"{self.get_name()}: the task has not begun in this context")
+        return np.array(
+            [
+                self.supervisor.desired(segments[i], time)
+                for i, time in zip(places_at(segments, moments), moments, strict=True)
+            ]
+        ).reshape(moments.size, -1)
+
+    def predicted_error(
+        self,
+        context: Context,
+        times: ArrayLike,
+        states: FloatArray,
+        integrals: Mapping[str, FloatArray],
+    ) -> FloatArray:
+        """The error that theory predicts for a run, shape (k, p + 1).
+
+        From each change of phases on it decays by the gains of the law that acts, from what it is
+        then. Impacts make errors anew: the change that follows a touch is after its impact.
+
+        Args:
+            context: The context of this system after the run.
+            times: Of the run, in s, shape (k,).
+            states: x at these times, shape (k, n).
+            integrals: "integral" and "free_integral" at these times, where the laws have any.
+        """
+        moments, segments = vector("times", times, None), self.segments(context)
+        places = places_at(segments, moments)
+        found = np.zeros((moments.size, len(self.output_signals)))
+        for which, segment in enumerate(segments):
+            rows = np.flatnonzero(places == which)
+            if not rows.size:
+                continue
+            start = max(rows[0] - 1, 0)  # At a change the state is known, and what was before.
+            is_free = not segment.change.in_contact
+            law, name = (self.free_law, "free_integral") if is_free else (self.law, "integral")
+            begin = max(segment.change.time, moments[start])
+            errors = law.predicted_error(
+                moments[rows] - moments[start],
+                states[start],
+                segment.reference(begin),
+                integral=integrals[name][start] if law.integral.outputs else None,
+            )
+            columns = list(range(errors.shape[1]))
+            if is_free:
+                columns[self.place] = found.shape[1] - 1
+            found[rows[:, None], columns] = errors
+        return found
+
+    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
+        """Changes a parameter of the laws' model in a context, as `TrackingController` does.
+
+        Args:
+            context: The context of this system.
+            name: The name of the parameter.
+            value: The new value, shape (k,), or a number for all entries.
+
+        Raises:
+            ModelError: No parameter has that name, or the value does not fit.
+        """
+        for controller in (self.controller, self.free_controller):
+            own = self.GetMutableSubsystemContext(controller, context)
+            controller.set_parameter(own, name, value)
+        known = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
+        at_supervisor = self.GetMutableSubsystemContext(self.supervisor, context)
+        at_supervisor.get_mutable_numeric_parameter(0).SetFromVector(known)
+
+
+def places_at(segments: tuple[Segment, ...], times: FloatArray) -> Indices:
+    """Which segment held at each time; at the moment of a change that before."""
+    starts = [segment.change.time for segment in segments[1:]]
+    return np.searchsorted(starts, times, side="left")
+
+
+def _check_laws(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:
+    """Which output is force or distance, and which of the constraint forces is that force.
+
+    Raises:
+        ModelError: The laws are not those of one robot with and without the contact.
+    """
+    own, free = law.system, free_law.system
+    names, others = (
+        [signal.name for signal in system.constraint_input_signals] for system in (own, free)
+    )
+    gone = [name for name in names if name not in others]
+    if len(gone) != 1 or (own.num_states, own.num_controls) != (
+        free.num_states,
+        free.num_controls,
+    ):
+        raise ModelError(
+            f"a task needs the laws of one robot with and without a contact, as of its system and "
+            f"of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
+            f"{', '.join(others) or 'nothing'}"
+        )
+    place, force = output_of_force(own, gone[0]), names.index(gone[0])
+    distance = own.constraint_output_signals[force].name
+    if free.output_signals[place].name != distance:
+        raise ModelError(
+            f"the free law must have the output '{distance}' where the law has '{gone[0]}'; make "
+            "its system by open_contact"
+        )
+    for system, one in ((own, law), (free, free_law)):
+        if one.exogenous_degrees:
+            raise ModelError(
+                f"{system.name}: the laws of a task take no exogenous signals; nothing may move"
+            )
+    kept = [i for i in range(own.num_outputs) if i != place]
+    for i in kept:
+        if law.degrees[i] != free_law.degrees[i]:
+            raise ModelError(
+                f"'{own.output_signals[i].name}' has degree {law.degrees[i]} in contact and "
+                f"{free_law.degrees[i]} without, so that no reference leads from one to the other"
+            )
+    if free_law.degrees[place] < 2:
+        raise ModelError(f"'{distance}' must have degree 2 or more, as where forces move it")
+    return place, force

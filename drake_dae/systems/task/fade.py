@@ -1,0 +1,62 @@
+"""Polynomials that take over from a reference without a bump, and fade away."""
+
+from collections.abc import Sequence
+from functools import cache
+from math import factorial
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+
+SMOOTH = 2
+"""So many derivatives of a fade are continuous at least, also where a law asks for fewer."""
+
+
+def fade(offset: FloatArray, degrees: Sequence[int], over: float) -> FloatArray:
+    """Polynomials that begin with given values and derivatives, and end at rest at zero.
+
+    For each output i with offsets d_0, ..., d_mu the one of degree 2 n + 1, n = max(mu, SMOOTH),
+
+        p^(k)(0) = d_k (0 for k > mu),    p^(k)(over) = 0,    k = 0, ..., n.
+
+    Args:
+        offset: d, output-major as a reference, shape (sum (mu_i + 1),).
+        degrees: mu_1, ..., mu_p.
+        over: How long it lasts, in s.
+
+    Returns:
+        Factors of 1, x, x^2, ... with x = t / over, one row for each entry of the reference.
+    """
+    width = 2 * max(SMOOTH, *degrees) + 2
+    rows, first = [], 0
+    for mu in degrees:
+        n = max(mu, SMOOTH)
+        start = np.zeros(n + 1)
+        start[: mu + 1] = offset[first : first + mu + 1] * over ** np.arange(mu + 1.0)
+        factors = np.zeros(width)
+        factors[: 2 * n + 2] = start @ _basis(n)
+        for k in range(mu + 1):
+            rows.append(factors / over**k)
+            factors = np.append(factors[1:] * np.arange(1.0, width), 0.0)
+        first += mu + 1
+    return np.array(rows)
+
+
+@cache
+def _basis(n: int) -> FloatArray:
+    """Polynomials whose k-th derivative is 1 at 0, and all others up to n are 0 at 0 and at 1.
+
+    Returns:
+        Row k has the factors of 1, x, ..., x^(2 n + 1), shape (n + 1, 2 n + 2).
+    """
+    powers = np.arange(2 * n + 2)
+    # Row j: the j-th derivatives of the powers at 1.
+    at_end = np.array(
+        [[float(np.prod(powers[p] - np.arange(j))) for p in powers] for j in range(n + 1)]
+    )
+    found = np.zeros((n + 1, 2 * n + 2))
+    for k in range(n + 1):
+        found[k, k] = 1.0 / factorial(k)
+    left = at_end[:, : n + 1] @ found[:, : n + 1].T
+    found[:, n + 1 :] = -np.linalg.solve(at_end[:, n + 1 :], left).T
+    return found

@@ -1,0 +1,74 @@
+"""The free member of a system with a contact: its distance is an output in place of its force."""
+
+from dataclasses import replace
+
+import casadi as ca
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import listed, unknown_name
+from drake_dae.dae.structure.redundancy import with_constraints
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+
+
+@checked(ModelError)
+def open_contact(system: DaeSystem, force: str) -> DaeSystem:
+    """A system one of whose contacts is open:
+
+        x' = f + g_o v_o + h u,    0 = k_o(x),    z = (l_o(x) + m_o(x) v_o, k_i(x)),
+
+    where o are all constraints but the one, i, with the named force v_i: it does not hold, and
+    where its force was an output there is its distance k_i(x). State, controls, parameters and the
+    order of the outputs are those of the system, so that a law of one can take over from a law of
+    the other at any moment.
+
+    Args:
+        system: The system with the contact closed, `RobotModel.dae` for example.
+        force: The name of the contact's force, "wall.force" for example.
+
+    Raises:
+        ModelError: There is no such force; it is not, alone, one of the outputs; or constraints
+            share their forces.
+    """
+    names = [signal.name for signal in system.constraint_input_signals]
+    if force not in names:
+        raise ModelError(f"{system.name}: {unknown_name('constraint force', force, names)}")
+    if system.sharing is not None:
+        raise ModelError(
+            f"{system.name}: redundant constraints share their forces, and none of them opens; "
+            "leave `compliances` out"
+        )
+    i, j = names.index(force), output_of_force(system, force)
+    found = with_constraints(system, [row for row in range(len(names)) if row != i])
+    drift, signals = ca.SX(found.l), list(found.output_signals)
+    drift[j], signals[j] = system.k[i], system.constraint_output_signals[i]
+    return replace(
+        found,
+        l=drift,
+        output_signals=tuple(signals),
+        implicit=found.implicit if found.num_constraints else None,
+    )
+
+
+def output_of_force(system: DaeSystem, force: str) -> int:
+    """Which output is a constraint force, of which no other one depends.
+
+    Raises:
+        ModelError: None is, or others depend on it.
+    """
+    i = [signal.name for signal in system.constraint_input_signals].index(force)
+    depending = [j for j in range(system.num_outputs) if not system.m[j, i].is_zero()]
+    chosen = [
+        j
+        for j in depending
+        if system.l[j].is_zero()
+        and system.m[j, i].is_one()
+        and ca.sparsify(system.m[j, :]).nnz() == 1
+    ]
+    if len(chosen) != 1 or depending != chosen:
+        outputs = listed(signal.name for signal in system.output_signals)
+        raise ModelError(
+            f"{system.name}: '{force}' must be one of the outputs by itself, so that a distance "
+            f"can be in its place where the contact is open; the outputs are {outputs}"
+        )
+    return chosen[0]

@@ -1,0 +1,144 @@
+"""How far a task is: what a context holds of it, and what is left of it as a record."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.layout import Layout
+from drake_dae.errors import ModelError
+from drake_dae.systems.feedback import Immutable
+from drake_dae.systems.task.fade import fade
+
+DONE, HELD = "done", "held"
+"""What the record calls the time after the last phase, and after a reaction that ends the task."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class PhaseChange:
+    """One entry of the record of a task: a phase begins.
+
+    Attributes:
+        time: When, in s.
+        phase: The phase that begins, "Approach" for example; "done" after the last one, "held"
+            after a reaction that ends the task.
+        place: Where it stands in the task, from 0; the number of phases when done or held.
+        in_contact: Whether the law with the contact acts from then on.
+        reason: Why the phase before ended.
+        force: The measured force of the contact then, in N.
+        distance: The distance by the law's model then, in m.
+        distance_rate: Its derivative, in m/s.
+    """
+
+    time: float
+    phase: str
+    place: int
+    in_contact: bool
+    reason: str
+    force: float
+    distance: float
+    distance_rate: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.time:.6g} s: {self.phase}, {self.reason}; {self.force:.4g} N, "
+            f"{self.distance:.4g} m, {self.distance_rate:.3g} m/s"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """The references from one change of phases on:
+
+        R(t) = goal(t - t_0) + base + rate (t - t_0) + fade(t - t_0).
+
+    Attributes:
+        change: What began.
+        layout: How the references of the law are stacked that acts.
+        goal: References of the phase in s after its begin, zero where it names none.
+        base, rate: Where and how fast the others go at last, shape (p,).
+        faded: The factors of the polynomials that take over, see `fade`.
+        over: How long they last, in s.
+    """
+
+    change: PhaseChange
+    layout: Layout
+    goal: Callable[[float], FloatArray]
+    base: FloatArray
+    rate: FloatArray
+    faded: FloatArray
+    over: float
+
+    @classmethod
+    def begin(
+        cls,
+        change: PhaseChange,
+        layout: Layout,
+        goal: Callable[[float], FloatArray],
+        named: Sequence[int],
+        rate: FloatArray,
+        present: FloatArray,
+        over: float,
+    ) -> "Segment":
+        """The references that begin with present values and derivatives.
+
+        Args:
+            change: What begins.
+            layout: How the references of the law are stacked that acts.
+            goal: References of the phase, in s after its begin.
+            named: Which outputs these are for.
+            rate: How fast the other outputs go at last, shape (p,).
+            present: R at the begin.
+            over: How long it takes, in s.
+        """
+        lowest = layout.lowest
+        has_rate = np.array(layout.degrees) > 0
+        moving = np.where(has_rate, present[np.minimum(lowest + 1, present.size - 1)], 0.0)
+        # With the mean of the two speeds on the way it does not swing over.
+        base = present[lowest] + (moving - rate) * over / 2.0
+        base[list(named)] = 0.0
+        rate = rate.copy()
+        rate[list(named)] = 0.0
+        found = cls(change, layout, goal, base, rate, np.zeros((present.size, 1)), over)
+        offset = present - found._goal(0.0)
+        return replace(found, faded=fade(offset, layout.degrees, over))
+
+    def reference(self, time: float) -> FloatArray:
+        """R at a time in s, shape (sum (mu_i + 1),)."""
+        passed = time - self.change.time
+        found = self._goal(passed)
+        if passed < self.over:
+            found += self.faded @ (passed / self.over) ** np.arange(self.faded.shape[1])
+        return found
+
+    def _goal(self, passed: float) -> FloatArray:
+        found = self.goal(passed).copy()
+        found[self.layout.lowest] += self.base + self.rate * passed
+        for i, degree in enumerate(self.layout.degrees):
+            if degree:
+                found[self.layout.lowest[i] + 1] += self.rate[i]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Progress(Immutable):
+    """What a context holds of a task.
+
+    Attributes:
+        segments: All that began; none before a run.
+        step: When the step began that is being made, in s.
+        felt: When the contact was felt last, in s.
+    """
+
+    segments: tuple[Segment, ...] = ()
+    step: float = -inf
+    felt: float = -inf
+
+    @property
+    def changes(self) -> tuple[PhaseChange, ...]:
+        """The record of the task."""
+        return tuple(segment.change for segment in self.segments)

@@ -1,0 +1,417 @@
+"""What leads through the phases of a task: guards, changes and references."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    EventStatus,
+    InputPortIndex,
+    LeafSystem,
+    State,
+    UnrestrictedUpdateEvent,
+    WitnessFunction,
+    WitnessFunctionDirection,
+)
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.references import ConstantReference, stack_references
+from drake_dae.dae.references.by_name import assigned, in_order
+from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.errors import ModelError, ReferenceSignalError, SimulationError
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.task.phases import Moment
+from drake_dae.systems.task.progress import DONE, HELD, PhaseChange, Progress, Segment
+from drake_dae.systems.task.task import Task
+
+FREE, CONTACT = 0, 1
+"""The places of the two laws."""
+
+
+@dataclass(frozen=True, eq=False)
+class Goals:
+    """The references of a phase for its law.
+
+    Attributes:
+        function: R in s after its begin, zero for outputs that it does not name.
+        named: Which outputs it names.
+    """
+
+    function: Callable[[float], FloatArray]
+    named: tuple[int, ...]
+
+
+class TaskSupervisor(LeafSystem):
+    """Leads through the phases of a task; see `TaskController`.
+
+    Input ports:
+        estimated_state: x, shape (n,).
+        measured_force: All constraint forces, shape (m,).
+
+    Output ports:
+        contact_reference, free_reference: R of the law that acts, zero for the other one.
+        chosen_law: Which input of a `PortSwitch` passes.
+        phase: The place of the phase, shape (1,); the number of phases when done or held.
+        desired_output: The positions, the force and the distance that are wanted, shape (p + 1,);
+            zero for the one of the last two that is none now.
+        contact_hold, free_hold: Where it is 1, the law's integrals stand still, shape (1,): while
+            the other law acts, no force is felt, or the robot has just touched.
+
+    Args:
+        task: The phases.
+        laws: The law of the free robot and that in contact.
+        place: Which output is the distance of the first, and the force of the second.
+        force: Which entry of `measured_force` is the contact's.
+        sample_period: When guards are looked at, in s; 0 for at all times.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        task: Task,
+        laws: tuple[TrackingLaw, TrackingLaw],
+        place: int,
+        force: int,
+        num_forces: int,
+        sample_period: float,
+    ) -> None:
+        super().__init__()
+        self.set_name("task")
+        self.task, self._laws, self._place, self._force = task, laws, place, force
+        self._goals = [
+            _goals(task, index, laws[contact], place) for index, contact in enumerate(task.contacts)
+        ]
+        self._nothing = [_no_goals(law) for law in laws]
+        free = laws[FREE]
+        distance = ca.vertcat(*free.structure.output_chains[place][:2])
+        self._seen = free.system.trace("distance", {"value": distance})
+        self._state_port = self.DeclareVectorInputPort(
+            "estimated_state", laws[FREE].system.num_states
+        )
+        self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
+        self.DeclareNumericParameter(BasicVector(laws[FREE].system.parameter_values))
+        self._index = self.DeclareAbstractState(AbstractValue.Make(Progress()))
+        self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
+        self._witnesses: list[WitnessFunction] = []
+        if sample_period > 0.0:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._advance))
+        else:
+            self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
+            self._witnesses.append(
+                self.MakeWitnessFunction(
+                    "the end of the phase",
+                    WitnessFunctionDirection.kPositiveThenNonPositive,
+                    weakly(self._guard),
+                    UnrestrictedUpdateEvent(weakly(self._at_guard)),
+                )
+            )
+        self._declare_outputs()
+
+    def _declare_outputs(self) -> None:
+        # Before a run it is as if the first phase began at the state that there is.
+        by_state = {
+            self.abstract_state_ticket(self._index),
+            self.input_port_ticket(self._state_port.get_index()),
+            self.all_parameters_ticket(),
+        }
+        by_time = by_state | {self.time_ticket()}
+        felt = by_state | {self.input_port_ticket(self._force_port.get_index())}
+        names = {FREE: "free_reference", CONTACT: "contact_reference"}
+        for which, name in names.items():
+            size = self._laws[which].layout.reference_size
+            self.DeclareVectorOutputPort(name, size, weakly(self._calc_reference, which), by_time)
+        size = self._laws[FREE].system.num_outputs + 1
+        self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
+        self.DeclareVectorOutputPort("phase", 1, weakly(self._calc_phase), by_state)
+        self.DeclareVectorOutputPort("free_hold", 1, weakly(self._calc_free_hold), by_state)
+        felt.add(self.time_ticket())
+        self.DeclareVectorOutputPort("contact_hold", 1, weakly(self._calc_contact_hold), felt)
+        self.DeclareAbstractOutputPort(
+            "chosen_law",
+            lambda: AbstractValue.Make(InputPortIndex(1 + FREE)),
+            weakly(self._calc_chosen),
+            by_state,
+        )
+
+    def progress(self, context: Context) -> Progress:
+        """How far the task is, in a context of this system."""
+        found: Progress = context.get_abstract_state(self._index).get_value()
+        return found
+
+    def desired(self, segment: Segment, time: float) -> FloatArray:
+        """The positions, the force and the distance that a segment wants at a time in s."""
+        values = segment.reference(time)[segment.layout.lowest]
+        found = np.append(values, 0.0)
+        if not segment.change.in_contact:
+            found[-1], found[self._place] = values[self._place], 0.0
+        return found
+
+    def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
+        return self._witnesses
+
+    # What a phase begins with.
+
+    def _segment(self, context: Context) -> Segment:
+        """The references that hold now."""
+        progress = self.progress(context)
+        return progress.segments[-1] if progress.segments else self._first(context)
+
+    def _first(self, context: Context) -> Segment:
+        contact = self.task.contacts[0]
+        law = self._laws[contact]
+        present = self._chain(context, law)
+        if contact and law.degrees[self._place] == 0:
+            present[law.layout.lowest[self._place]] = self.task.contact_force
+        moment = Moment(0.0, 0.0, *self._distance(context), 0.0)
+        phase = self.task.phases[0].name, 0
+        return self._started(context.get_time(), phase, contact, "the task begins", moment, present)
+
+    def _next(
+        self,
+        context: Context,
+        before: Segment,
+        moment: Moment,
+        phase: tuple[str, int],
+        reason: str,
+    ) -> Segment:
+        """The references from now on, which begin as those before are."""
+        time = context.get_time()
+        known = before.reference(time)
+        was, (name, place) = before.change.in_contact, phase
+        if name == HELD:  # It rests as it is: it touches, or is free.
+            contact = was and moment.force >= self.task.contact_force
+        else:
+            contact = was if name == DONE else self.task.contacts[place]
+        law = self._laws[contact]
+        if contact == was:
+            present = known
+        else:
+            present = self._chain(context, law)
+            if contact and law.degrees[self._place] == 0:
+                present[law.layout.lowest[self._place]] = moment.force
+            for i, first in enumerate(law.layout.lowest):
+                if i != self._place:
+                    size, old = law.degrees[i] + 1, before.layout.lowest[i]
+                    present[first : first + size] = known[old : old + size]
+        return self._started(time, phase, contact, reason, moment, present)
+
+    def _started(
+        self,
+        time: float,
+        phase: tuple[str, int],
+        contact: bool,
+        reason: str,
+        moment: Moment,
+        present: FloatArray,
+    ) -> Segment:
+        law, phases, (name, place) = self._laws[contact], self.task.phases, phase
+        rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
+        if place < len(phases):
+            rate[self._place] = -phases[place].speed_of_approach
+            over, goals = phases[place].over, self._goals[place]
+        change = PhaseChange(
+            time=float(time),
+            phase=name,
+            place=place,
+            in_contact=bool(contact),
+            reason=reason,
+            force=float(moment.force),
+            distance=float(moment.distance),
+            distance_rate=float(moment.rate),
+        )
+        return Segment.begin(change, law.layout, goals.function, goals.named, rate, present, over)
+
+    def _chain(self, context: Context, law: TrackingLaw) -> FloatArray:
+        """R that a law meets now: z_i, z_i', ..., and zero for the highest derivatives."""
+        found = np.zeros(law.layout.reference_size)
+        state = self._state_port.Eval(context)
+        parameters = context.get_numeric_parameter(0).CopyToVector()
+        coordinates = law.error_coordinates(state, found, parameters)
+        own = np.delete(coordinates, _integral_places(law))
+        found[law.layout.chained] = own
+        return found
+
+    def _distance(self, context: Context) -> tuple[float, float]:
+        """The distance and its derivative, by the model."""
+        parameters = context.get_numeric_parameter(0).value()
+        distance, rate = self._seen.evaluate(self._state_port.Eval(context), parameters)[0]
+        return float(distance), float(rate)
+
+    # What ends a phase.
+
+    def _moment(self, context: Context, segment: Segment) -> Moment:
+        time = context.get_time()
+        force = float(self._force_port.Eval(context)[self._force])
+        distance, rate = self._distance(context)
+        wanted = segment.reference(time)[segment.layout.lowest[self._place]]
+        return Moment(time - segment.change.time, force, distance, rate, float(wanted))
+
+    def _margins(
+        self, context: Context, progress: Progress, segment: Segment
+    ) -> tuple[Moment, FloatArray]:
+        """What is seen, and how far the phase is from its end, from a lost contact, from late."""
+        task, place = self.task, segment.change.place
+        moment = self._moment(context, segment)
+        phase = task.phases[place]
+        lost = np.inf
+        if phase.if_lost and segment.change.in_contact and moment.force < task.contact_force:
+            lost = task.patience - (context.get_time() - max(progress.felt, segment.change.time))
+        end = phase.margin(moment, task.contact_force)
+        return moment, np.array([end, lost, phase.within - moment.time])
+
+    def _guard(self, context: Context) -> float:
+        """Positive while the phase goes on: Drake seeks where that ends."""
+        progress = self.progress(context)
+        if not progress.segments or self._is_over(progress.segments[-1]):
+            return 1.0
+        _, margins = self._margins(context, progress, progress.segments[-1])
+        least = float(np.min(margins))
+        # What jumped with an event, as the force of an impact, is seen only if it was not so at the
+        # start of a step.
+        return 1.0 if least <= 0.0 and context.get_time() == progress.step else least
+
+    def _is_over(self, segment: Segment) -> bool:
+        return segment.change.place >= len(self.task.phases)
+
+    def _begin(self, context: Context, state: State) -> EventStatus:
+        if self.progress(context).segments:
+            return EventStatus.DidNothing()  # A run that goes on.
+        time = context.get_time()
+        self._put(state, Progress((self._first(context),), time, time))
+        return EventStatus.Succeeded()
+
+    def _at_guard(
+        self, context: Context, event: UnrestrictedUpdateEvent, state: State
+    ) -> EventStatus:
+        return self._advance(context, state)
+
+    def _advance(self, context: Context, state: State) -> EventStatus:
+        progress, time = self.progress(context), context.get_time()
+        segment = progress.segments[-1]
+        if self._is_over(segment):
+            return EventStatus.DidNothing()
+        moment, margins = self._margins(context, progress, segment)
+        is_felt = moment.force >= self.task.contact_force
+        status, found = EventStatus.Succeeded(), progress.segments
+        if np.any(margins <= 0.0):
+            following, status = self._changed(context, segment, moment, margins)
+            found = (*found, following)
+        felt = time if is_felt else progress.felt
+        self._put(state, replace(progress, segments=found, step=time, felt=felt))
+        return status
+
+    def _put(self, state: State, progress: Progress) -> None:
+        state.get_mutable_abstract_state().get_mutable_value(int(self._index)).set_value(progress)
+
+    def _changed(
+        self, context: Context, segment: Segment, moment: Moment, margins: FloatArray
+    ) -> tuple[Segment, EventStatus]:
+        """What follows where a phase has ended."""
+        task, place = self.task, segment.change.place
+        phase, count = task.phases[place], len(task.phases)
+        wanted = phase.awaited(task.contact_force)
+        status = EventStatus.Succeeded()
+        if margins[0] <= 0.0:
+            after = self._named(place + 1)
+            return self._next(context, segment, moment, after, f"after {wanted}"), status
+        if margins[1] <= 0.0:
+            reaction, reason = phase.if_lost, f"the contact of {phase.name} is lost"
+        else:
+            reaction = phase.if_late
+            reason = f"{phase.name} has waited {phase.within:g} s for {wanted}"
+        if reaction == "fail":
+            raise self._failed(context, reason, moment)
+        again = task.last_approach(place) if reaction == "approach" else None
+        after = (HELD, count) if again is None else self._named(again)
+        if reaction == "stop":
+            status = EventStatus.ReachedTermination(self, reason)
+        return self._next(context, segment, moment, after, reason), status
+
+    def _named(self, place: int) -> tuple[str, int]:
+        phases = self.task.phases
+        return (phases[place].name if place < len(phases) else DONE), place
+
+    def _failed(self, context: Context, reason: str, moment: Moment) -> SimulationError:
+        time, state = context.get_time(), self._state_port.Eval(context)
+        return SimulationError(
+            f"{self.get_name()}: {reason}, at t = {time:.6g} s, with a force of {moment.force:.4g} "
+            f"N at a distance of {moment.distance:.4g} m (by the law's model) that changes by "
+            f"{moment.rate:.3g} m/s, state {show(state)}. Give the phase more time or another "
+            "goal, look where the surface is, or choose what follows by if_late and if_lost",
+            time,
+            state.copy(),
+        )
+
+    # What is shown.
+
+    def _calc_reference(self, which: int, context: Context, output: BasicVector) -> None:
+        segment = self._segment(context)
+        if segment.change.in_contact == bool(which):
+            output.SetFromVector(segment.reference(context.get_time()))
+        else:
+            output.SetFromVector(np.zeros(output.size()))
+
+    def _calc_desired(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self.desired(self._segment(context), context.get_time()))
+
+    def _calc_phase(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([float(self._segment(context).change.place)])
+
+    def _calc_free_hold(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([float(self._segment(context).change.in_contact)])
+
+    def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
+        segments = self.progress(context).segments or (self._first(context),)
+        begin = segments[-1].change
+        force = self._force_port.Eval(context)[self._force]
+        is_open = not begin.in_contact or force < self.task.contact_force
+        # The force of an impact is no error to be integrated.
+        touched = len(segments) > 1 and not segments[-2].change.in_contact
+        settles = touched and context.get_time() < begin.time + segments[-1].over
+        output.SetFromVector([float(is_open or settles)])
+
+    def _calc_chosen(self, context: Context, value: AbstractValue) -> None:
+        contact = self._segment(context).change.in_contact
+        value.set_value(InputPortIndex(1 + (CONTACT if contact else FREE)))
+
+
+def _integral_places(law: TrackingLaw) -> list[int]:
+    """Where integrals stand among the error coordinates."""
+    found, place = [], 0
+    for i, degree in enumerate(law.degrees):
+        if i in law.integral.outputs:
+            found.append(place)
+            place += 1
+        place += degree
+    return found
+
+
+def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
+    """The references of a phase."""
+    phase = task.phases[index]
+    names = [signal.name for signal in law.system.output_signals]
+    found, degrees = [], law.degrees
+    for name, reference in phase.goals(names[place]).items():
+        try:
+            found.append(assigned(name, reference, names, degrees))
+        except ReferenceSignalError as error:
+            raise ModelError(
+                f"phase {index + 1} of the task, {phase.name}: reference '{name}': {error}"
+            ) from error
+    named = tuple(i for one in found for i in one.places)
+    rest = [name for i, name in enumerate(names) if i not in named]
+    found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
+    try:
+        return Goals(stack_references(in_order(found, names), degrees), named)
+    except ReferenceSignalError as error:
+        raise ModelError(f"phase {index + 1} of the task, {phase.name}: {error}") from error
+
+
+def _no_goals(law: TrackingLaw) -> Goals:
+    zero = np.zeros(law.layout.reference_size)
+    return Goals(lambda time: zero, ())

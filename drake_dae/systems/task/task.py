@@ -1,0 +1,86 @@
+"""A task: phases in an order that makes sense."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import positive
+from drake_dae.errors import ModelError
+from drake_dae.systems.task.phases import Phase
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Task:
+    """Phases, one after the other; after the last one the robot rests where it is.
+
+    Attributes:
+        phases: The phases. Where the first one begins in contact, it does so with `contact_force`.
+        contact_force: A force that is less than this, in N, is none: with it the robot has
+            touched, and below it it has let go.
+        patience: How long the force of a contact that shall hold may be none before the contact is
+            lost, in s; a contact that gives way may bounce at first.
+
+    Raises:
+        ModelError: There are no phases, one begins in contact where that before does not end so, or
+            the other way round, or a number makes no sense.
+    """
+
+    phases: Sequence[Phase]
+    contact_force: float = 0.5
+    patience: float = 0.25
+
+    def __post_init__(self) -> None:
+        positive("contact_force", self.contact_force)
+        positive("patience", self.patience)
+        object.__setattr__(self, "phases", tuple(self.phases))
+        if not self.phases:
+            raise ModelError("a task needs phases, such as Approach(0.05), Press(20.0), Release()")
+        left = self.phases[0].begins_in_contact
+        for index, phase in enumerate(self.phases):
+            where = f"phase {index + 1} of the task, {phase.name}"
+            if phase.begins_in_contact and not left:
+                raise ModelError(
+                    f"{where}: it begins in contact, where the robot is free; an Approach must "
+                    "lead there"
+                )
+            if phase.begins_in_contact is False and left:
+                raise ModelError(
+                    f"{where}: it begins with a free robot, which is in contact; a Release must "
+                    "lead there"
+                )
+            left = left if phase.ends_in_contact is None else phase.ends_in_contact
+            for key in ("if_late", "if_lost"):
+                if getattr(phase, key) == "approach" and self.last_approach(index) is None:
+                    raise ModelError(
+                        f"{where}: {key}: approach goes back to an Approach, and there is none "
+                        "before it"
+                    )
+
+    @property
+    def contacts(self) -> tuple[bool, ...]:
+        """Whether each phase begins in contact."""
+        found, left = [], False
+        for phase in self.phases:
+            begins = phase.begins_in_contact
+            found.append(left if begins is None else begins)
+            left = found[-1] if phase.ends_in_contact is None else phase.ends_in_contact
+        return tuple(found)
+
+    def last_approach(self, index: int) -> int | None:
+        """The place of the last phase up to one that leads into contact; None if there is none."""
+        for place in range(index, -1, -1):
+            phase = self.phases[place]
+            if phase.ends_in_contact and not phase.begins_in_contact:
+                return place
+        return None
+
+    def __repr__(self) -> str:
+        return f"Task({', '.join(phase.name for phase in self.phases)})"
+
+    def __str__(self) -> str:
+        """One line for each phase: what ends it."""
+        return "\n".join(
+            f"{index + 1}. {phase.name}, until {phase.awaited(self.contact_force)}"
+            for index, phase in enumerate(self.phases)
+        )

@@ -1,0 +1,98 @@
+"""The two-link arm and a task on its wall: short, and with a hand that can pull it off."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from arms import arm, error_controlled, parse
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
+
+from drake_dae import (
+    Approach,
+    KnownForce,
+    Move,
+    PointToPointReference,
+    Press,
+    Release,
+    Retreat,
+    RobotModel,
+    Task,
+    TaskController,
+    TaskLoop,
+    TrackingLaw,
+    UnilateralRobotPlant,
+    make_task_loop,
+    open_contact,
+    poles,
+    shipped_model,
+    simulate,
+)
+from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.systems.task.phases import Phase
+
+SPEED, OVER, FAR = 0.05, 0.2, 0.02
+POLE = -8.0
+CLIMB = PointToPointReference(0.3, 0.4, 0.0, 0.4)
+WHOLE = (
+    Approach(SPEED, over=OVER),
+    Press(20.0, over=0.2),
+    Move({"tool.z": CLIMB}, 0.5, over=0.2),
+    Release(over=0.2),
+    Retreat(0.03, over=0.4),
+)
+
+
+@cache
+def polisher() -> RobotModel:
+    """The arm of `arms.touching`, with a known force "push" on its tool."""
+    known = arm("two_link").model
+    return RobotModel.from_multibody(
+        parse("two_link_arm"),
+        known.constraints,
+        known.positions,
+        [1.2, -1.6],
+        "two_link",
+        loads=[KnownForce("tool", name="push")],
+    )
+
+
+@cache
+def laws() -> tuple[TrackingLaw, TrackingLaw]:
+    system = polisher().dae
+    free = open_contact(system, "wall.force")
+    return TrackingLaw(system, poles(POLE)), TrackingLaw(free, poles(POLE))
+
+
+def task_loop(phases: Sequence[Phase], **settings: float) -> TaskLoop:
+    """The ideal plant under a task."""
+    controller = TaskController(Task(phases, **settings), *laws())
+    return make_task_loop(UnilateralRobotPlant(polisher(), {"wall": 0.0}), controller)
+
+
+def started(loop: TaskLoop, distance: float = FAR, height: float = 0.3) -> Context:
+    """A context of a loop with the arm at rest, off the wall."""
+    context = loop.diagram.CreateDefaultContext()
+    guess = polisher().dae.nominal_state
+    loop.set_state(context, loop.controller.rest_state([height, distance], guess))
+    return context
+
+
+def run_on(loop: TaskLoop, context: Context, end: float, accuracy: float = 1e-6) -> RunStatistics:
+    """Goes on until a time."""
+    config = error_controlled(accuracy)
+    config.start_time = context.get_time()
+    return simulate(loop.diagram, context, end - context.get_time(), config)
+
+
+def push(loop: TaskLoop, context: Context, force: float) -> None:
+    """A hand that pushes the tool into the wall, or pulls it off."""
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_parameter(own, "push.force", np.array([force, 0.0, 0.0]))
+
+
+def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Adds the two-link arm to a plant."""
+    Parser(plant).AddModels(str(shipped_model("two_link_arm.urdf")))

@@ -1,0 +1,50 @@
+"""The rules of `systems.task.phases.Phase`, run on every member."""
+
+from dataclasses import replace
+
+import pytest
+
+from drake_dae import Approach, ConstantReference, Dwell, Move, Press, Release, Retreat
+from drake_dae.errors import ModelError
+from drake_dae.systems.task.phases import Moment
+
+CONTACT_FORCE = 0.5
+
+# A phase; what is seen while it goes on; what is seen when it is over.
+MEMBERS = {
+    "Approach": (Approach(0.05), Moment(1.0, 0.0, 0.1, -0.05, 0.1), Moment(2.0, 0.6, 0.0, 0.0, 0)),
+    "Press": (Press(20.0), Moment(0.6, 18.0, 0.0, 0.0, 20.0), Moment(0.6, 19.5, 0.0, 0.0, 20.0)),
+    "Press early": (
+        Press(ConstantReference(20.0)),
+        Moment(0.4, 20.0, 0.0, 0.0, 20.0),
+        Moment(0.5, 20.0, 0.0, 0.0, 20.0),
+    ),
+    "Move": (Move({}, 2.0), Moment(1.9, 20.0, 0.0, 0.0, 20.0), Moment(2.0, 20.0, 0.0, 0.0, 20.0)),
+    "Dwell": (Dwell(2.0), Moment(1.9, 0.0, 0.1, 0.0, 0.1), Moment(2.1, 0.0, 0.1, 0.0, 0.1)),
+    "Release": (Release(), Moment(0.3, 3.0, 0.0, 0.0, 3.0), Moment(0.5, 0.4, 0.0, 0.0, 0.3)),
+    "Retreat": (Retreat(0.1), Moment(0.6, 0.0, 0.09, 0.1, 0.1), Moment(0.6, 0.0, 0.1, 0.0, 0.1)),
+}
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_phase_keeps_the_rules(name):
+    phase, going_on, over = MEMBERS[name]
+    assert phase.name == name.split()[0]
+    assert phase.margin(going_on, CONTACT_FORCE) > 0.0  # Rule 4.
+    assert phase.margin(over, CONTACT_FORCE) <= 0.0
+    assert phase.within > going_on.time
+    assert phase.if_late in ("approach", "hold", "stop", "fail")
+    assert phase.awaited(CONTACT_FORCE)
+    # Rule 1: what leads from one law to the other says so of both ends.
+    assert (phase.begins_in_contact is None) == (phase.ends_in_contact is None)
+    # Rule 2: what approaches has no goal for the distance.
+    goals = phase.goals("contact")
+    assert set(goals) <= {"contact"}
+    assert not (phase.speed_of_approach and goals)
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_phase_takes_time(name):
+    phase = MEMBERS[name][0]
+    with pytest.raises(ModelError, match=rf"{phase.name}: over must be positive, got 0\.0"):
+        replace(phase, over=0.0)
