@@ -304,7 +304,7 @@ def _protocol(protocol: Any) -> _Rule:
 
 
 def _article(name: str) -> str:
-    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+    return f"{'an' if name[0] in 'AEIOU' and not name.startswith('Uni') else 'a'} {name}"
 
 
 def _is_bool(value: Any) -> bool:
