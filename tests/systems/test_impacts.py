@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from drake_dae.systems.unilateral.frictional import Rubbing, impact
 from drake_dae.systems.unilateral.impacts import (
     Touch,
     complementary,
@@ -77,3 +78,70 @@ def test_friction_may_leave_none_or_two():
     assert complementary(turned, np.array([-1.0, 1.0]), rows(), TOUCHES[:0]) is not None
     touches = [Touch(0, rows(0)), Touch(1, rows(1))]
     assert complementary(turned, np.array([-1.0, 1.0]), rows(), touches) is None
+
+
+def rubbing_bodies(seed, tangents):
+    """A random body of 6 freedoms with two contacts and one kept row; rates along them."""
+    random = np.random.default_rng(seed)
+    J = random.standard_normal((1 + 2 * (1 + tangents), 6))
+    root = random.standard_normal((6, 6))
+    A = J @ np.linalg.inv(root @ root.T + 0.5 * np.eye(6)) @ J.T
+    before = J @ random.standard_normal(6)
+    before[0] = 0.0
+    contacts, start = [], 1
+    for mu in random.uniform(0.0, 1.0, 2):
+        before[start] = -abs(before[start])
+        along = np.arange(start + 1, start + 1 + tangents)
+        contacts.append(Rubbing(start, along, mu, random.uniform(0.0, 1.0)))
+        start += 1 + tangents
+    return A, before, contacts
+
+
+@pytest.mark.parametrize(("tangents", "count"), [(1, 2), (2, 1)])
+def test_impacts_that_rub_are_in_their_cones_and_gain_no_energy(tangents, count):
+    """Of 60 random bodies each, by the conditions themselves; some bounce less, as Kane says.
+
+    Those of 36 go to and fro, and are found among all sets.
+    """
+    seen, less = set(), 0
+    for seed in range(60):
+        A, before, contacts = rubbing_bodies(seed, tangents)
+        contacts = contacts[:count]
+        impulses = impact(A, before, rows(0), contacts)
+        after, size = before + A @ impulses, np.abs(before).max()
+        assert impulses @ (before + after) <= 1e-12 * size**2
+        assert abs(after[0]) < 1e-11 * size
+        factors, opened = [], []
+        for one in contacts:
+            push, along = impulses[one.normal], impulses[one.along]
+            if push == 0.0:
+                assert not along.any()
+                opened.append((after[one.normal], one.restitution * before[one.normal]))
+                seen.add("open")
+                continue
+            assert push > 0.0
+            factors.append(-after[one.normal] / before[one.normal] / one.restitution)
+            slip, most = after[one.along], one.friction * push
+            if np.linalg.norm(slip) < 1e-10 * size:
+                assert np.linalg.norm(along) <= most * (1.0 + 1e-10)
+                seen.add("stick")
+            else:
+                assert_allclose(along, -most * slip / np.linalg.norm(slip), atol=1e-9 * size)
+                seen.add("slip")
+        # Newton's law: all bounce as they shall, or all by one factor less.
+        assert_allclose(factors, np.max(factors, initial=0.0), atol=1e-8)
+        assert all(rate + factors[0] * bounce >= -1e-8 * size for rate, bounce in opened)
+        assert np.max(factors, initial=0.0) <= 1.0 + 1e-9
+        less += bool(factors) and factors[0] < 1.0 - 1e-6
+    assert seen == {"open", "stick", "slip"} if count > 1 else {"stick", "slip"}
+    assert less > 0
+
+
+def test_a_block_that_lands_on_one_foot_sticks_or_slides():
+    """A point mass: A is 1 / m. It sticks where |c_t| <= mu |c_n|, else it slows down."""
+    contact = [Rubbing(0, rows(1, 2), 0.5, 0.0)]
+    A = np.eye(3) / 2.0
+    sticks = impact(A, np.array([-1.0, 0.3, 0.3]), rows(), contact)
+    assert_allclose(A @ sticks, [1.0, -0.3, -0.3], atol=1e-14)
+    slides = impact(A, np.array([-1.0, 3.0, 4.0]), rows(), contact)
+    assert_allclose(slides, [2.0, -0.6, -0.8], atol=1e-12)

@@ -121,7 +121,7 @@ class Constraint(ABC):
     12. `drag` is what it does without constraint forces, as viscous friction; `applications` hold
         it too.
     13. Where what lambda does besides grows with one of its parameters, a coefficient of friction,
-        `friction_parameter` names that.
+        `friction_parameter` names that, and `sliding` is the velocity along which it rubs.
     14. `solid` is what its one force comes from where Drake's own contact is the plant: what stands
         in the world and pushes frame B of its first application at the point there.
     15. `touch` tells at which point it touches what has a free side, if it does; `residual` is then
@@ -143,6 +143,13 @@ class Constraint(ABC):
     @property
     def friction_parameter(self) -> str | None:
         """The name of its coefficient of friction among its parameters; None without one."""
+        return None
+
+    def sliding(self, kinematics: Kinematics) -> ca.SX | None:
+        """The velocity at which it slides, relative to what it rubs on, m/s, shape (3, 1).
+
+        None where it does not rub, or in a way of its own, which impacts then know nothing of.
+        """
         return None
 
     @property

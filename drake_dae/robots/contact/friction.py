@@ -22,19 +22,15 @@ class Friction:
     drag: ca.SX | None
 
     @classmethod
-    def of(
-        cls, name: str, parameters: Sequence[Parameter], velocity: ca.SX, normal: ca.SX
-    ) -> "Friction":
+    def of(cls, name: str, parameters: Sequence[Parameter], sliding: ca.SX) -> "Friction":
         """The friction by the parameters that `friction_parameters` made.
 
         Args:
             name: The name of the constraint.
             parameters: Its parameters.
-            velocity: That of the point relative to the surface, m/s, shape (3, 1).
-            normal: The normal of the surface there, of length one, shape (3, 1).
+            sliding: v_t, the velocity of the point along the surface, m/s, shape (3, 1).
         """
         known = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
-        sliding = velocity - normal * ca.dot(normal, velocity)
         pull, drag = ca.SX(3, 1), None
         if "friction" in known:
             speed = ca.sqrt(ca.sumsqr(sliding) + known["stiction_tolerance"] ** 2)

@@ -119,6 +119,10 @@ class PointOnSurface(Constraint):
 
     def _friction(self, kinematics: Kinematics) -> Friction | None:
         """How the point rubs; None where it does not."""
+        sliding = self.sliding(kinematics)
+        return None if sliding is None else Friction.of(self.name, self.parameters, sliding)
+
+    def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         if self.is_ideal:
             return None
         surface = self.parameters[0].rate
@@ -128,7 +132,8 @@ class PointOnSurface(Constraint):
             turning = ca.jtimes(ca.mtimes(self._rotation(), offset), turn.symbol, turn.rate)
             surface = surface + ca.substitute(turning, offset, self.offset(kinematics))
         velocity = kinematics.velocity(self.frame, self.point) - surface
-        return Friction.of(self.name, self.parameters, velocity, self._normal(kinematics))
+        normal = self._normal(kinematics)
+        return velocity - normal * ca.dot(normal, velocity)
 
     @property
     def is_ideal(self) -> bool:

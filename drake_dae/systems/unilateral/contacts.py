@@ -12,8 +12,10 @@ from drake_dae.dae.contacts import Jam, jam
 from drake_dae.dae.layout import Indices
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import JammedContactError, ModelError
+from drake_dae.robots.contact.constraint import Constraint
 from drake_dae.robots.contact.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.unilateral.frictional import Rubbing
 from drake_dae.systems.unilateral.impacts import Touch, is_p_matrix
 
 
@@ -22,20 +24,32 @@ class Terms:
     """What decides of contacts at one state, for all constraints, shape (m,) each.
 
     Attributes:
-        rates: The rates c of the constraints: phi', or what restricts velocities alone.
+        all_rates: The rates c of the constraints, phi' or what restricts velocities alone, and
+            below them the velocities at which contacts slide that rub, shape (m + s,).
         accelerations: c' without constraint forces.
         force_matrix: How constraint forces enter c', shape (m, m).
-        impulse_matrix: How impulses enter c, shape (m, m); the same without friction.
-        velocity_change: How impulses enter x, shape (n, m).
+        all_impulses: How impulses enter `all_rates`, shape (m + s, m + s).
+        velocity_change: How impulses enter x, shape (n, m + s).
         size: How large the terms are that `accelerations` are the sums of.
     """
 
-    rates: FloatArray
+    all_rates: FloatArray
     accelerations: FloatArray
     force_matrix: FloatArray
-    impulse_matrix: FloatArray
+    all_impulses: FloatArray
     velocity_change: FloatArray
     size: FloatArray
+
+    @property
+    def rates(self) -> FloatArray:
+        """Those of the constraints alone, shape (m,)."""
+        return self.all_rates[: self.accelerations.size]
+
+    @property
+    def impulse_matrix(self) -> FloatArray:
+        """How impulses of constraints enter their rates, shape (m, m)."""
+        m = self.accelerations.size
+        return self.all_impulses[:m, :m]
 
     def jam(self, kept: Sequence[int], normals: Sequence[int]) -> Jam | None:
         """What becomes of contacts that touch and rub; None where one set of forces fits.
@@ -72,6 +86,7 @@ class UnilateralContacts:
         dae: The system with all contacts closed.
         restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
+        along: Where the velocities of each contact stand along which it rubs, among `all_rates`.
         kept: The rows of all other constraints.
         normals: The row of each contact that can only push.
         gaps: A function of state and parameters: phi of each contact, and phi'.
@@ -142,13 +157,15 @@ class UnilateralContacts:
         self.gaps = dae.trace("gaps", found)
         positions, velocities = links.q.numel(), links.v.numel()
         self._moved = slice(positions, positions + velocities)
+        sliding = self._sliding(model, parts)
+        every = ca.vertcat(self.rates, sliding)
         control = ca.SX.sym("u", dae.num_controls)
         self._control = bool(dae.num_controls)
         self._terms = dae.trace(
             "contacts",
             {
-                "rates": self.rates,
-                "slope": ca.jacobian(self.rates, dae.state),
+                "rates": every,
+                "slope": ca.jacobian(every, dae.state),
                 "drift": self.drift,
                 "mass": dae.mass_matrix,
                 "free": dae.f + ca.mtimes(dae.h, control),
@@ -157,6 +174,34 @@ class UnilateralContacts:
             {"control": control},
             often=False,
         )
+
+    def _sliding(self, model: RobotModel, parts: Mapping[str, tuple[Constraint, slice]]) -> ca.SX:
+        """The velocities of contacts that rub, shape (s, 1); notes where they stand, and mu."""
+        kinematics, rows = model.links.kinematics(), [ca.SX(0, 1)]
+        start = self.dae.num_constraints
+        self.along: list[Indices] = []
+        self._friction: list[int | None] = []
+        for name in self.names:
+            constraint = parts[name][0]
+            sliding, mu = constraint.sliding(kinematics), constraint.friction_parameter
+            size = 0 if sliding is None or mu is None else sliding.numel()
+            self.along.append(np.arange(start, start + size))
+            self._friction.append(self.dae.parameter_slice(mu).start if size and mu else None)
+            if sliding is not None and size:
+                rows.append(sliding)
+            start += size
+        return kinematics.value(ca.vertcat(*rows))
+
+    def rubbing(self, place: int, parameters: FloatArray, restitution: float) -> Rubbing:
+        """How a contact rubs in an impact.
+
+        What restricts its velocities besides, as where it sticks, holds as far as it pushes.
+        """
+        touch, mu = self.touches[place], self._friction[place]
+        others = touch.rows[touch.rows != touch.normal]
+        if mu is None or others.size:
+            return Rubbing(touch.normal, others, np.inf, restitution)
+        return Rubbing(touch.normal, self.along[place], float(parameters[mu]), restitution)
 
     def holds(self, closed: Sequence[bool]) -> FloatArray:
         """For each entry of the residual 1, or 0 where it is that of a contact that is open."""
@@ -168,24 +213,23 @@ class UnilateralContacts:
     def terms(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> Terms:
         """The numbers at a state; nan where a function has no value."""
         values = self._terms.evaluate(state, control, parameters)
-        n = state.size
+        n, m = state.size, self.dae.num_constraints
         rates, slope, drift, mass, free, force = (value.copy() for value in values)
-        m = rates.size
-        slope, mass, force = slope.reshape(m, n), mass.reshape(n, n), force.reshape(n, m)
-        push = np.zeros((n, m))
+        slope, mass, force = slope.reshape(-1, n), mass.reshape(n, n), force.reshape(n, m)
+        push = np.zeros((n, rates.size))
         push[self._moved] = slope[:, self._moved].T
         try:
             solved = np.asarray(np.linalg.solve(mass, np.column_stack([free, force, push])), float)
         except np.linalg.LinAlgError:
-            solved = np.full((n, 1 + 2 * m), np.nan)
+            solved = np.full((n, 1 + m + rates.size), np.nan)
         moved = slope @ solved
         return Terms(
-            rates=rates,
-            accelerations=moved[:, 0] + drift,
-            force_matrix=moved[:, 1 : m + 1],
-            impulse_matrix=moved[:, m + 1 :],
+            all_rates=rates,
+            accelerations=moved[:m, 0] + drift,
+            force_matrix=moved[:m, 1 : m + 1],
+            all_impulses=moved[:, m + 1 :],
             velocity_change=solved[:, m + 1 :],
-            size=np.abs(slope) @ np.abs(solved[:, 0]) + np.abs(drift),
+            size=np.abs(slope[:m]) @ np.abs(solved[:, 0]) + np.abs(drift),
         )
 
     def jammed(

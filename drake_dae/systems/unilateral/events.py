@@ -28,7 +28,8 @@ class ContactEvent:
             zero.
         contacts: The names of the contacts that it happened to.
         closed: The names of the contacts that are closed after it.
-        impulses: What each of `contacts` did to the robot, N s, zero without an impact.
+        impulses: What each of `contacts` did to the robot along its normal, N s, zero without an
+            impact.
         energy_lost: Kinetic energy, J, never negative, where surfaces stand still.
         rest_time: When bouncing would have ended, in s: the limit of the times of infinitely many
             impacts. None unless it comes to rest.

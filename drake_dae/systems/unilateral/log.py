@@ -52,8 +52,9 @@ def clearance(log: Log, time: float, gaps: FloatArray, rates: FloatArray) -> Flo
         b = step * log.rates[i]
         c = 3.0 * rise - step * (2.0 * log.rates[i] + rates[i])
         d = step * (log.rates[i] + rates[i]) - 2.0 * rise
-        s = -b / (c + np.sqrt(c * c - 3.0 * b * d))  # Where b + 2 c s + 3 d s^2 = 0 and it rises.
-        lowest = log.gaps[i] + s * (b + s * (c + s * d))
-        if lowest < -TOUCHING:
-            found[i] = lowest
+        root = c + np.sqrt(max(c * c - 3.0 * b * d, 0.0))
+        if root > -b:  # Not where all that is but round-off.
+            s = -b / root  # There b + 2 c s + 3 d s^2 = 0, and it rises.
+            lowest = log.gaps[i] + s * (b + s * (c + s * d))
+            found[i] = lowest if lowest < -TOUCHING else found[i]
     return found

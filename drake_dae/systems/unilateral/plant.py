@@ -43,7 +43,7 @@ class UnilateralRobotPlant(ModalPorts):
     - It closes where phi falls through zero: an impact, by Newton's law with its coefficient of
       restitution e; several at once by a linear complementarity problem. Bouncing ends by a rule
       that is exact in its limit; see `Resets` for all of it. Velocities jump; positions and the
-      states of stages do not. Impacts are without friction.
+      states of stages do not. A contact that rubs does so in impacts, too.
     - It opens where lambda falls through zero, or where a control that jumps pulls at it.
     - Where contacts depend on each other, as four feet of a table, as few as do carry it, and the
       others touch without force. Where friction leaves no motion, or two, the run ends with a

@@ -10,6 +10,7 @@ from drake_dae.dae.contacts import Jam
 from drake_dae.errors import SimulationError
 from drake_dae.systems.unilateral.contacts import Terms, UnilateralContacts
 from drake_dae.systems.unilateral.events import ContactChange, ContactEvent
+from drake_dae.systems.unilateral.frictional import impact
 from drake_dae.systems.unilateral.impacts import (
     MOST,
     Fit,
@@ -53,7 +54,8 @@ class Resets:
         c+ = c- + A Lambda,    0 <= Lambda_i,    0 <= c+_i + e_i c-_i,    Lambda_i (...) = 0,
 
     c being the rates and A = J M^-1 J^T; kept constraints have c+ = 0. No energy is gained: it
-    changes by Lambda . (c- + c+) / 2, in which every term of a contact is at most zero.
+    changes by Lambda . (c- + c+) / 2, in which every term of a contact is at most zero. Where a
+    contact rubs, its impulse along the surface is Coulomb's; see `frictional`.
 
     Bouncing ends where its end is near: the contacts that leave at c+ fall back at the rate a > 0
     after 2 c+ / a, and from impact to impact the largest rate shrinks by rho = max c+ / max |c-|.
@@ -144,13 +146,20 @@ class Resets:
         parameters: FloatArray,
         e: FloatArray,
     ) -> tuple[FloatArray, ContactEvent]:
-        contacts, before = self._contacts, terms.rates
+        contacts, before = self._contacts, terms.all_rates
         touches = [contacts.touches[i] for i in touching]
         normals = np.array([touch.normal for touch in touches])
-        wanted = before.copy()
-        wanted[normals] *= 1.0 + e
-        matrix = terms.impulse_matrix
-        impulse = self._fit(time, state, matrix, wanted, touches).values
+        matrix = terms.all_impulses
+        rubbing = [contacts.rubbing(i, parameters, own) for i, own in zip(touching, e, strict=True)]
+        if any(0.0 < one.friction < np.inf for one in rubbing):
+            found = impact(matrix, before, contacts.kept, rubbing)
+            if found is None:
+                raise self._unfit(time, state)
+            impulse = found
+        else:
+            wanted = before.copy()
+            wanted[normals] *= 1.0 + e
+            impulse = self._fit(time, state, matrix, wanted, touches).values
         after = before + matrix @ impulse
         x = state + terms.velocity_change @ impulse
         rest = self._rest(time, x, touches, before, control, parameters)
@@ -209,13 +218,16 @@ class Resets:
     ) -> Fit:
         fit = complementary(matrix, offset, self._contacts.kept, touches)
         if fit is None:
-            raise SimulationError(
-                f"{self._contacts.dae.name}: no forces of the contacts that touch at t = "
-                f"{time:.6g} s, state {show(state)}, keep them from being pierced by pushing alone",
-                time,
-                state,
-            )
+            raise self._unfit(time, state)
         return fit
+
+    def _unfit(self, time: float, state: FloatArray) -> SimulationError:
+        return SimulationError(
+            f"{self._contacts.dae.name}: no forces of the contacts that touch at t = "
+            f"{time:.6g} s, state {show(state)}, keep them from being pierced by pushing alone",
+            time,
+            state,
+        )
 
     def _changes(
         self, time: float, before: Closed, closed: Closed, events: Sequence[ContactEvent]

@@ -1,0 +1,250 @@
+"""Impacts of contacts that rub: Newton's law across surfaces, Coulomb's along them; numbers alone.
+
+With c the rates, A = J M^-1 J^T over all rows, and Lambda the impulses, c+ = c- + A Lambda; kept
+rows have c+ = 0, and each contact with its normal n and its rows t along the surface
+
+    0 <= Lambda_n,    0 <= c+_n + e c-_n,    Lambda_n (...) = 0,
+    c+_t = 0 and |Lambda_t| <= mu Lambda_n,    or    Lambda_t = -mu Lambda_n c+_t / |c+_t|
+
+(Moreau 1988, Glocker 2001, with no restitution along the surface). With bounces it can gain energy
+(Kane 1984), without it cannot: Lambda_n c+_n = 0 and Lambda_t . c+_t <= 0 leave
+
+    T+ - T- = Lambda . c+ - Lambda . A Lambda / 2 <= 0.
+
+So where energy would be gained all coefficients of restitution are less, by the factor at which
+none is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.layout import Indices
+from drake_dae.systems.unilateral.impacts import DEPENDENT
+
+SWEEPS = 500
+"""So often impulses of one contact after the other are found, each with those of the others."""
+
+SETTLED = 1e-14
+"""A sweep that changes impulses by less, relative to the largest, is the last."""
+
+ANGLES = 72
+"""Among so many directions along a surface that is sought in which a contact slides on."""
+
+MOST_SETS = 4
+"""Of so many contacts all sets are tried where they go to and fro."""
+
+FITS = 1e-11
+"""What a set may violate, relative to what there is."""
+
+HALVINGS = 60
+"""So often the factor of restitution is halved in between: to round-off."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rubbing:
+    """The rows of one contact that rubs.
+
+    Attributes:
+        normal: The row that must not be pierced.
+        along: The rows along the surface, in any axes of length one; they may depend on each other.
+        friction: mu, zero or more.
+        restitution: e, 0 to 1.
+    """
+
+    normal: int
+    along: Indices
+    friction: float
+    restitution: float
+
+
+def impact(
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+) -> FloatArray | None:
+    """The impulses Lambda of contacts that rub, shape (k,).
+
+    Args:
+        matrix: A over all rows, positive semidefinite, shape (k, k).
+        before: c-, shape (k,).
+        kept: The rows that nothing opens.
+        contacts: The contacts that touch.
+
+    Returns:
+        The impulses; None if none are found.
+    """
+    found = _impulses(matrix, before, kept, contacts)
+    if found is None or _gained(matrix, before, found) <= 0.0:
+        return found
+    least, most = 0.0, 1.0
+    best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (least + most)
+        tried = _impulses(matrix, before, kept, _bouncing(contacts, middle))
+        if tried is not None and _gained(matrix, before, tried) <= 0.0:
+            least, best = middle, tried
+        else:
+            most = middle
+    return best
+
+
+def _bouncing(contacts: Sequence[Rubbing], factor: float) -> list[Rubbing]:
+    return [replace(one, restitution=factor * one.restitution) for one in contacts]
+
+
+def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> float:
+    """What the kinetic energy gains, less round-off."""
+    twice = impulses @ (2.0 * before + matrix @ impulses)
+    size = np.abs(impulses) @ np.abs(before)
+    return float(0.5 * twice - 1e-14 * size)
+
+
+def _impulses(
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+) -> FloatArray | None:
+    # What is kept follows from the contacts: c_k = 0.
+    inverse = np.linalg.pinv(matrix[np.ix_(kept, kept)], DEPENDENT, hermitian=True)
+    A = matrix - matrix[:, kept] @ inverse @ matrix[kept]
+    b = before - matrix[:, kept] @ inverse @ before[kept]
+    wanted = b.copy()
+    blocks = []
+    for one in contacts:
+        wanted[one.normal] += one.restitution * before[one.normal]
+        blocks.append(_axes(A, one))
+    impulses, total = [np.zeros(axes.shape[1]) for axes in blocks], np.zeros(before.size)
+    parts = [axes.T @ A @ axes for axes in blocks]
+    for _ in range(SWEEPS):
+        change = 0.0
+        for i, (axes, part, one) in enumerate(zip(blocks, parts, contacts, strict=True)):
+            others = total - axes @ impulses[i]
+            own = _of_one(part, axes.T @ (wanted + A @ others), one.friction)
+            if own is None:
+                return None
+            change = max(change, float(np.abs(own - impulses[i]).max()))
+            impulses[i], total = own, others + axes @ own
+        if change <= SETTLED * np.abs(total).max(initial=0.0):
+            break
+    else:  # They go to and fro.
+        found = _of_sets(A, wanted, blocks, [one.friction for one in contacts])
+        if found is None:
+            return None
+        total = found
+    total[kept] = -inverse @ (before[kept] + matrix[kept] @ total)
+    return total
+
+
+def _of_sets(
+    matrix: FloatArray,
+    wanted: FloatArray,
+    blocks: Sequence[FloatArray],
+    frictions: Sequence[float],
+) -> FloatArray | None:
+    """The impulses of contacts in a plane that open, stick or slide: of all sets, the first to fit.
+
+    With y_t = -mu d y_n where a contact slides along d, all of it is linear.
+    """
+    if len(blocks) > MOST_SETS or any(axes.shape[1] != 2 for axes in blocks):
+        return None
+    size = np.abs(wanted).max()
+    for ways in product((None, 0.0, 1.0, -1.0), repeat=len(blocks)):
+        pushing = [
+            (axes, mu, way)
+            for axes, mu, way in zip(blocks, frictions, ways, strict=True)
+            if way is not None
+        ]
+        # What unknowns make, and the rates that are zero.
+        makes = [axes if not way else axes @ [[1.0], [-mu * way]] for axes, mu, way in pushing]
+        zero = [axes if not way else axes[:, :1] for axes, _, way in pushing]
+        total = np.zeros(wanted.size)
+        if pushing:
+            make, rows = np.hstack(makes), np.hstack(zero)
+            try:
+                total = make @ np.linalg.solve(rows.T @ matrix @ make, -rows.T @ wanted)
+            except np.linalg.LinAlgError:
+                continue
+        rates = wanted + matrix @ total
+        if all(
+            _fits(axes.T @ total, axes.T @ rates, mu, way, FITS * size)
+            for axes, mu, way in zip(blocks, frictions, ways, strict=True)
+        ):
+            return total
+    return None
+
+
+def _fits(
+    impulses: FloatArray, rates: FloatArray, friction: float, way: float | None, slack: float
+) -> bool:
+    """Whether a contact does as its set says: None is open, 0 sticks, else it slides that way."""
+    if way is None:
+        return bool(rates[0] >= -slack)
+    if way:
+        return bool(impulses[0] >= 0.0 and rates[1] * way >= -slack)
+    return bool(abs(impulses[1]) <= friction * impulses[0])
+
+
+def _axes(matrix: FloatArray, one: Rubbing) -> FloatArray:
+    """The normal, and those directions along the surface that impulses move, as columns."""
+    rows = one.along
+    values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])
+    moved = vectors[:, values > DEPENDENT * max(values.max(initial=0.0), 0.0)]
+    axes = np.zeros((matrix.shape[0], 1 + moved.shape[1]))
+    axes[one.normal, 0] = 1.0
+    axes[rows, 1:] = moved
+    return axes
+
+
+def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray | None:
+    """The impulses of one contact, its normal first: it opens, sticks or slides."""
+    if wanted[0] >= 0.0:
+        return np.zeros(wanted.size)
+    if wanted.size == 1 or friction == 0.0:
+        straight = np.zeros(wanted.size)
+        straight[0] = -wanted[0] / matrix[0, 0]
+        return straight
+    sticking = np.asarray(np.linalg.solve(matrix, -wanted), float)
+    if sticking[0] > 0.0 and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
+        return sticking
+
+    ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
+    impulses, after = _slid(matrix, wanted, friction, ways)
+    fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (np.sum(after * ways, axis=0) >= 0.0)
+    if not fits.any():
+        return None
+    # Where several fit, that which goes on most as it came.
+    onward = np.where(fits, wanted[1:] @ after, -np.inf)
+    return impulses[:, int(np.argmax(onward))]
+
+
+def _slid(
+    matrix: FloatArray, wanted: FloatArray, friction: float, ways: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Impulses that rub against ways along the surface, and what of c+ is along it; columns."""
+    push = np.vstack([np.ones((1, ways.shape[1])), -friction * ways])
+    mobility = matrix[0] @ push
+    impulses = push * np.divide(
+        -wanted[0], mobility, out=np.full(mobility.shape, np.inf), where=mobility > 0.0
+    )
+    with np.errstate(invalid="ignore"):
+        return impulses, wanted[1:, None] + matrix[1:] @ impulses
+
+
+def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:
+    """The directions in a plane against which impulses rub that leave it sliding along them."""
+
+    def aside(angles: FloatArray) -> FloatArray:
+        """How much of c+ is across each direction."""
+        ways = np.array([np.cos(angles), np.sin(angles)])
+        after = _slid(matrix, wanted, friction, ways)[1]
+        return np.asarray(ways[0] * after[1] - ways[1] * after[0])
+
+    angles = np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)
+    values = aside(angles)
+    crosses = np.flatnonzero(values[:-1] * values[1:] <= 0.0)
+    least, most, sign = angles[crosses], angles[crosses + 1], values[crosses]
+    for _ in range(HALVINGS):
+        middle = 0.5 * (least + most)
+        is_before = aside(middle) * sign > 0.0
+        least, most = np.where(is_before, middle, least), np.where(is_before, most, middle)
+    return np.array([np.cos(most), np.sin(most)])
