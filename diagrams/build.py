@@ -159,16 +159,14 @@ def wire_loop(
 
     # The diagram.
     limits = _limits(scenario, model)
-    plant_exogenous = None
-    if isinstance(scenario.plant, ContactMaterial):
-        plant: RobotPlant | ContactPlant = _contact_plant(scenario, model, structure)
-    elif (own := own_model(scenario, model.links)) is not None:
-        plant, scene_graph = RobotPlant(own.model, structure=own.structure), own.scene_graph
+    feedback = can_be_fed_back(law, scenario.sampling, limits)
+    own, plant_exogenous = own_model(scenario, model.links), None
+    if own is None:
+        plant = _plant(scenario, model, structure, feedback)
+    else:
+        plant, scene_graph = _plant(scenario, own.model, own.structure, False), own.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
-    else:
-        feedback = can_be_fed_back(law, scenario.sampling, limits)
-        plant = RobotPlant(model, structure=structure, feedback=feedback)
     if scenario.encoders is not None:
         with at("encoders"):
             period = scenario.sampling.period if scenario.sampling else plant.time_step
@@ -194,8 +192,27 @@ def wire_loop(
         )
 
 
+def _plant(
+    scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
+) -> RobotPlant | ContactPlant:
+    """What is simulated."""
+    if not isinstance(scenario.plant, ContactMaterial):
+        return RobotPlant(model, structure=structure, feedback=feedback)
+    return contact_plant(scenario, model, structure)
+
+
 @at("plant or plant_parameters")
-def _contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+def contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+    """The plant of a scenario in Drake's contact.
+
+    Args:
+        scenario: A scenario with `plant: !MultibodyPlant`.
+        model: The scenario's robot, by `scenario_model`.
+        structure: The structure of the model's system.
+
+    Raises:
+        ScenarioError: The robot cannot touch in this way.
+    """
     check_pushes(scenario.plant_pushes, model.links)
     assert isinstance(scenario.plant, ContactMaterial)
     return ContactPlant(
