@@ -217,7 +217,7 @@ def contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -
     assert isinstance(scenario.plant, ContactMaterial)
     return ContactPlant(
         model,
-        partial(add_robot, scenario.robot, scenario.plant_payloads),
+        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant,
         structure=structure,
         parameters=scenario.plant_parameters,
