@@ -161,23 +161,12 @@ def wire_loop(
 
     # The diagram.
     limits = _limits(scenario, model)
-    plant: RobotPlant | ContactPlant | UnilateralRobotPlant
-    plant_exogenous = own = None
-    if isinstance(scenario.plant, ContactMaterial):
-        plant = _contact_plant(scenario, model, structure)
+    feedback = can_be_fed_back(law, scenario.sampling, limits)
+    own, plant_exogenous = own_model(scenario, model.links), None
+    if own is None:
+        plant = _plant(scenario, model, structure, feedback)
     else:
-        own = own_model(scenario, model.links)
-    if own is not None:
-        model, structure, scene_graph = own.model, own.structure, own.scene_graph
-    if isinstance(scenario.plant, Unilateral):
-        with at("plant.restitution"):
-            plant = scenario.plant.plant(model, structure)
-    elif own is not None:
-        plant = RobotPlant(model, structure=structure)
-    elif not isinstance(scenario.plant, ContactMaterial):
-        feedback = can_be_fed_back(law, scenario.sampling, limits)
-        plant = RobotPlant(model, structure=structure, feedback=feedback)
-    if own is not None:
+        plant, scene_graph = _plant(scenario, own.model, own.structure, False), own.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
     if scenario.encoders is not None:
@@ -205,13 +194,35 @@ def wire_loop(
         )
 
 
+def _plant(
+    scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
+) -> RobotPlant | ContactPlant | UnilateralRobotPlant:
+    """What is simulated."""
+    if isinstance(scenario.plant, Unilateral):
+        with at("plant.restitution"):
+            return scenario.plant.plant(model, structure)
+    if not isinstance(scenario.plant, ContactMaterial):
+        return RobotPlant(model, structure=structure, feedback=feedback)
+    return contact_plant(scenario, model, structure)
+
+
 @at("plant or plant_parameters")
-def _contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+def contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+    """The plant of a scenario in Drake's contact.
+
+    Args:
+        scenario: A scenario with `plant: !MultibodyPlant`.
+        model: The scenario's robot, by `scenario_model`.
+        structure: The structure of the model's system.
+
+    Raises:
+        ScenarioError: The robot cannot touch in this way.
+    """
     check_pushes(scenario.plant_pushes, model.links)
     assert isinstance(scenario.plant, ContactMaterial)
     return ContactPlant(
         model,
-        partial(add_robot, scenario.robot, scenario.plant_payloads),
+        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant,
         structure=structure,
         parameters=scenario.plant_parameters,

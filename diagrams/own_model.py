@@ -7,6 +7,7 @@ from typing import Any
 from pydrake.geometry import SceneGraph
 
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.keys import each
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import completed_model, scenario_structure
@@ -46,7 +47,7 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
         ScenarioError: Something does not fit; the message names its key.
     """
     payloads, pushes = scenario.plant_payloads, scenario.plant_pushes
-    if not (payloads or pushes):
+    if not (payloads or pushes) or isinstance(scenario.plant, ContactMaterial):
         return None
     check_pushes(pushes, links)
     named = {f"plant_push_{index}": push for index, push in enumerate(pushes)}

@@ -160,15 +160,18 @@ def scenario_structure(model: RobotModel) -> Structure:
 
 @at("robot.file")
 def add_robot(
-    robot: Robot, payloads: Sequence[Payload], plant: MultibodyPlant, scene_graph: SceneGraph
+    robot: Robot,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    payloads: Sequence[Payload] = (),
 ) -> None:
     """Adds the robot of a scenario to a plant that is not finalized.
 
     Args:
         robot: The robot.
-        payloads: What the scenario has under `plant_payloads`.
         plant: The plant, registered in the scene graph.
         scene_graph: The scene graph.
+        payloads: What the scenario has under `plant_payloads`.
 
     Raises:
         ScenarioError: Drake cannot read the file, or drops something of it; or what the scenario

@@ -20,9 +20,9 @@ _SAME = 1e-9
 class Encoders:
     """How a robot's positions and velocities are measured at samples t_k = k T.
 
-    A position is rounded to a multiple of the resolution delta, after its noise is added:
+    A position is rounded to a multiple of the resolution delta, after bias and noise are added:
 
-        qm_k = delta round((q(t_k) + sigma_q n_k) / delta).
+        qm_k = delta round((q(t_k) + b + sigma_q n_k) / delta).
 
     A velocity is measured with noise of its own, vm_k = v(t_k) + sigma_v n_k; or it is the filtered
     difference of the measured positions, with the bandwidth w,
@@ -36,6 +36,7 @@ class Encoders:
     Attributes:
         resolution: delta in rad or m, one number for all positions or one each; 0 for none.
         velocity_bandwidth: w in rad/s; None for velocities that are measured themselves.
+        position_bias: b in rad or m, one number or one each.
         position_noise: sigma_q in rad or m, one number or one each.
         velocity_noise: sigma_v in rad/s or m/s, one number or one each; where there is no
             velocity_bandwidth.
@@ -51,6 +52,7 @@ class Encoders:
     position_noise: ArrayLike = 0.0
     velocity_noise: ArrayLike = 0.0
     seed: int = 0
+    position_bias: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
         for name in ("resolution", "position_noise", "velocity_noise"):
@@ -60,6 +62,12 @@ class Encoders:
                     f"the {name} of encoders must be 0 or more, one number or one for each "
                     f"position, got {brief(getattr(self, name))}"
                 )
+        bias = numbers("position_bias", self.position_bias)
+        if bias.ndim > 1 or not np.isfinite(bias).all():
+            raise ModelError(
+                "the position_bias of encoders must be finite, one number or one for each "
+                f"position, got {brief(self.position_bias)}"
+            )
         if self.velocity_bandwidth is not None:
             positive("the velocity_bandwidth of encoders", self.velocity_bandwidth)
             if np.any(self.velocity_noise):
@@ -78,7 +86,7 @@ class Encoders:
 
     @property
     def position_deviation(self) -> FloatArray:
-        """The standard deviation of qm - q, sqrt(delta^2 / 12 + sigma_q^2), rad or m."""
+        """The standard deviation of qm - q - b, sqrt(delta^2 / 12 + sigma_q^2), rad or m."""
         return np.sqrt(np.square(self.resolution) / 12.0 + np.square(self.position_noise))
 
     def velocity_deviation(self, period: float) -> FloatArray:
@@ -158,9 +166,9 @@ class StateSensor(LeafSystem):
         check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.period = encoders, positive("period", period)
-        self._resolution, self._position_noise, self._velocity_noise = (
+        self._resolution, self._bias, self._position_noise, self._velocity_noise = (
             _each(name, getattr(encoders, name), num_positions)
-            for name in ("resolution", "position_noise", "velocity_noise")
+            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
         )
         self._count = num_positions
         self._port = self.DeclareVectorInputPort("state", size)
@@ -189,7 +197,7 @@ class StateSensor(LeafSystem):
         if held[0] == sample:
             return held
         count = self._count
-        q, v = state[:count].copy(), state[count : 2 * count]
+        q, v = state[:count] + self._bias, state[count : 2 * count]
         if self._noise is not None:
             noise = self._noise.Eval(context)
             q += self._position_noise * noise[:count]

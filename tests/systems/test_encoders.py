@@ -98,10 +98,11 @@ def test_deviation_of_velocities_is_the_norm_of_the_impulse_response():
 
 
 def test_noise_has_its_deviation_and_its_seed():
-    encoders = Encoders(position_noise=5e-6, velocity_noise=1e-3)
+    encoders = Encoders(position_noise=5e-6, velocity_noise=1e-3, position_bias=-2e-3)
     first, again, other = (measure(encoders, [0.1], [0.0], 2.0, seed)[1] for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
+    assert_allclose(np.mean(first[0]), 0.1 - 2e-3, atol=5 * 5e-6 / np.sqrt(2000))
     # Of 2000 samples to 1.6 %.
     assert_allclose(np.std(first, axis=1), [5e-6, 1e-3], rtol=0.05)
 
@@ -186,6 +187,7 @@ def test_seed_is_that_of_the_scenario():
         (["encoders={resolution: [1.0e-5, 1.0e-5, 1.0e-5]}"], "3 entries, the robot has 2 pos"),
         (["encoders={velocity_bandwidth: 0.0}"], "velocity_bandwidth of encoders must be positive"),
         (["encoders={velocity_bandwidth: 9.0, velocity_noise: 1.0}"], "either a velocity_bandw"),
+        (["encoders={position_bias: [[1.0, 2.0]]}"], "position_bias of encoders must be finite"),
         (["encoders={seed: -1}"], "seed of encoders"),
         (["encoders={}", "sampling="], "give it a sampling"),
     ],
