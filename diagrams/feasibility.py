@@ -54,7 +54,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
     # The law's model alone, without what it does not know of the plant.
-    ideal = replace(scenario, plant=IdealConstraints())
+    ideal = replace(scenario, plant=IdealConstraints(), observer=None)
     loop, context = wire_scenario(ideal, model, structure)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 

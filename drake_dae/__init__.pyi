@@ -4,6 +4,9 @@ from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
 from .dae.constraint_damping import contact_damping as contact_damping
+from .dae.contact_gains import ContactGains as ContactGains
+from .dae.contact_gains import contact_gains as contact_gains
+from .dae.disturbance import with_disturbance as with_disturbance
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
@@ -104,6 +107,8 @@ from .simulation.view import start_meshcat as start_meshcat
 from .symbolic import from_symbolic as from_symbolic
 from .systems.controller import TrackingController as TrackingController
 from .systems.limits import ControlLimits as ControlLimits
+from .systems.observer import DisturbanceObserver as DisturbanceObserver
+from .systems.observer import Observing as Observing
 from .systems.plant import DaePlant as DaePlant
 from .systems.realization import StateRealization as StateRealization
 from .systems.references import ReferenceGenerator as ReferenceGenerator
