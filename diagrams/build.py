@@ -16,11 +16,13 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.diagrams.advice import advised
 from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_closed_loop
 from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at, violated
+from drake_dae.diagrams.observing import observed_structure
 from drake_dae.diagrams.own_model import check_pushes, own_model
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
@@ -73,6 +75,8 @@ def build_completed(
         structure = scenario_structure(model)
     except AssumptionError as error:
         raise violated(error) from error
+    chosen = advised(completed.scenario, model, structure)
+    completed = Completed(chosen.scenario, (*completed.notes, *chosen.notes))
     return completed, wire_loop(completed.scenario, model, structure, scene_graph, meshcat)
 
 
@@ -97,9 +101,10 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     """
     context = loop.diagram.CreateDefaultContext()
     context.SetTime(scenario.integrator.start_time)
-    with at("gains"):
-        own = loop.controller.GetMyMutableContextFromRoot(context)
-        loop.controller.set_gains(own, scenario.gains.design())
+    if scenario.gains is not None:  # Those that were advised are in the law.
+        with at("gains"):
+            own = loop.controller.GetMyMutableContextFromRoot(context)
+            loop.controller.set_gains(own, scenario.gains.design())
     _start(scenario, cast(RobotPlant, loop.plant).model, loop, context)
     return context
 
@@ -138,6 +143,7 @@ def wire_loop(
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
+    scenario = advised(scenario, model, structure).scenario
     # The law, the sensor that it may need, and the references.
     force = scenario.force
     with at("force"):
@@ -145,19 +151,24 @@ def wire_loop(
     damping = scenario.constraint_damping
     keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
+    observed = observed_structure(scenario, model, structure)
     with at(" or ".join(keys)):
+        assert scenario.gains is not None  # advised.
+        assert scenario.integral is not None
         gains = scenario.gains.design()
         law = TrackingLaw(
-            model.dae,
+            observed.system,
             gains,
-            structure=structure,
+            structure=observed,
             measured_force=force.is_measured,
             force_gain=force.gain,
             constraint_damping=None if damping is None else damping.design(),
             integral=scenario.integral,
         )
     references = _references(scenario.references, law)
-    exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
+    exogenous = []
+    if scenario.observer is None:
+        exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
 
     # The diagram.
     limits = _limits(scenario, model)
@@ -176,7 +187,10 @@ def wire_loop(
     if scenario.tolerances is not None:
         with at("tolerances"):
             scenario.tolerances.places(model.dae.output_signals)
-    with at("force" if force.is_measured else "start.positions"):
+    observer = scenario.observer
+    keys = ["observer"] if observer is not None else []
+    keys += ["force"] if force.is_measured or observer is not None else []
+    with at(" or ".join(keys) or "start.positions"):
         return make_closed_loop(
             plant,
             law,
@@ -188,6 +202,7 @@ def wire_loop(
             encoders=scenario.encoders,
             control_limits=limits,
             tolerances=scenario.tolerances,
+            observer=observer,
             scene_graph=scene_graph,
             meshcat=meshcat,
             start_time=scenario.integrator.start_time,

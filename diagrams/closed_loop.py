@@ -26,12 +26,14 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.observing import add_observer
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
 from drake_dae.diagrams.unilateral import with_events
 from drake_dae.diagrams.wiring import (
     add_block,
     add_drives,
     add_exogenous,
+    add_hold,
     add_watch,
     check_sizes,
 )
@@ -41,6 +43,7 @@ from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.encoders import Encoders
+from drake_dae.systems.observer import DisturbanceObserver, Observing
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
@@ -68,6 +71,7 @@ class ClosedLoop:
         exogenous: The generator of the exogenous signals for the law, or None.
         plant_exogenous: That for the plant, or None.
         encoders: What measures the state for the law, or None.
+        observer: The observer that feeds the law instead, or None.
         memory: What `rollout` made of the loop, and uses again.
     """
 
@@ -83,6 +87,7 @@ class ClosedLoop:
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
     encoders: MeasuredState | None = None
+    observer: DisturbanceObserver | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
@@ -263,6 +268,7 @@ def make_closed_loop(
     encoders: Encoders | None = None,
     control_limits: ArrayLike | None = None,
     tolerances: Tolerances | None = None,
+    observer: Observing | None = None,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     start_time: float = 0.0,
@@ -292,6 +298,10 @@ def make_closed_loop(
             `model.control_limits`; the signal "excess" of the record tells what was cut off, and
             when. Integrals stand still meanwhile. None for drives without limits.
         tolerances: How large errors may be, or a run ends with an exception that tells it.
+        observer: How a `DisturbanceObserver` observes what the law's model lacks, for a sampled law
+            with measured force of a system that `with_disturbance` made. The signals "disturbance"
+            and "friction" of the record are what it found, and integrals stand still while a
+            contact is lost.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
             its geometry can be drawn. Left out where nothing is drawn.
         meshcat: Where to draw the surface, the contact force, and the robot if there is a
@@ -307,7 +317,8 @@ def make_closed_loop(
 
     Raises:
         WiringError: The law or the sensor has other sizes than the plant; measured force would
-            close an algebraic loop, or a sampled loop that diverges; or no law uses the sensor.
+            close an algebraic loop, or a sampled loop that diverges; no law uses the sensor; or an
+            observer lacks samples or measured force.
     """
     check_sizes(system, law, sensor)
     if isinstance(references, System):
@@ -349,12 +360,18 @@ def make_closed_loop(
 
     own = exogenous if plant_exogenous is None else plant_exogenous
     moving = [add_exogenous(builder, *pair) for pair in ((plant, own), (controller, exogenous))]
+    watch, hold = None, None if limits is None else limits.GetOutputPort("is_limited")
+    if observer is not None:
+        watch = add_observer(builder, plant, controller, observer, state, held, control, limits)
+        hold = watch.GetOutputPort("hold")
+    add_hold(builder, controller, hold)
 
     noise = None
     if law.measured_force:
         if sensor is not None:
             add_block(builder, sensor)
-        noise = add_force_feedback(builder, plant, controller, sensor, sampling)
+        takers = [controller] if watch is None else [controller, watch]
+        noise = add_force_feedback(builder, plant, takers, sensor, sampling)
     elif sensor is not None:
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 
@@ -382,6 +399,10 @@ def make_closed_loop(
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     if law.integral.outputs:
         named["integral"] = (controller.GetOutputPort("integral"), law.integral.signals)
+    if watch is not None:
+        for name in ("disturbance", "friction"):
+            signals = getattr(watch, f"{name}_signals")
+            named |= {name: (watch.GetOutputPort(name), signals)} if signals else {}
     if law.measured_force and sensor is not None:
         port = sensor.GetOutputPort("measured_force")
         named["measured_force"] = (port, dae.constraint_input_signals)
@@ -430,6 +451,7 @@ def make_closed_loop(
         moving[1],
         moving[0],
         measured,
+        watch,
     )
 
 

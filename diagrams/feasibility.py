@@ -60,6 +60,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         plant_payloads=[],
         plant_pushes=[],
         encoders=None,
+        observer=None,
         tolerances=None,
     )
     loop, context = wire_scenario(ideal, model, structure)

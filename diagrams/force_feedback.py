@@ -1,5 +1,7 @@
 """The wire from a plant's constraint force to a law that takes it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import DiagramBuilder
@@ -8,6 +10,7 @@ from pydrake.systems.primitives import RandomSource
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.errors import WiringError
 from drake_dae.systems.controller import TrackingController
+from drake_dae.systems.observer import DisturbanceObserver
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
@@ -16,16 +19,16 @@ from drake_dae.systems.sensors import ForceSensor
 def add_force_feedback(
     builder: DiagramBuilder,
     plant: DaePlant | ContactPlant,
-    controller: TrackingController,
+    takers: Sequence[TrackingController | DisturbanceObserver],
     sensor: ForceSensor | None,
     sampling: Sampling | None,
 ) -> RandomSource | None:
-    """Connects the constraint force to the controller, through the sensor if there is one.
+    """Connects the constraint force to what takes it, through the sensor if there is one.
 
     Args:
-        builder: The builder of the diagram, with plant, controller and sensor in it.
+        builder: The builder of the diagram, with plant, takers and sensor in it.
         plant: The plant.
-        controller: The controller, whose law takes a measured force.
+        takers: The controller, whose law takes a measured force, and what else does.
         sensor: The sensor; None for the force as it is.
         sampling: When the control is read and acts; None where it does so at once.
 
@@ -36,6 +39,8 @@ def add_force_feedback(
         WiringError: It would close an algebraic loop, or a sampled loop that diverges.
     """
     force, noise = plant.GetOutputPort("constraint_force"), None
+    controller = takers[0]
+    assert isinstance(controller, TrackingController)
     _check_loop(plant, controller, sensor, sampling)
     if sensor is not None:
         builder.Connect(force, sensor.GetInputPort("force"))
@@ -46,7 +51,8 @@ def add_force_feedback(
             source = RandomSource(RandomDistribution.kGaussian, size, period)
             noise = builder.AddSystem(source)
             builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    builder.Connect(force, controller.GetInputPort("measured_force"))
+    for taker in takers:
+        builder.Connect(force, taker.GetInputPort("measured_force"))
     return noise
 
 

@@ -378,6 +378,8 @@ def _in_words(schema: Mapping[str, Any]) -> str:
     """What a plain value must be."""
     if "anyOf" in schema:
         return " or ".join(map(_in_words, schema["anyOf"]))
+    if "oneOf" in schema:
+        return f"one of {_tags(schema)}"
     if "enum" in schema or "const" in schema:
         return "one of " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
     return _IN_WORDS.get(schema.get("type", ""), "something else")

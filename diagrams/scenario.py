@@ -110,6 +110,7 @@ Plant = Annotated[
 Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
+Observer = Annotated[parts.Observer, Form()]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
@@ -171,11 +172,17 @@ class Scenario:
         compliances: Constraint force -> its compliance relative to the others, where constraints
             are redundant: their forces are shared by least squares. {} is all alike; left out, no
             constraint may be redundant.
-        gains: The gains of the tracking law (28); poles at -4 1/s where left out.
+        gains: The gains of the tracking law (28). Where left out: poles at -4 1/s with ideal
+            constraints; in Drake's own contact they are advised, with what is left out of
+            `integral`, `constraint_damping` and `observer`, and with measured force; see
+            `contact_gains`. The scenario as run has them all.
         integral: Names of outputs whose errors are integrated as well, which take a pole more:
-            positions, and forces where `force` is measured.
+            positions, and forces where `force` is measured; none where left out beside `gains`.
         constraint_damping: What the law's model demands of constraints that give way, written as
-            gains are, for r_i - 1 poles per constraint; none where left out.
+            gains are, for r_i - 1 poles per constraint; none where left out beside `gains`.
+        observer: How the law observes what its model lacks, a disturbance and coefficients of
+            friction, where `force` is measured and the law is sampled; not at all where left out
+            beside `gains`.
         plant: Whether constraints are ideal; or open and close; or Drake's own contact is in their
             place: a discrete MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
@@ -210,9 +217,10 @@ class Scenario:
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
-    gains: Gains = field(default_factory=lambda: parts.Poles(all=[-4.0]))
-    integral: list[str] = field(default_factory=list)
+    gains: Gains | None = None
+    integral: list[str] | None = None
     constraint_damping: Gains | None = None
+    observer: Observer | None = None
     plant: Plant = field(default_factory=parts.IdealConstraints)
     sampling: Sampling | None = None
     encoders: Encoders | None = None
@@ -228,6 +236,19 @@ class Scenario:
     ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
     write: parts.Write = field(default_factory=parts.Write)
     compiled: Compiled = "auto"
+
+    def __post_init__(self) -> None:
+        if self.is_advised:
+            return
+        if self.gains is None:
+            object.__setattr__(self, "gains", parts.Poles(all=[-4.0]))
+        if self.integral is None:
+            object.__setattr__(self, "integral", [])
+
+    @property
+    def is_advised(self) -> bool:
+        """Whether the gains are left to be advised."""
+        return self.gains is None and isinstance(self.plant, contact_material.ContactMaterial)
 
     def __repr__(self) -> str:
         names = listed(constraint.name for constraint in self.constraints)

@@ -17,6 +17,7 @@ from drake_dae.diagrams.robot_file.payloads import Payload
 from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import contact, outputs
+from drake_dae.systems.observer import Observing
 from drake_dae.systems.sensors import ForceSensor
 
 T = TypeVar("T")
@@ -271,6 +272,18 @@ class MeasuredForce:
         return ForceSensor(
             size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
         )
+
+
+@dataclass(frozen=True)
+class Observer(Observing):
+    """How a `systems.observer.DisturbanceObserver` observes what the law's model lacks.
+
+    Attributes:
+        friction: The names of constraints whose coefficient of friction is identified, from that
+            which they have here on: 0 where nothing is known.
+    """
+
+    friction: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -100,10 +100,6 @@ def add_drives(
             )
         builder.Connect(control, limits.get_input_port())
         control = limits.GetOutputPort("control")
-        if controller.law.integral.outputs:
-            hold = builder.AddSystem(MatrixGain(np.ones((len(controller.law.integral.outputs), 1))))
-            builder.Connect(limits.GetOutputPort("is_limited"), hold.get_input_port())
-            builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
     return control, limits
 
 
@@ -134,3 +130,14 @@ def add_watch(
     builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
     for name in ("controlled_output", "constraint_force", "state"):
         builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))
+
+
+def add_hold(
+    builder: DiagramBuilder, controller: TrackingController, source: OutputPort | None
+) -> None:
+    """Lets the integrals of a controller stand still while a signal is not 0."""
+    count = len(controller.law.integral.outputs)
+    if count and source is not None:
+        hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
+        builder.Connect(source, hold.get_input_port())
+        builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))

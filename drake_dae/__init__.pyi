@@ -4,6 +4,9 @@ from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
 from .dae.constraint_damping import contact_damping as contact_damping
+from .dae.contact_gains import ContactGains as ContactGains
+from .dae.contact_gains import contact_gains as contact_gains
+from .dae.disturbance import with_disturbance as with_disturbance
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
@@ -111,6 +114,8 @@ from .systems.controller import TrackingController as TrackingController
 from .systems.encoders import Encoders as Encoders
 from .systems.encoders import StateSensor as StateSensor
 from .systems.limits import ControlLimits as ControlLimits
+from .systems.observer import DisturbanceObserver as DisturbanceObserver
+from .systems.observer import Observing as Observing
 from .systems.plant import DaePlant as DaePlant
 from .systems.pushes import Push as Push
 from .systems.realization import StateRealization as StateRealization

@@ -55,6 +55,8 @@ PAPER = (
     "normal_form",
     "gains",
     "constraint_damping",
+    "contact_gains",
+    "disturbance",
     "references",
     "measured_force",
     "integral",

@@ -79,6 +79,11 @@ def contact_plant() -> dd.ContactPlant:
     return dd.ContactPlant(found.model, add_arm, dd.ContactMaterial(), structure=found.structure)
 
 
+def observed_law() -> dd.TrackingLaw:
+    dae = dd.with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
+    return dd.TrackingLaw(dae, dd.poles(-4.0))
+
+
 @cache
 def record() -> dd.Record:
     context = loop().diagram.CreateDefaultContext()
@@ -164,6 +169,10 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Sampling: lambda: dd.Sampling(0.01),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
     dd.Encoders: lambda: dd.Encoders(1e-5),
+    dd.Observing: lambda: dd.Observing(10.0),
+    dd.DisturbanceObserver: lambda: dd.DisturbanceObserver(
+        observed_law(), dd.Observing(10.0), 0.01
+    ),
     dd.LinkExpressions: textbook,
     dd.NormalForm: normal_form,
     Manifold: lambda: arm("two_link").structure.manifold,
@@ -239,6 +248,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "components": lambda: "xy",
     "duration": lambda: 0.01,
     "max_integrators": lambda: 2,
+    "law of DisturbanceObserver": observed_law,
+    "states of with_disturbance": lambda: ["joint1_w", "joint2_w"],
     "region": lambda: None,
     "measured_force": lambda: None,
     "settings": lambda: (),

@@ -134,24 +134,26 @@ def test_force_tends_to_that_of_the_ideal_constraint():
 
 
 @pytest.mark.slow
-def test_shipped_wall_is_tracked():
-    """The circle at 0.1 m/s with 20 + 5 sin 2t N: 0.01 mm and 0.02 N rms after 2 s, at 1 kHz.
+def test_shipped_wall_is_tracked_by_a_law_that_does_not_know_its_friction():
+    """The circle at 0.1 m/s with 20 + 5 sin 2t N: 0.02 mm and 0.03 N rms after 2 s, at 1 kHz.
 
-    Measured 0.003 mm and 0.012 N; what is left is for other versions of Drake.
+    Measured 0.007 mm and 0.017 N; what is left is for other versions of Drake.
     """
     loop, _, record = run_scenario(scenario("wall_point_contact", "duration=3.0"))
     late = record["tracking_error"][record.time > 2.0]
-    assert np.sqrt(np.mean(np.sum(late[:, :2] ** 2, axis=1))) < 1e-5
-    assert np.sqrt(np.mean(late[:, -1] ** 2)) < 0.02
+    assert np.sqrt(np.mean(np.sum(late[:, :2] ** 2, axis=1))) < 2e-5
+    assert np.sqrt(np.mean(late[:, -1] ** 2)) < 0.03
     # Nothing but the ball and the wall touches.
     assert record["constraint_force"].min() >= 0.0
     assert loop.plant.time_step == 1e-3
+    assert_allclose(record["friction"][[0, -1], 0], [0.0, 0.3], atol=1e-3)
+    assert "disturbance" in record.signals
 
 
 @pytest.mark.slow
-def test_shipped_hydroelastic_wall_is_tracked():
-    """On 1e7 Pa as on points: measured 0.009 mm and 0.022 N."""
-    _, _, record = run_scenario(scenario("wall_hydroelastic", "duration=4.0"))
+def test_shipped_hydroelastic_wall_is_tracked_by_such_a_law():
+    """On 1e7 Pa within 0.05 N, since friction acts along the curved patch: 0.31 of the force."""
+    _, _, record = run_scenario(scenario("wall_hydroelastic", "duration=3.0"))
     late = record["tracking_error"][record.time > 2.0]
     assert np.sqrt(np.mean(np.sum(late[:, :2] ** 2, axis=1))) < 2e-5
     assert np.sqrt(np.mean(late[:, -1] ** 2)) < 0.05

@@ -18,6 +18,7 @@ from drake_dae.diagrams.typed_yaml import TAG, load_yaml
 from drake_dae.errors import ScenarioError
 
 PURE = {
+    ("Observer", "largest_friction"),
     ("Scenario", "control_weights"),
     ("Scenario", "compliances"),
     ("Scenario", "plant_parameters"),  # Each has its own.
@@ -104,7 +105,8 @@ def test_defaults_are_those_that_hold():
     found = {(entry.title, key.name): key.default for entry in entries() for key in entry.keys}
     assert found["Scenario", "duration"] == 10.0
     assert found["Scenario", "robot"] is NOTHING
-    assert found["Scenario", "gains"] is OWN
+    assert found["Scenario", "start"] is OWN
+    assert found["Scenario", "gains"] is None
     assert found["SimulatorConfig", "accuracy"] == 1e-6
     assert found["!PointOnSurface", "stiction_tolerance"] == 1e-3
     tried = 0

@@ -1,0 +1,185 @@
+"""What a model lacks, as an exogenous signal of its law, and how it is observed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.signals import Parameter
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+
+DISTURBANCE = "disturbance"
+"""The name of the parameter."""
+
+_TINY = 1e-200
+"""What is divided by where nothing slides or pushes, and the quotient is of no use."""
+
+
+@checked(ModelError)
+def with_disturbance(
+    system: DaeSystem, states: Sequence[str], frictions: Sequence[str] = ()
+) -> DaeSystem:
+    """The same system with what its model lacks, d(t), as an exogenous signal:
+
+        E x' = f + S d + g v + h u,
+
+    where S holds the rows of some states: for a robot its velocities, so that d is a generalized
+    force. A law for this system cancels d, and the coefficients of friction that are named, as
+    they come through the port `exogenous` of its controller; see `DisturbanceObserver`. Where d is
+    zero, it is the law of the system.
+
+    Args:
+        system: The system, as a robot's `RobotModel.dae`.
+        states: The names of the states whose rates d enters, for a robot those of v.
+        frictions: The names of parameters that are observed, too, such as "wall.friction": they
+            become exogenous signals.
+
+    Raises:
+        ModelError: A name is that of no state or of no parameter, or stands twice; or the system
+            has a parameter "disturbance".
+    """
+    known = [signal.name for signal in system.state_signals]
+    for name in states:
+        if name not in known:
+            raise ModelError(f"{system.name}: {unknown_name('state', name, known)}")
+    rows = [known.index(name) for name in states]
+    if not rows or len(set(rows)) != len(rows):
+        raise ModelError(
+            f"{system.name}: with_disturbance needs names of states, each once, got "
+            f"{', '.join(states) or 'none'}"
+        )
+    if DISTURBANCE in [p.name for p in system.parameters]:
+        raise ModelError(f"{system.name} has a parameter '{DISTURBANCE}' already")
+    parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
+    force = ca.SX(system.num_states, 1)
+    force[rows] = parameter.symbol
+    inner = system.implicit
+
+    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
+        assert inner is not None
+        balance, constraint_rate = inner(rate, constraint_input)
+        return balance - force, constraint_rate
+
+    return replace(
+        system,
+        f=system.f + force,
+        parameters=(*system.parameters, parameter),
+        implicit=None if inner is None else implicit,
+        state_scale=system.scale,
+    ).with_exogenous(frictions)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What an observer of d computes of a system that `with_disturbance` made.
+
+    With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
+    derivative of a measurement is needed.
+
+    Attributes:
+        momentum: (x, u, v, parameters) -> p, its rate without inputs and without d, and what the
+            inputs add to that, S^T (h u + g v); shape (k,) each.
+        friction: (x, v, parameters) -> of each coefficient of friction the force that one of 1
+            makes, C = S^T dg/dmu v, shape (k, c); the share that a d has of it,
+            (Q c_j)^T E^-1 Q d / |Q c_j|^2 with |a|^2 = a^T E^-1 a, as rows, shape (c, k); and the
+            speed of sliding by the power of friction, in m/s, shape (c,). Q d is d with what the
+            constraint answers, Q = 1 + S^T g dalpha/dd.
+        rows: The states whose rates d enters.
+        frictions: The names of the coefficients of friction, and which constraint input each is
+            for.
+    """
+
+    momentum: TracedFunction
+    friction: TracedFunction
+    rows: tuple[int, ...]
+    frictions: dict[str, int]
+
+    @classmethod
+    def of(cls, structure: Structure) -> "Observation":
+        """What is observed of a system, by its structure.
+
+        Raises:
+            ModelError: The system has no disturbance, or a mass that depends on what d moves.
+        """
+        system = structure.system
+        named = {p.name: p for p in system.exogenous.moving}
+        if DISTURBANCE not in named:
+            raise ModelError(
+                f"{system.name} has no disturbance to observe; make the law for "
+                "with_disturbance(system, states)"
+            )
+        d = named[DISTURBANCE].symbol
+        entry = ca.DM(ca.jacobian(system.f, d).sparsity()).full()
+        rows = [int(np.flatnonzero(column)[0]) for column in entry.T]
+        frictions = _frictions(system, tuple(named))
+        x, v = system.state, ca.SX.sym("v", system.num_constraints)
+        u = ca.SX.sym("u", system.num_controls)
+        mass, action = system.mass_matrix[rows, :], ca.mtimes(system.g, v)
+        momentum = ca.mtimes(mass, x)
+        still = ca.SX.sym("still", x.numel())
+        moved = ca.jtimes(ca.mtimes(mass, still), x, _known_rate(system, mass, rows))
+        drift = ca.substitute(system.f[rows], d, 0 * d) + ca.substitute(moved, still, x)
+        inputs = action[rows] + ca.mtimes(system.h[rows, :], u)
+        outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
+        function = system.trace("momentum", outputs, {"control": u, "constraint_input": v})
+
+        # What a coefficient of friction of one does, in the directions that the constraint leaves.
+        columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
+        forces = ca.horzcat(ca.SX(len(rows), 0), *columns)
+        reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
+        projector = ca.SX.eye(len(rows)) + reaction
+        matched = ca.mtimes(projector, forces)
+        right = ca.SX(x.numel(), len(frictions))
+        right[rows, :] = matched
+        moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows, :]
+        # Friction takes the power mu lambda |v_t|.
+        power = ca.mtimes(forces.T, x[rows])
+        weights, speeds = [ca.SX(0, len(rows))], [ca.SX(0, 1)]
+        for j, i in enumerate(frictions.values()):
+            weights.append(moves[:, j].T / ca.fmax(ca.dot(matched[:, j], moves[:, j]), _TINY))
+            speeds.append(ca.fabs(power[j]) / ca.fmax(ca.fabs(v[i]), _TINY))
+        found = {
+            "forces": forces,
+            "weights": ca.mtimes(ca.vertcat(*weights), projector),
+            "speeds": ca.vertcat(*speeds),
+        }
+        shared = system.trace("friction in a disturbance", found, {"constraint_input": v})
+        return cls(function, shared, tuple(rows), frictions)
+
+
+def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
+    """The exogenous coefficients of friction, and which constraint input each is for."""
+    forces = [signal.name for signal in system.constraint_input_signals]
+    found = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
+    for name in names:
+        if name not in (*found, DISTURBANCE):
+            raise ModelError(
+                f"{system.name}: '{name}' moves and is no coefficient of friction of one contact; "
+                "an observer tells a disturbance and coefficients of friction"
+            )
+    return {name: found[name] for name in names if name in found}
+
+
+def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
+    """x' as far as a mass depends on x, which no input and no disturbance must enter."""
+    rate = ca.SX(system.num_states, 1)
+    pattern = ca.DM(ca.jacobian(ca.vec(mass), system.state).sparsity()).full()
+    others = ca.horzcat(system.g, system.h)
+    identity = ca.SX.eye(system.num_states)
+    for i in np.flatnonzero(pattern.any(axis=0)).tolist():
+        own = ca.is_equal(ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2)
+        if i in rows or not own or ca.sparsify(others[i, :]).nnz():
+            name = system.state_signals[i].name
+            raise ModelError(
+                f"{system.name}: the mass of what a disturbance moves depends on '{name}', whose "
+                "rate is no function of the state alone"
+            )
+        rate[i] = system.f[i]
+    return rate

@@ -1,0 +1,262 @@
+"""Disturbances and friction that an observer finds, against closed forms and MultibodyPlant."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import error_controlled, touching
+from numpy.testing import assert_allclose
+from pydrake.common import RandomDistribution
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    LogVectorOutput,
+    MatrixGain,
+    RandomSource,
+)
+
+from drake_dae import (
+    ConstantReference,
+    DaePlant,
+    DaeSystem,
+    DisturbanceObserver,
+    FlexibleJoints,
+    ForceSensor,
+    Observing,
+    RobotModel,
+    RobotPlant,
+    Sampling,
+    SinusoidReference,
+    TrackingLaw,
+    find_structure,
+    make_closed_loop,
+    poles,
+    simulate,
+    with_disturbance,
+)
+from drake_dae.errors import ModelError, WiringError
+
+T, RATE, MASS = 0.01, 8.0, 2.5
+STEPS = error_controlled(1e-10)
+
+
+def body() -> DaeSystem:
+    """M q'' = u + d on a spring, with M = 2.5 kg."""
+    x, none = ca.SX.sym("x", 2), ca.SX(0, 1)
+    system = DaeSystem(
+        x,
+        ca.vertcat(x[1], -3.0 * x[0]),
+        ca.SX(2, 0),
+        ca.vertcat(0, 1),
+        none,
+        x[0],
+        ca.SX(1, 0),
+        mass_matrix=ca.diag(ca.SX([1.0, MASS])),
+        state_signals=("q", "v"),
+    )
+    return with_disturbance(system, ["v"])
+
+
+def pushed(push: float, delay: float = 0.0, **more):
+    """The body under its law with an observer, pushed from the start on."""
+    system = body()
+    law = TrackingLaw(system, poles(-5.0))
+    loop = make_closed_loop(
+        DaePlant(system),
+        law,
+        [ConstantReference(0.0)],
+        sampling=Sampling(T, delay),
+        observer=Observing(RATE),
+        **more,
+    )
+    context = loop.diagram.CreateDefaultContext()
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_parameter(own, "disturbance", push)
+    simulate(loop.diagram, context, 3.0, STEPS)
+    return loop.record(context)
+
+
+def at_samples(record, name, period=T):
+    """A signal just before each sample."""
+    times = period * np.arange(round(record.time[-1] / period))
+    places = np.searchsorted(record.time, times - 1e-9)
+    return times, record[name][places]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.7 * T])
+def test_constant_push_is_found_at_the_rate(delay):
+    """r = d (1 - e^(-k_o t)) of what the sample before has seen; the control acts between samples.
+
+    The spring's force is a mean of two samples, off by T^2 of its second derivative.
+    """
+    record = pushed(4.0, delay)
+    times, found = at_samples(record, "disturbance")
+    seen = np.maximum(times - T, 0.0)
+    assert_allclose(found[:, 0], 4.0 * -np.expm1(-RATE * seen), atol=2e-3)
+    assert abs(found[-1, 0] - 4.0) < 1e-3
+
+
+def test_push_that_is_found_is_cancelled():
+    """Without the observer it would be d / (M 25) = 64 mm off."""
+    record = pushed(4.0)
+    assert np.abs(record["tracking_error"]).max() > 5e-3
+    assert abs(record["tracking_error"][-1, 0]) < 1e-6
+
+
+def test_saturated_drive_does_not_wind_the_estimate_up():
+    """The push is more than the drive gives: its estimate stays right, as what acts is observed."""
+    record = pushed(4.0, control_limits=[1.0])
+    assert np.abs(record["excess"]).max() > 0.5
+    assert_allclose(record["disturbance"][-1], 4.0, atol=0.02)
+
+
+def test_noise_of_velocities_comes_through_as_the_filter_says():
+    """White noise n makes (1 - a) / T sqrt(2 / (1 + a)) M n, a = e^(-k_o T): about k_o M n.
+
+    4,000 samples, of which 1 / (k_o T) are correlated, tell it to some 5 per cent.
+    """
+    system, noise = body(), 0.02
+    observer = DisturbanceObserver(TrackingLaw(system, poles(-5.0)), Observing(RATE), T)
+    builder = DiagramBuilder()
+    builder.AddSystem(observer)
+    source = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 1, T))
+    spread = builder.AddSystem(MatrixGain(np.array([[0.0], [noise]])))
+    builder.Connect(source.get_output_port(), spread.get_input_port())
+    builder.Connect(spread.get_output_port(), observer.GetInputPort("estimated_state"))
+    for name, size in (("control", 1), ("measured_force", 0)):
+        still = builder.AddSystem(ConstantVectorSource(np.zeros(size)))
+        builder.Connect(still.get_output_port(), observer.GetInputPort(name))
+    log = LogVectorOutput(observer.GetOutputPort("disturbance"), builder, T)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(4000 * T)
+    found = log.FindLog(simulator.get_context()).data()[0, 100:]
+    a = np.exp(-RATE * T)
+    wanted = (1.0 - a) / T * np.sqrt(2.0 / (1.0 + a)) * MASS * noise
+    assert np.std(found) == pytest.approx(wanted, rel=0.05)
+    assert wanted == pytest.approx(RATE * MASS * noise, rel=0.05)
+
+
+def rubbing(friction: float) -> tuple[RobotModel, DaeSystem]:
+    """The two-link arm on its wall, and what its law takes it for: with friction to be found."""
+    smooth = touching("two_link")
+    wall = replace(smooth.constraints[0], friction=friction, stiction_tolerance=1e-3)
+    model = RobotModel(smooth.links, [wall], smooth.positions, [1.2, -1.6])
+    velocities = [signal.name for signal in model.links.velocity_signals]
+    return model, with_disturbance(model.dae, velocities, ["wall.friction"])
+
+
+def slide(wanted, duration, observing, friction=0.3, change=None):
+    """The arm on a wall that rubs, of which its law knows nothing; the plant is ideal."""
+    model, dae = rubbing(0.0)
+    law = TrackingLaw(dae, poles(-10.0), measured_force=True)
+    plant = RobotPlant(model)
+    sensor = ForceSensor(1, sample_period=1e-3)
+    sampling = Sampling(1e-3)
+    loop = make_closed_loop(
+        plant, law, wanted, sensor=sensor, sampling=sampling, observer=observing
+    )
+    context = loop.diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    q = model.configuration([0.3], [1.2, -1.6])
+    plant.set_consistent_state(own, model.rest_state(q, [20.0]))
+    for name, value in {"wall.friction": friction, **(change or {})}.items():
+        plant.set_parameter(own, name, value)
+    sensor.set_force(sensor.GetMyMutableContextFromRoot(context), [20.0])
+    simulate(loop.diagram, context, duration, error_controlled(1e-6))
+    return loop, loop.record(context)
+
+
+SWAY = [SinusoidReference(0.3, 0.1, 2.0), SinusoidReference(20.0, 5.0, 3.0)]
+
+
+@pytest.mark.slow
+def test_friction_is_identified_while_it_slides():
+    """To 1 per cent: where the motion turns, the smooth law and 1 ms are not the same."""
+    _, record = slide(SWAY, 1.5, Observing(20.0, friction_rate=8.0))
+    assert record["friction"][0] == 0.0
+    assert_allclose(record["friction"][-1], 0.3, rtol=0.01)
+    assert np.abs(record["disturbance"][-1]).max() < 0.05 * 0.3 * 20.0
+
+
+@pytest.mark.slow
+def test_friction_stays_between_zero_and_its_limit():
+    _, record = slide(SWAY, 0.6, Observing(20.0, 20.0, largest_friction=0.2))
+    assert record["friction"].max() == 0.2
+    assert record["friction"].min() >= 0.0
+
+
+def test_friction_stands_still_where_nothing_slides():
+    """What holds the arm still then is a disturbance, and no coefficient."""
+    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    _, record = slide(wanted, 0.3, Observing(20.0), change={"link2.mass": 5.0})
+    assert np.all(record["friction"] == 0.0)
+    assert np.abs(record["disturbance"][-1]).max() > 1.0
+
+
+def test_handing_over_to_friction_moves_nothing():
+    """r + c mu is the same for each k_f but for the force of friction, which grows with lambda."""
+    wanted = [SinusoidReference(0.3, 0.1, 2.0), ConstantReference(20.0)]
+    ends = [slide(wanted, 0.25, Observing(20.0, rate))[1]["control"][-1] for rate in (1e-6, 8.0)]
+    assert_allclose(*ends, atol=0.2)
+
+
+def test_law_without_a_disturbance_is_that_of_the_system():
+    model, dae = rubbing(0.3)
+    given = TrackingLaw(model.dae, poles(-4.0)), TrackingLaw(dae, poles(-4.0))
+    state = find_structure(model.dae).states[0]
+    reference = np.linspace(0.2, 0.7, given[0].layout.reference_size)
+    controls = [law.control(state, reference) for law in given]
+    assert_allclose(controls[1], controls[0], rtol=1e-12)
+
+
+def test_law_cancels_a_disturbance_that_acts_as_a_known_torque():
+    """A torque d at the joints is cancelled by -d of the motors, whatever the state."""
+    _, dae = rubbing(0.3)
+    law = TrackingLaw(dae, poles(-4.0))
+    state = law.structure.states[0]
+    reference = np.linspace(0.2, 0.7, law.layout.reference_size)
+    values = dae.parameter_values
+    values[dae.parameter_slice("disturbance")] = [1.5, -0.7]
+    change = law.control(state, reference, parameters=values) - law.control(state, reference)
+    assert_allclose(change, [-1.5, 0.7], rtol=1e-10)
+
+
+def test_what_cannot_be_observed_is_refused():
+    system = body()
+    with pytest.raises(ModelError, match=r"no state 'w'"):
+        with_disturbance(system, ["w"])
+    with pytest.raises(ModelError, match="already"):
+        with_disturbance(system, ["v"])
+    model, dae = rubbing(0.3)
+    with pytest.raises(ModelError, match="no disturbance to observe"):
+        DisturbanceObserver(TrackingLaw(model.dae, poles(-4.0)), Observing(5.0), T)
+    law = TrackingLaw(dae, poles(-4.0))
+    with pytest.raises(ModelError, match="control_lag must be from 0 to 1"):
+        DisturbanceObserver(law, Observing(5.0), T, 2.0)
+    with pytest.raises(ModelError, match="rate must be positive"):
+        Observing(-5.0)
+    wanted, plant = [ConstantReference(0.3), ConstantReference(20.0)], RobotPlant(model)
+    with pytest.raises(WiringError, match="observes at samples"):
+        make_closed_loop(plant, law, wanted, observer=Observing(5.0))
+    with pytest.raises(WiringError, match="measured force"):
+        make_closed_loop(
+            RobotPlant(model), law, wanted, observer=Observing(5.0), sampling=Sampling(T)
+        )
+    observer = DisturbanceObserver(law, Observing(5.0), T)
+    context = observer.CreateDefaultContext()
+    observer.set_friction(context, 0.4)
+    assert observer.GetOutputPort("friction").Eval(context) == 0.4
+    with pytest.raises(ModelError, match="from 0 to 1"):
+        observer.set_friction(context, 1.4)
+
+
+@pytest.mark.slow
+def test_flexible_joints_are_refused_with_what_to_do():
+    model = touching("two_link", [FlexibleJoints(8000.0, inertia=1.0)])
+    velocities = [signal.name for signal in model.links.velocity_signals]
+    law = TrackingLaw(with_disturbance(model.dae, velocities), poles(-4.0))
+    with pytest.raises(ModelError, match="take rigid joints, or integral action"):
+        DisturbanceObserver(law, Observing(5.0), T)
