@@ -293,7 +293,7 @@ def make_closed_loop(
     )
     builder.AddSystem(controller)
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    held = None if sampling is None else hold_before(plant, sampling)
+    held = None if sampling is None else _hold_before(plant, sampling)
     control, limits = add_drives(builder, controller, held, control_limits)
     if is_fed_back:
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
@@ -347,7 +347,7 @@ def make_closed_loop(
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
         if name not in told:
-            loggers[name] = (log_steps(builder, port, plant), signals)
+            loggers[name] = (_log(builder, port, plant), signals)
     builder.ExportOutput(controller.GetOutputPort("tracking_error"), "tracking_error")
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
@@ -378,7 +378,7 @@ def make_closed_loop(
     )
 
 
-def log_steps(
+def _log(
     builder: DiagramBuilder, port: OutputPort, plant: DaePlant | ContactPlant
 ) -> VectorLogSink:
     """Logs once per step.
@@ -391,7 +391,7 @@ def log_steps(
     return LogVectorOutput(port, builder, {TriggerType.kPerStep})
 
 
-def hold_before(plant: DaePlant | ContactPlant, sampling: Sampling) -> Sampling:
+def _hold_before(plant: DaePlant | ContactPlant, sampling: Sampling) -> Sampling:
     """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
     step = plant.time_step
     if step and sampling.delay < step * (1.0 - 1e-9):
