@@ -73,7 +73,7 @@ def build_completed(
     except AssumptionError as error:
         raise violated(error) from error
     if completed.scenario.task is not None:
-        return completed, wire_task(completed.scenario, model, structure, scene_graph)
+        return completed, wire_task(completed.scenario, model, structure, scene_graph, meshcat)
     return completed, wire_loop(completed.scenario, model, structure, scene_graph, meshcat)
 
 

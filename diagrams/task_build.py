@@ -3,7 +3,7 @@
 from functools import partial
 
 import numpy as np
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.dae.structure.structure import Structure
@@ -27,6 +27,7 @@ def wire_task(
     model: RobotModel,
     structure: Structure,
     scene_graph: SceneGraph | None = None,
+    meshcat: Meshcat | None = None,
 ) -> TaskLoop:
     """The loop of a scenario with a task.
 
@@ -35,6 +36,7 @@ def wire_task(
         model: Its robot.
         structure: The structure of the model's system.
         scene_graph: Where the robot's geometry is registered; needed to draw it.
+        meshcat: Where to draw while the run goes on; None draws nothing.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -81,6 +83,7 @@ def wire_task(
             sensor=sensor,
             sampling=scenario.sampling,
             scene_graph=scene_graph,
+            meshcat=meshcat,
         )
 
 

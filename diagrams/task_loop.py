@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common import RandomGenerator
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource, VectorLogSink
 
@@ -20,6 +20,7 @@ from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.wiring import add_block
 from drake_dae.errors import WiringError
 from drake_dae.simulation.record import Record, Recorded
+from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sampling import ControlHold, Sampling
@@ -149,6 +150,7 @@ def make_task_loop(
     sensor: ForceSensor | None = None,
     sampling: Sampling | None = None,
     scene_graph: SceneGraph | None = None,
+    meshcat: Meshcat | None = None,
 ) -> TaskLoop:
     """Wires a plant and the controller of a task, with loggers.
 
@@ -161,6 +163,7 @@ def make_task_loop(
             that acts at all times, or, with a `ContactPlant`, at each of its steps.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then its
             geometry can be drawn.
+        meshcat: Where to draw while it runs; None draws nothing.
 
     Raises:
         WiringError: The controller's laws are for another robot, its guards would be looked at at
@@ -186,6 +189,8 @@ def make_task_loop(
         loggers[name] = (log_steps(builder, port, plant), signals)
     builder.ExportOutput(controller.GetOutputPort("desired_output"), "desired_output")
     builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+    if meshcat is not None and isinstance(plant, RobotBlock):
+        add_live_view(builder, plant, scene_graph, meshcat)
     diagram = builder.Build()
     diagram.set_name("task_loop")
     return TaskLoop(diagram, plant, controller, loggers, scene_graph, noise)

@@ -194,6 +194,8 @@ def _write(run: _Run) -> bool:
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if isinstance(loop.plant, RobotBlock):
             text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
+        if isinstance(loop, TaskLoop):
+            text = "\n".join([text, "", *map(str, loop.changes(run.context))])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)

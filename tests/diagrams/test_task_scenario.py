@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from runs import run_scenario, scenario
 
-from drake_dae import build_scenario, load_scenario
+from drake_dae import build_scenario, load_scenario, simulate, start_meshcat
 from drake_dae.cli import main
 from drake_dae.diagrams.build import build_loop
 from drake_dae.diagrams.feasibility import find_feasibility
@@ -26,7 +26,7 @@ task:
   - !Approach {speed: 0.1, over: 0.1}
   - !Press {force: 10, over: 0.1}
   - !Move {references: {tool.z: 0.31, wall.force: 12}, duration: 0.2, over: 0.2}
-start: {positions: {joint1: 1.204, joint2: -1.6655}}
+start: {positions: {joint1: 1.1653, joint2: -1.8326}}
 duration: 1.0
 """
 
@@ -44,10 +44,23 @@ def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
     words = ["--set", "plant=!MultibodyPlant {radius: 1.0e-5}", "--set", "duration=0.3"]
     words += ["--set", "constraint_damping={all: [-250]}"]
     assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
-    assert "wall.distance" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "wall.distance" in told
+    assert "\n0 s: Approach, the task begins; 0 N, 0.0" in told
+    assert ": Press, after a force of 0.5 N; " in told
     assert (tmp_path / "run" / "outputs.png").stat().st_size > 10_000
     page = (tmp_path / "run" / "animation.html").read_text()
     assert '"phases": [[0.0, "Approach"], [0.' in page
+
+
+@pytest.mark.slow
+def test_live_view_draws_a_task(file):
+    meshcat = start_meshcat()
+    words = ["plant=!MultibodyPlant {radius: 1.0e-5}", "constraint_damping={all: [-250]}"]
+    found = load_scenario(file, words)
+    loop, context = build_scenario(found, meshcat)
+    simulate(loop.diagram, context, 0.02, found.integrator)
+    assert meshcat.HasPath("/contact/wall/surface")
 
 
 @pytest.mark.slow

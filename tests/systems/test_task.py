@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from arms import arm, numbers
+from arms import arm, numbers, touching
 from numpy.testing import assert_allclose
 from polishing import (
     CLIMB,
@@ -28,6 +28,7 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     Dwell,
+    FlexibleJoints,
     Move,
     Press,
     Release,
@@ -36,6 +37,7 @@ from drake_dae import (
     Task,
     TaskController,
     TrackingLaw,
+    UnilateralRobotPlant,
     make_task_loop,
     open_contact,
     poles,
@@ -229,6 +231,31 @@ def test_task_may_begin_in_contact():
     record = loop.record(context)
     assert record["constraint_force"].max() == pytest.approx(5.0, abs=1e-9)
     assert loop.changes(context)[-1].phase == "done"
+
+
+@pytest.mark.slow
+def test_arm_with_springs_in_its_joints_touches_and_presses():
+    """Degrees 4 and 2: the force has a derivative, and goes on from it; 1e-8 a step."""
+    model = touching("two_link", [FlexibleJoints(stiffness=8000.0, inertia=0.5)])
+    law = TrackingLaw(model.dae, poles(-20.0))
+    free = TrackingLaw(open_contact(model.dae, "wall.force"), poles(-20.0))
+    assert (law.degrees, free.degrees) == ((4, 2), (4, 4))
+    controller = TaskController(
+        Task([Approach(0.1, over=0.1), Press(20.0, over=0.1), Dwell(0.05)]), law, free
+    )
+    loop = make_task_loop(UnilateralRobotPlant(model, {"wall": 0.0}), controller)
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, controller.rest_state([0.3, 0.005], model.dae.nominal_state))
+    run_on(loop, context, 0.24, accuracy=1e-8)
+    press = loop.changes(context)[1]
+    # The impact bends the springs, and these press: 0.5 N are there some time after it.
+    impact = loop.plant.events(loop.plant.GetMyContextFromRoot(context))[0]
+    assert_allclose(impact.time, 0.005 / 0.1 + 0.05, atol=1e-6)
+    assert_allclose(press.force, 0.5, atol=1e-6)
+    record = loop.record(context)
+    off = (record["tracking_error"] - loop.predicted_error(record))[record.time > press.time]
+    assert np.abs(off).max() < 1e-5
+    assert_allclose(record["constraint_force"][-1], 20.0, atol=1e-4)
 
 
 def test_law_may_have_another_wall(whole):
