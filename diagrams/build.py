@@ -33,6 +33,8 @@ from drake_dae.diagrams.scenario_model import (
     start_guess,
 )
 from drake_dae.diagrams.state_feedback import make_sensor
+from drake_dae.diagrams.task_build import check_task, start_task, wire_task
+from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.diagrams.unilateral import Unilateral
 from drake_dae.errors import (
     AssumptionError,
@@ -48,7 +50,7 @@ from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 @checked(lambda text: ScenarioError(("", text)))
 def build_scenario(
     scenario: Scenario, meshcat: Meshcat | None = None
-) -> tuple[ClosedLoop, Context]:
+) -> tuple[ClosedLoop | TaskLoop, Context]:
     """The closed loop of a scenario, and its context at the start.
 
     Args:
@@ -64,17 +66,21 @@ def build_scenario(
 
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None
-) -> tuple[Completed, ClosedLoop]:
+) -> tuple[Completed, ClosedLoop | TaskLoop]:
     """A scenario completed, and its loop, which `start_scenario` starts as often as one likes.
 
     The arguments and errors are those of `build_scenario`.
     """
+    if scenario.task is not None:
+        check_task(scenario)
     scene_graph = SceneGraph()
     completed, model = completed_model(scenario, scene_graph)
     try:
         structure = scenario_structure(model)
     except AssumptionError as error:
         raise violated(error) from error
+    if completed.scenario.task is not None:
+        return completed, wire_task(completed.scenario, model, structure, scene_graph, meshcat)
     chosen = advised(completed.scenario, model, structure)
     completed = Completed(chosen.scenario, (*completed.notes, *chosen.notes))
     return completed, wire_loop(completed.scenario, model, structure, scene_graph, meshcat)
@@ -85,10 +91,13 @@ def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop
 
     The arguments and errors are those of `build_scenario`.
     """
-    return build_completed(scenario, meshcat)[1]
+    loop = build_completed(scenario, meshcat)[1]
+    if isinstance(loop, TaskLoop):
+        raise ScenarioError(("task", "what is done here knows references alone, and no tasks"))
+    return loop
 
 
-def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
+def start_scenario(scenario: Scenario, loop: ClosedLoop | TaskLoop) -> Context:
     """A new context of a closed loop at a scenario's start.
 
     Args:
@@ -99,6 +108,8 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
+    if isinstance(loop, TaskLoop):
+        return start_task(scenario, loop)
     context = loop.diagram.CreateDefaultContext()
     context.SetTime(scenario.integrator.start_time)
     if scenario.gains is not None:  # Those that were advised are in the law.

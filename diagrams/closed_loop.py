@@ -1,7 +1,7 @@
 """The one wiring: plant, reference, controller, loggers, and a view of the robot."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,8 @@ from pydrake.systems.framework import (
     DiagramBuilder,
     OutputPort,
     System,
-    TriggerType,
 )
-from pydrake.systems.primitives import LogVectorOutput, RandomSource, VectorLogSink
+from pydrake.systems.primitives import RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -36,6 +35,8 @@ from drake_dae.diagrams.wiring import (
     add_hold,
     add_watch,
     check_sizes,
+    hold_before,
+    log_steps,
 )
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
@@ -453,32 +454,3 @@ def make_closed_loop(
         measured,
         watch,
     )
-
-
-def log_steps(
-    builder: DiagramBuilder,
-    port: OutputPort,
-    plant: DaePlant | ContactPlant | UnilateralRobotPlant,
-) -> VectorLogSink:
-    """Logs once per step.
-
-    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
-    instant that the run has not reached.
-    """
-    if plant.time_step:
-        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
-    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
-
-
-def hold_before(
-    plant: DaePlant | ContactPlant | UnilateralRobotPlant, sampling: Sampling
-) -> Sampling:
-    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
-    step = plant.time_step
-    if step and sampling.delay < step * (1.0 - 1e-9):
-        raise WiringError(
-            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
-            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
-            "delay at each step of the plant needs no sampling"
-        )
-    return replace(sampling, delay=max(sampling.delay - step, 0.0))

@@ -53,6 +53,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         structure = scenario_structure(model)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
+    if scenario.task is not None:  # What a task takes depends on when it touches.
+        return Feasibility(analyze(model.dae), scenario.duration)
     # The law's model alone, without what it does not know of the plant.
     ideal = replace(
         scenario,

@@ -23,12 +23,14 @@ from drake_dae.diagrams import contact_material, unilateral
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
 from drake_dae.diagrams.robot_file import payloads
+from drake_dae.diagrams.scenario_task import ScenarioTask
 from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
 from drake_dae.systems import encoders, pushes, sampling, tolerances
+from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -111,6 +113,15 @@ Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
+_PHASE_DATA = {
+    float | references.Reference: Reference,
+    Mapping[str, references.Reference | float]: dict[str, Reference],
+}
+Phase = Annotated[
+    phases.Approach | phases.Press | phases.Move | phases.Dwell | phases.Release | phases.Retreat,
+    Choice(_PHASE_DATA),
+]
+Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase]})]
 Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
@@ -194,7 +205,8 @@ class Scenario:
             tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
             "tool.y, elbow". Outputs that complete others may be without; they hold what they start
             with.
-        start: Where the robot starts; without positions that is found.
+        task: What the robot does phase by phase, touching and letting go, in place of references.
+        start: Where the robot starts; without positions that is found, but not for a task.
         duration: How long the run lasts, in s.
         integrator: Drake's SimulatorConfig; the run begins at its start_time.
         write: What the run leaves in its folder.
@@ -226,7 +238,8 @@ class Scenario:
     encoders: Encoders | None = None
     saturation: bool = False
     tolerances: Tolerances | None = None
-    references: dict[str, Reference] = field(kw_only=True)
+    references: dict[str, Reference] = field(default_factory=dict)
+    task: Task | None = None
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
     integrator: Annotated[

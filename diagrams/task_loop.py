@@ -5,21 +5,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.geometry import SceneGraph
+from pydrake.common import RandomGenerator
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import VectorLogSink
+from pydrake.systems.primitives import RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.closed_loop import hold_before, log_steps
 from drake_dae.diagrams.contact_plant import ContactPlant
-from drake_dae.diagrams.wiring import add_block
+from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.wiring import add_block, hold_before, log_steps
 from drake_dae.errors import WiringError
 from drake_dae.simulation.record import Record, Recorded
+from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sampling import ControlHold, Sampling
+from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.task.controller import TaskController
 from drake_dae.systems.task.progress import PhaseChange
 from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
@@ -38,6 +41,7 @@ class TaskLoop:
         plant, controller: The systems in it.
         loggers: Port name -> (sink, names and units), one sample per step.
         scene_graph: The geometry of the robot, or None.
+        noise: The source of the sensor's noise, or None.
     """
 
     diagram: Diagram
@@ -45,6 +49,21 @@ class TaskLoop:
     controller: TaskController
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
     scene_graph: SceneGraph | None = None
+    noise: RandomSource | None = None
+
+    def __repr__(self) -> str:
+        return f"TaskLoop('{self.plant.dae.name}', {self.controller.task!r})"
+
+    def set_seed(self, context: Context, seed: int) -> None:
+        """Chooses the noise of the sensor, as `ClosedLoop.set_seed` does.
+
+        Args:
+            context: The diagram's context.
+            seed: The seed of the random numbers.
+        """
+        if self.noise is not None:
+            own = self.noise.GetMyMutableContextFromRoot(context)
+            self.noise.SetRandomContext(own, RandomGenerator(seed))
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Starts the robot at a state, shape (n,), in contact or not.
@@ -72,8 +91,10 @@ class TaskLoop:
         """What was logged up to now, and what follows from it.
 
         The outputs are the positions, the force and the distance; in contact the distance that is
-        wanted is zero, and else the force. "distance" has the distance and its derivative by the
-        law's model. At a moment of an event or of a change of phases it is what was before.
+        wanted is zero, and else the force. "distance" has the distance and its derivative, "phase"
+        1 for the phase that goes on and 0 for all others, "predicted_error" what theory says, see
+        `TaskController.predicted_error`. At the moment of an impact or of a change of phases all is
+        what was before.
 
         Args:
             context: The diagram's context.
@@ -91,29 +112,32 @@ class TaskLoop:
         found = function_along(controller.outputs, given)
         outputs, signals = found[:, :-1], controller.output_signals
         desired = controller.desired_along(own, logged.time)
-        rates = (signals[-1], signals[-1].derivative(1))
+        places, names = logged["phase"].astype(int), self.phase_signals
+        values = {name: recorded.values for name, recorded in logged.signals.items()}
         derived = {
-            "distance": Recorded(found[:, -2:], rates),
-            "controlled_output": Recorded(outputs, signals),
-            "desired_output": Recorded(desired, signals),
-            "tracking_error": Recorded(outputs - desired, signals),
+            "phase": (places == np.arange(len(names))).astype(float),
+            "distance": found[:, -2:],
+            "controlled_output": outputs,
+            "desired_output": desired,
+            "tracking_error": outputs - desired,
+            "predicted_error": controller.predicted_error(own, logged.time, values),
         }
-        return Record(logged.time, {**logged.signals, **derived}).while_finite()
+        named = {
+            "phase": names,
+            "distance": (signals[-1], signals[-1].derivative(1)),
+        }
+        told = {n: Recorded(v, named.get(n, signals)) for n, v in derived.items()}
+        return Record(logged.time, {**logged.signals, **told}).while_finite()
 
-    def predicted_error(self, record: Record, context: Context) -> FloatArray:
-        """The error that theory predicts for a record of a run, shape (k, p + 1).
+    @property
+    def phase_signals(self) -> tuple[Signal, ...]:
+        """The names of the phases as a record has them: "1 Approach", "2 Press", ..., "end"."""
+        names = [phase.name for phase in self.controller.task.phases]
+        return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal("end"))
 
-        See `TaskController.predicted_error`. Where a contact is lost there is none.
-
-        Args:
-            record: What `record` returned.
-            context: The diagram's context after the run.
-        """
-        names = [name for name in ("integral", "free_integral") if name in record.signals]
-        own = self.controller.GetMyContextFromRoot(context)
-        return self.controller.predicted_error(
-            own, record.time, record["state"], {name: record[name] for name in names}
-        )
+    def predicted_error(self, record: Record) -> FloatArray:
+        """The error that theory predicts for a record of a run, shape (k, p + 1)."""
+        return record["predicted_error"]
 
 
 @checked(WiringError)
@@ -121,8 +145,10 @@ def make_task_loop(
     plant: Plant,
     controller: TaskController,
     *,
+    sensor: ForceSensor | None = None,
     sampling: Sampling | None = None,
     scene_graph: SceneGraph | None = None,
+    meshcat: Meshcat | None = None,
 ) -> TaskLoop:
     """Wires a plant and the controller of a task, with loggers.
 
@@ -130,10 +156,12 @@ def make_task_loop(
         plant: A `UnilateralRobotPlant` whose contact opens and closes, a `ContactPlant`, with which
             everything is logged at its steps, or a `RobotPlant`, for a task without Approach.
         controller: The controller; its laws are for the plant's robot.
+        sensor: The sensor of the constraint forces. Without one they are measured as they are.
         sampling: When the control is computed and acts; it is held between. None for a controller
             that acts at all times, or, with a `ContactPlant`, at each of its steps.
         scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then its
             geometry can be drawn.
+        meshcat: Where to draw while it runs; None draws nothing.
 
     Raises:
         WiringError: The controller's laws are for another robot, its guards would be looked at at
@@ -150,18 +178,20 @@ def make_task_loop(
         control = hold.get_output_port()
     builder.Connect(control, plant.GetInputPort("control"))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    builder.Connect(
-        plant.GetOutputPort("constraint_force"), controller.GetInputPort("measured_force")
-    )
+    if sensor is not None:
+        add_block(builder, sensor)
+    noise = add_force_feedback(builder, plant, controller, sensor, sampling)
     loggers = {}
     for name, (port, signals) in _signals(plant, controller, control).items():
         builder.ExportOutput(port, name)
         loggers[name] = (log_steps(builder, port, plant), signals)
     builder.ExportOutput(controller.GetOutputPort("desired_output"), "desired_output")
     builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+    if meshcat is not None and isinstance(plant, RobotBlock):
+        add_live_view(builder, plant, scene_graph, meshcat)
     diagram = builder.Build()
     diagram.set_name("task_loop")
-    return TaskLoop(diagram, plant, controller, loggers, scene_graph)
+    return TaskLoop(diagram, plant, controller, loggers, scene_graph, noise)
 
 
 def _signals(

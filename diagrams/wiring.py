@@ -1,12 +1,13 @@
 """The parts of a closed loop: what is refused, and how sensor and exogenous signals are wired."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import DiagramBuilder, OutputPort
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
+from pydrake.systems.primitives import LogVectorOutput, MatrixGain, VectorLogSink
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.tracking import TrackingLaw
@@ -20,6 +21,7 @@ from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.sampling import ControlHold, Sampling
 from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.tolerances import Tolerances, ToleranceWatch
+from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 Block = TypeVar("Block", DaePlant, ForceSensor)
 
@@ -141,3 +143,32 @@ def add_hold(
         hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
         builder.Connect(source, hold.get_input_port())
         builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
+
+
+def log_steps(
+    builder: DiagramBuilder,
+    port: OutputPort,
+    plant: DaePlant | ContactPlant | UnilateralRobotPlant,
+) -> VectorLogSink:
+    """Logs once per step.
+
+    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
+    instant that the run has not reached.
+    """
+    if plant.time_step:
+        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
+    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
+
+
+def hold_before(
+    plant: DaePlant | ContactPlant | UnilateralRobotPlant, sampling: Sampling
+) -> Sampling:
+    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
+    step = plant.time_step
+    if step and sampling.delay < step * (1.0 - 1e-9):
+        raise WiringError(
+            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
+            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
+            "delay at each step of the plant needs no sampling"
+        )
+    return replace(sampling, delay=max(sampling.delay - step, 0.0))

@@ -317,5 +317,6 @@ def test_help_tells_the_exit_codes(capsys):
 def test_shipped_scenarios_have_no_problems(name):
     told = find_feasibility(scenario(name))
     assert told.problems == ()
-    assert told.analysis.motion.times[-1] == told.duration
+    motion = told.analysis.motion
+    assert motion.times[-1] == told.duration if motion else name == "wall_polish"
     assert told.to_markdown().endswith("no problem found")

@@ -82,6 +82,8 @@ def complete(
     missing = actuators - size - S.shape[0]
     if not (size or S.shape[0] or scenario.references):
         return Completed(scenario)  # It is only simulated.
+    if scenario.task is not None:
+        return Completed(scenario)
     if scenario.control_weights or scenario.compliances is not None:
         return Completed(scenario)
     if np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals):

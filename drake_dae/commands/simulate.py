@@ -22,10 +22,12 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
 from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.simulation.animation import animate
 from drake_dae.simulation.course import Course, contact_paths, follow
 from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
+from drake_dae.simulation.phases import phase_spans
 from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.record import Record
@@ -90,7 +92,7 @@ def _unused(name: str) -> Path:
 class _Run:
     """A run: what it is of, where it is written, and how it ended."""
 
-    loop: ClosedLoop
+    loop: ClosedLoop | TaskLoop
     context: Context
     scenario: Scenario
     folder: Path
@@ -138,6 +140,8 @@ def _roll(run: _Run) -> RunStatistics:
     """
     from drake_dae.diagrams.rollout.scenario_run import roll_scenario
 
+    if isinstance(run.loop, TaskLoop):
+        raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
     found = roll_scenario(run.scenario, run.loop, run.context)
     run.record = found.record
@@ -147,7 +151,7 @@ def _roll(run: _Run) -> RunStatistics:
 
 
 def _run(
-    loop: ClosedLoop,
+    loop: ClosedLoop | TaskLoop,
     context: Context,
     scenario: Scenario,
     folder: Path,
@@ -190,6 +194,8 @@ def _write(run: _Run) -> bool:
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if isinstance(loop.plant, RobotBlock):
             text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
+        if isinstance(loop, TaskLoop):
+            text = "\n".join([text, "", *map(str, loop.changes(run.context))])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)
@@ -208,7 +214,7 @@ def _write(run: _Run) -> bool:
                 save_plots(record, predicted, limits.control, place, paths, accuracy)
         if write.animation and course is not None:
             with _collected(problems), stage(folder, ANIMATION) as place:
-                page = animate(course, loop.scene_graph, run.title)
+                page = animate(course, loop.scene_graph, run.title, phase_spans(record))
                 (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PART) if (folder / name).exists()]

@@ -4,7 +4,7 @@ import html
 import json
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from drake_dae.simulation.constraint_forces import (
     path_of,
 )
 from drake_dae.simulation.course import Course, Loop, follow
+from drake_dae.simulation.phases import Span, phase_spans
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import (
     FRAME_RATE,
@@ -75,16 +76,22 @@ def make_animation(loop: Loop, record: Record, context: Context, title: str = ""
     Raises:
         ModelError: There is no robot.
     """
-    return animate(follow(loop, record, context), loop.scene_graph, title)
+    return animate(follow(loop, record, context), loop.scene_graph, title, phase_spans(record))
 
 
-def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> AnimationPage:
+def animate(
+    course: Course,
+    scene_graph: SceneGraph | None,
+    title: str = "",
+    phases: Sequence[Span] = (),
+) -> AnimationPage:
     """The page of `make_animation`.
 
     Args:
         course: Where the robot was.
         scene_graph: The geometry of the robot, or None.
         title: The title of the page; the robot's name if empty.
+        phases: The phases of a task, told beside the clock.
     """
     # A server of its own, made only now: a run that nobody watches opens no port.
     with _quiet():
@@ -124,7 +131,8 @@ def animate(course: Course, scene_graph: SceneGraph | None, title: str = "") -> 
     recording.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     recording.set_repetitions(_FOREVER)
     meshcat.PublishRecording()
-    return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, title or model.dae.name))
+    name = title or model.dae.name
+    return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, name, phases))
 
 
 def _add_flashes(meshcat: Meshcat, course: Course, radius: float) -> dict[int, str]:
@@ -201,7 +209,7 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
     return rings.reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def _with_overlay(page: str, course: Course, title: str) -> str:
+def _with_overlay(page: str, course: Course, title: str, phases: Sequence[Span]) -> str:
     """Meshcat's page with a title, the clock, the sizes of the forces, and paths that grow."""
     constraints = course.acting.constraints
     sizes = np.linalg.norm([load.forces for load in course.loads], axis=2)
@@ -220,6 +228,7 @@ def _with_overlay(page: str, course: Course, title: str) -> str:
             for row, constraint in enumerate(constraints)
         ],
         "impacts": bool(course.flashes.any()),
+        "phases": [[span.begin, span.name] for span in phases],
         "paths": [["paths", constraint.name, "actual"] for constraint in constraints],
     }
     # A name may hold what ends a script.

@@ -37,6 +37,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.simulation.constraint_forces import own_values
 from drake_dae.simulation.course import Course, Loop, follow
+from drake_dae.simulation.phases import phases_at
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.view import scene_extent
 
@@ -83,6 +84,7 @@ def save_film(loop: Loop, record: Record, context: Context, path: str | Path) ->
         raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{path}'")
     course = follow(loop, record, context, RATE)
     scene, last = _Scene(course, loop.scene_graph), len(course.times) - 1
+    scene.notes = phases_at(record, course.start_time + course.times)
     if kind == ".gif":
         from matplotlib.animation import PillowWriter
 
@@ -144,6 +146,7 @@ class _Scene:
         middle, self._size = _extent(course)
         eye = middle + self._size * np.array([-1.55, -1.1, 0.8])
         self._camera = _Camera(eye, middle, 10.0 * self._size)
+        self.notes = [""] * len(course.times)
         self._course, self._points, self._wanted = course, course.points, course.wanted_points
         builder = DiagramBuilder()
         scene = builder.AddSystem(scene_graph.Clone())
@@ -205,6 +208,7 @@ class _Scene:
                 axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
         time = course.start_time + course.times[number]
         axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")
+        axis.text(12, 46, self.notes[number], fontsize=11, color="0.25")
         axis.set_xlim(-0.5, _WIDTH - 0.5)
         axis.set_ylim(_HEIGHT - 0.5, -0.5)
 

@@ -21,6 +21,7 @@ from drake_dae.simulation.axes import (
     squares,
 )
 from drake_dae.simulation.open_contacts import mark_events, mark_labels
+from drake_dae.simulation.phases import mark_phases
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 
@@ -66,6 +67,8 @@ def save_plots(
         plot_residual(record),
         plot_controls(record, limits),
     ]
+    for figure in figures:
+        mark_phases(figure, record)
     if paths:
         figures.append(plot_paths(paths))
     files = [Path(folder) / name for name in PLOTS[: len(figures)]]

@@ -7,6 +7,7 @@ from weakref import ref
 
 import arms
 import numpy as np
+import polishing
 import pytest
 from campaign.memory import resident
 from pydrake.systems.analysis import Simulator
@@ -15,12 +16,15 @@ from pydrake.systems.primitives import FirstOrderTaylorApproximation
 from runs import scenario
 
 from drake_dae import (
+    Approach,
     ClosedLoop,
     ConstantReference,
     ForceSensor,
     NormalForm,
     RobotPlant,
     StateRealization,
+    Task,
+    TaskController,
     TrackingController,
     build_scenario,
     make_closed_loop,
@@ -42,6 +46,7 @@ def loop(feedback: bool = False) -> ClosedLoop:
 SYSTEMS = {
     "plant": plant,
     "controller": lambda: TrackingController(arms.law("two_link")),
+    "task": lambda: TaskController(Task([Approach()]), *polishing.laws()),
     "references": lambda: ReferenceGenerator([ConstantReference([0.3, 15.0])], (2, 0)),
     "sensor": lambda: ForceSensor(1, 0.01, 0.001, noise_deviation=0.1),
     "realization": lambda: StateRealization(NormalForm(arms.arm("two_link").model.dae)),

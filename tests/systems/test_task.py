@@ -4,9 +4,22 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from arms import arm, numbers
+from arms import arm, numbers, touching
 from numpy.testing import assert_allclose
-from polishing import FAR, OVER, POLE, SPEED, WHOLE, add_arm, laws, push, run_on, started, task_loop
+from polishing import (
+    CLIMB,
+    FAR,
+    OVER,
+    POLE,
+    SPEED,
+    WHOLE,
+    add_arm,
+    laws,
+    push,
+    run_on,
+    started,
+    task_loop,
+)
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import (
@@ -15,6 +28,7 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     Dwell,
+    FlexibleJoints,
     Move,
     Press,
     Release,
@@ -23,12 +37,14 @@ from drake_dae import (
     Task,
     TaskController,
     TrackingLaw,
+    UnilateralRobotPlant,
     make_task_loop,
     open_contact,
     poles,
     simulate,
 )
 from drake_dae.errors import ModelError, SimulationError, WiringError
+from drake_dae.simulation.phases import phase_spans, phases_at
 from drake_dae.systems.task.fade import fade
 
 TOUCH = FAR / SPEED + OVER / 2.0
@@ -60,7 +76,13 @@ def test_phases_follow_each_other_and_say_why(whole):
     assert str(found[1]).startswith(f"{TOUCH:.6g} s: Press, after a force of 0.5 N; ")
     # A sample at the moment of a change shows what was before.
     places = np.searchsorted([c.time for c in found[1:]], record.time)
-    assert_allclose(record["phase"][:, 0], places)
+    assert_allclose(np.argmax(record["phase"], axis=1), places)
+    assert_allclose(record["phase"].sum(axis=1), 1.0)
+    spans = phase_spans(record)
+    assert [span.name for span in spans] == [*names[:-1], "end"]
+    assert_allclose([span.begin for span in spans], [change.time for change in found])
+    middles = np.array([(span.begin + span.end) / 2.0 for span in spans])
+    assert phases_at(record, middles) == [span.name for span in spans]
 
 
 def test_it_touches_when_and_as_fast_as_designed(whole):
@@ -122,15 +144,13 @@ def test_control_jumps_by_what_the_laws_explain_otherwise_and_no_more(whole):
 
 def test_run_is_as_predicted(whole):
     """e'' = -K e from each change on, force on its reference; the integrator has 1e-8 a step."""
-    loop, context, record = whole
-    off = record["tracking_error"] - loop.predicted_error(record, context)
-    # The free law presses between the impact and the change: the last sample of the approach.
-    quiet = record["phase"][:, 0] > 0.0
-    assert np.abs(off[quiet]).max() < 1e-6
-    pressing = record["phase"][:, 0] == 1.0
+    loop, _, record = whole
+    off = record["tracking_error"] - loop.predicted_error(record)
+    assert np.abs(off).max() < 1e-6
+    pressing, places = record["phase"][:, 1] > 0.0, np.argmax(record["phase"], axis=1)
     assert np.abs(record["tracking_error"][pressing, 1]).max() < 1e-9
     assert np.abs(record["tracking_error"][:, 0]).max() > 1e-5  # The impact.
-    moved = record["phase"][:, 0] >= 3.0
+    moved = places >= 3
     assert_allclose(record["desired_output"][moved, 0], 0.4, atol=1e-12)
     assert_allclose(record["controlled_output"][-1, 2], 0.03, atol=1e-7)
 
@@ -177,7 +197,7 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
         assert_allclose(found.simulated_time, 0.02, atol=1e-6)
         assert last.phase == "held"
         return
-    run_on(loop, context, 2.0)
+    run_on(loop, context, 1.0 if reaction == "approach" else 1.5)
     record = loop.record(context)
     if reaction == "approach":
         names = [change.phase for change in loop.changes(context)]
@@ -186,7 +206,7 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
     else:
         assert (last.phase, last.in_contact) == ("held", False)
         assert record["constraint_force"][-1] == 0.0
-        assert_allclose(record["distance"][-1, 1], 0.0, atol=1e-3)
+        assert_allclose(record["distance"][-1, 1], 0.0, atol=3e-3)
 
 
 @pytest.mark.parametrize("reaction", ["hold", "fail"])
@@ -205,12 +225,37 @@ def test_guard_that_never_fires_is_told(reaction):
 
 
 def test_task_may_begin_in_contact():
-    loop = task_loop([Press(5.0, over=0.1), Release(over=0.1), Retreat(0.01, over=0.1)])
+    loop = task_loop([Press(5.0, over=0.05), Release(over=0.05), Retreat(0.001, over=0.05)])
     context = started(loop, distance=0.0)
-    run_on(loop, context, 0.5)
+    run_on(loop, context, 0.17)
     record = loop.record(context)
     assert record["constraint_force"].max() == pytest.approx(5.0, abs=1e-9)
     assert loop.changes(context)[-1].phase == "done"
+
+
+@pytest.mark.slow
+def test_arm_with_springs_in_its_joints_touches_and_presses():
+    """Degrees 4 and 2: the force has a derivative, and goes on from it; 1e-8 a step."""
+    model = touching("two_link", [FlexibleJoints(stiffness=8000.0, inertia=0.5)])
+    law = TrackingLaw(model.dae, poles(-20.0))
+    free = TrackingLaw(open_contact(model.dae, "wall.force"), poles(-20.0))
+    assert (law.degrees, free.degrees) == ((4, 2), (4, 4))
+    controller = TaskController(
+        Task([Approach(0.1, over=0.1), Press(20.0, over=0.1), Dwell(0.05)]), law, free
+    )
+    loop = make_task_loop(UnilateralRobotPlant(model, {"wall": 0.0}), controller)
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, controller.rest_state([0.3, 0.005], model.dae.nominal_state))
+    run_on(loop, context, 0.24, accuracy=1e-8)
+    press = loop.changes(context)[1]
+    # The impact bends the springs, and these press: 0.5 N are there some time after it.
+    impact = loop.plant.events(loop.plant.GetMyContextFromRoot(context))[0]
+    assert_allclose(impact.time, 0.005 / 0.1 + 0.05, atol=1e-6)
+    assert_allclose(press.force, 0.5, atol=1e-6)
+    record = loop.record(context)
+    off = (record["tracking_error"] - loop.predicted_error(record))[record.time > press.time]
+    assert np.abs(off).max() < 1e-5
+    assert_allclose(record["constraint_force"][-1], 20.0, atol=1e-4)
 
 
 def test_law_may_have_another_wall(whole):
@@ -262,9 +307,9 @@ def test_free_member_is_the_robot_without_the_wall():
 
 @pytest.mark.slow
 def test_drakes_own_contact_is_the_plant():
-    """1e5 N/m at 1 kHz, one sample late: measured 0.1 N and 0.2 mm off while it climbs.
+    """1e5 N/m at 1 kHz, one sample late: measured 0.4 N and 0.2 mm off at most in contact.
 
-    It touches as fast as designed but for what the delay of 1 ms does, 1e-4, and within 2 ms.
+    It touches as fast as designed but for what a delay of 1 ms does, measured 0.6 %.
     """
     found = arm("two_link")
     plant = ContactPlant(
@@ -277,22 +322,29 @@ def test_drakes_own_contact_is_the_plant():
     free = TrackingLaw(
         open_contact(system, "wall.force"), poles({"tool.z": -25.0, "wall.distance": -8.0})
     )
-    controller = TaskController(Task(WHOLE), law, free, sample_period=1e-3)
+    phases = (
+        Approach(SPEED, over=0.1),
+        Press(20.0, over=0.1),
+        Move({"tool.z": CLIMB}, 0.5, over=0.2),
+        Release(over=0.1),
+        Retreat(0.01, over=0.2),
+    )
+    controller = TaskController(Task(phases), law, free, sample_period=1e-3)
     loop = make_task_loop(plant, controller, sampling=Sampling(1e-3, 1e-3))
     context = loop.diagram.CreateDefaultContext()
-    loop.set_state(context, controller.rest_state([0.3, FAR], system.nominal_state))
-    simulate(loop.diagram, context, 2.4, SimulatorConfig())
+    loop.set_state(context, controller.rest_state([0.3, 0.25 * FAR], system.nominal_state))
+    simulate(loop.diagram, context, 1.15, SimulatorConfig())
     changes = loop.changes(context)
     assert [change.phase for change in changes][-2:] == ["Retreat", "done"]
     record = loop.record(context)
     touch = int(np.argmax(record["constraint_force"][:, 0] > 0.0))
-    assert_allclose(record.time[touch], TOUCH, atol=2e-3)
-    assert_allclose(record["distance"][touch - 1, 1], -SPEED, atol=1e-4)
-    moving = record["phase"][:, 0] == 2.0
-    assert_allclose(record["tracking_error"][moving, 1], 0.0, atol=0.3)
+    assert_allclose(record.time[touch], 0.25 * FAR / SPEED + 0.05, atol=2e-3)
+    assert_allclose(record["distance"][touch - 1, 1], -SPEED, atol=5e-4)
+    moving = record["phase"][:, 2] > 0.0
+    assert_allclose(record["tracking_error"][moving, 1], 0.0, atol=0.6)
     assert_allclose(record["tracking_error"][moving, 0], 0.0, atol=2e-4)
     assert record["constraint_force"][moving, 0].min() > 19.0
-    assert_allclose(record["distance"][-1, 0], 0.03, atol=1e-3)
+    assert_allclose(record["distance"][-1, 0], 0.01, atol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -204,22 +204,20 @@ class TaskController(Diagram):
         ).reshape(moments.size, -1)
 
     def predicted_error(
-        self,
-        context: Context,
-        times: ArrayLike,
-        states: FloatArray,
-        integrals: Mapping[str, FloatArray],
+        self, context: Context, times: ArrayLike, values: Mapping[str, FloatArray]
     ) -> FloatArray:
         """The error that theory predicts for a run, shape (k, p + 1).
 
         From each change of phases on it decays by the gains of the law that acts, from what it is
-        then. Impacts make errors anew: the change that follows a touch is after its impact.
+        then. An impact makes errors anew; the change that follows a touch is after it. Of what no
+        law steers, the force while the free law acts, it is what it is. Of a contact that is open
+        where it should hold there is no theory.
 
         Args:
             context: The context of this system after the run.
             times: Of the run, in s, shape (k,).
-            states: x at these times, shape (k, n).
-            integrals: "integral" and "free_integral" at these times, where the laws have any.
+            values: At these times: "state", "constraint_force", and "integral" and "free_integral"
+                where the laws have any; one row for each.
         """
         moments, segments = vector("times", times, None), self.segments(context)
         places = places_at(segments, moments)
@@ -234,13 +232,14 @@ class TaskController(Diagram):
             begin = max(segment.change.time, moments[start])
             errors = law.predicted_error(
                 moments[rows] - moments[start],
-                states[start],
+                values["state"][start],
                 segment.reference(begin),
-                integral=integrals[name][start] if law.integral.outputs else None,
+                integral=values[name][start] if law.integral.outputs else None,
             )
-            columns = list(range(errors.shape[1]))
+            columns = np.arange(errors.shape[1])
             if is_free:
                 columns[self.place] = found.shape[1] - 1
+                found[rows, self.place] = values["constraint_force"][rows, self.force]
             found[rows[:, None], columns] = errors
         return found
 

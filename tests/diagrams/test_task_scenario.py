@@ -1,0 +1,114 @@
+"""Tasks in scenario files: the shipped one, its pictures, and what is refused."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from runs import run_scenario, scenario
+
+from drake_dae import build_scenario, load_scenario, simulate, start_meshcat
+from drake_dae.cli import main
+from drake_dae.diagrams.build import build_loop
+from drake_dae.diagrams.feasibility import find_feasibility
+from drake_dae.diagrams.task_loop import TaskLoop
+from drake_dae.errors import ScenarioError
+
+# At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
+SHORT = """
+robot: {file: package://drake_dae_models/two_link_arm.urdf}
+constraints:
+- {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
+outputs:
+- {frame: tool, axes: z}
+gains: {all: [-25]}
+task:
+  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
+  phases:
+  - !Approach {speed: 0.1, over: 0.1}
+  - !Press {force: 10, over: 0.1}
+  - !Move {references: {tool.z: 0.31, wall.force: 12}, duration: 0.2, over: 0.2}
+start: {positions: {joint1: 1.1653, joint2: -1.8326}}
+duration: 1.0
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+@pytest.mark.slow
+def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
+    """Its plots and its animation tell the phases."""
+    words = ["--set", "plant=!MultibodyPlant {radius: 1.0e-5}", "--set", "duration=0.3"]
+    words += ["--set", "constraint_damping={all: [-250]}"]
+    assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
+    told = capsys.readouterr().out
+    assert "wall.distance" in told
+    assert "\n0 s: Approach, the task begins; 0 N, 0.0" in told
+    assert ": Press, after a force of 0.5 N; " in told
+    assert (tmp_path / "run" / "outputs.png").stat().st_size > 10_000
+    page = (tmp_path / "run" / "animation.html").read_text()
+    assert '"phases": [[0.0, "Approach"], [0.' in page
+
+
+@pytest.mark.slow
+def test_live_view_draws_a_task(file):
+    meshcat = start_meshcat()
+    words = ["plant=!MultibodyPlant {radius: 1.0e-5}", "constraint_damping={all: [-250]}"]
+    found = load_scenario(file, words)
+    loop, context = build_scenario(found, meshcat)
+    simulate(loop.diagram, context, 0.02, found.integrator)
+    assert meshcat.HasPath("/contact/wall/surface")
+
+
+@pytest.mark.slow
+def test_shipped_task_touches_as_designed_and_is_as_predicted():
+    """Friction 0.3 at 0.03 m/s: the speed to 1e-5, outputs to 5e-5 of N and m, with 1e-6 a step.
+
+    The approach takes 1 s and half a ramp of 0.5 s, after 2.1 s on the way.
+    """
+    loop, context, record = run_scenario(
+        scenario("wall_polish", "duration=3.5", "integrator.accuracy=1e-6")
+    )
+    assert isinstance(loop, TaskLoop)
+    touch = loop.changes(context)[2]
+    assert touch.phase == "Press"
+    assert_allclose(touch.time, 2.1 + 1.0 + 0.25, atol=1e-5)
+    before = record.time < touch.time - 1e-6
+    assert_allclose(record["distance"][before][-1, 1], -0.03, atol=1e-5)
+    assert np.abs(record["tracking_error"] - loop.predicted_error(record)).max() < 5e-5
+
+
+def test_analysis_of_a_task_is_that_of_its_contact(file):
+    found = find_feasibility(load_scenario(file))
+    assert found.problems == ()
+    assert found.analysis.motion is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("task.phases=[]", "task: a task needs phases"),
+        ("task.phases.0.speed=-1", r"task\.phases\.0: Approach: speed must be positive, got -1"),
+        ("task.phases.0.sped=1", r"task\.phases\.0: !Approach has no key 'sped'"),
+        ("task.phases.1.if_lost=wait", r"task\.phases\.1\.if_lost: .*approach"),
+        ("task.phases.2.references={tool.x: 1}", "phase 3 of the task, Move: reference 'tool.x'"),
+        ("task.contact=floor", r"task\.contact: 'floor' is no constraint with one force"),
+        ("task.gains={all: [5]}", r"task\.gains: the error dynamics \(30\) are not Hurwitz"),
+        ("references={tool.z: 0.3}", "references: a task has the references of its phases"),
+        ("saturation=true", "saturation: the drives of a task have no limits"),
+        ("start.errors={tool.z: 0.1}", r"start\.errors: a task begins at start\.positions"),
+        ("start={}", r"start\.positions: needed"),
+        ("integral=[wall.force]", "integral: by the model the law meets 'wall.force' at once"),
+    ],
+)
+def test_what_does_not_fit_is_named_by_its_key(file, change, message):
+    with pytest.raises(ScenarioError, match=message):
+        build_scenario(load_scenario(file, [change]))
+
+
+def test_what_knows_no_tasks_says_so(file):
+    with pytest.raises(ScenarioError, match="task: what is done here knows references alone"):
+        build_loop(load_scenario(file))
