@@ -371,8 +371,8 @@ def make_closed_loop(
     if law.measured_force:
         if sensor is not None:
             add_block(builder, sensor)
-        takers = [controller] if watch is None else [controller, watch]
-        noise = add_force_feedback(builder, plant, takers, sensor, sampling)
+        others = [] if watch is None else [watch]
+        noise = add_force_feedback(builder, plant, controller, sensor, sampling, others)
     elif sensor is not None:
         raise WiringError("the law takes no measured force; make it with measured_force=True")
 

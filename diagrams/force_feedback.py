@@ -14,23 +14,26 @@ from drake_dae.systems.observer import DisturbanceObserver
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.task.controller import TaskController
 
 
 def add_force_feedback(
     builder: DiagramBuilder,
     plant: DaePlant | ContactPlant,
-    takers: Sequence[TrackingController | DisturbanceObserver],
+    controller: TrackingController | TaskController,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
+    others: Sequence[DisturbanceObserver] = (),
 ) -> RandomSource | None:
-    """Connects the constraint force to what takes it, through the sensor if there is one.
+    """Connects the constraint force to the controller, through the sensor if there is one.
 
     Args:
-        builder: The builder of the diagram, with plant, takers and sensor in it.
+        builder: The builder of the diagram, with plant, controller and sensor in it.
         plant: The plant.
-        takers: The controller, whose law takes a measured force, and what else does.
+        controller: The controller, whose law takes a measured force.
         sensor: The sensor; None for the force as it is.
         sampling: When the control is read and acts; None where it does so at once.
+        others: What takes the measured force as well.
 
     Returns:
         The source of the sensor's noise, if it has one.
@@ -39,8 +42,6 @@ def add_force_feedback(
         WiringError: It would close an algebraic loop, or a sampled loop that diverges.
     """
     force, noise = plant.GetOutputPort("constraint_force"), None
-    controller = takers[0]
-    assert isinstance(controller, TrackingController)
     _check_loop(plant, controller, sensor, sampling)
     if sensor is not None:
         builder.Connect(force, sensor.GetInputPort("force"))
@@ -51,14 +52,14 @@ def add_force_feedback(
             source = RandomSource(RandomDistribution.kGaussian, size, period)
             noise = builder.AddSystem(source)
             builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    for taker in takers:
+    for taker in (controller, *others):
         builder.Connect(force, taker.GetInputPort("measured_force"))
     return noise
 
 
 def _check_loop(
     plant: DaePlant | ContactPlant,
-    controller: TrackingController,
+    controller: TrackingController | TaskController,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
 ) -> None:
