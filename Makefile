@@ -20,7 +20,7 @@ HOUSE := $(PICTURES)/house.png
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark campaign house pictures clean lint
+.PHONY: help demo check test benchmark campaign friction house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -55,6 +55,9 @@ benchmark: $(VENV)/installed-dev
 campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
+
+friction: $(VENV)/installed
+	$(BIN)/python examples/unknown_friction
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)
