@@ -21,7 +21,7 @@ HOUSE := $(PICTURES)/house.png
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark campaign unknowns house pictures clean lint
+.PHONY: help demo check test benchmark campaign unknowns friction house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -72,6 +72,9 @@ unknowns: $(VENV)/installed
 		--vary 'plant_pushes=[[{frame: tool, force: [-10..10, -10..10, -10..10], start_time: 0.6, end_time: 0.7}]]' \
 		--vary 'encoders=[{resolution: 1.0e-5, velocity_bandwidth: 500}, {position_noise: 5.0e-6, velocity_noise: 0.001}]' \
 		--vary force.bias=-0.3..0.3 --vary force.noise_deviation=0..0.3 --vary force.seed=1..1000
+
+friction: $(VENV)/installed
+	$(BIN)/python examples/unknown_friction
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)

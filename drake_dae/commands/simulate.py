@@ -19,6 +19,7 @@ import drake_dae
 from drake_dae.commands.view import show
 from drake_dae.diagrams.build import build_completed, start_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
 from drake_dae.diagrams.shipped import find_scenario
@@ -69,7 +70,7 @@ def run_command(options: argparse.Namespace) -> int:
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
         title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
-        code = _run(loop, context, scenario, folder, simulate_by, title)
+        code = _run(loop, context, completed, folder, simulate_by, title)
     if options.open:
         show(folder)
     return code
@@ -98,6 +99,7 @@ class _Run:
     folder: Path
     writer: RecordWriter
     title: str
+    notes: tuple[str, ...] = ()
     statistics: RunStatistics | None = None
     failure: str = ""
     pictures: bool = True
@@ -153,14 +155,14 @@ def _roll(run: _Run) -> RunStatistics:
 def _run(
     loop: ClosedLoop | TaskLoop,
     context: Context,
-    scenario: Scenario,
+    completed: Completed,
     folder: Path,
     simulate_by: Callable[[_Run], RunStatistics],
     title: str,
 ) -> int:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     with RecordWriter(folder / PART, loop.record) as writer:
-        run = _Run(loop, context, scenario, folder, writer, title)
+        run = _Run(loop, context, completed.scenario, folder, writer, title, completed.notes)
         try:
             run.statistics = simulate_by(run)
         except DrakeDaeError as error:
@@ -200,7 +202,8 @@ def _write(run: _Run) -> bool:
             with _collected(problems):
                 _write_record(record, run)
         with _collected(problems), stage(folder, "summary.txt") as place:
-            (place / "summary.txt").write_text(text + "\n", encoding="utf-8")
+            told = "\n".join([text, *run.notes, ""])
+            (place / "summary.txt").write_text(told, encoding="utf-8")
     try:
         if ending.signal is not None:
             end_at_once(ending.signal)

@@ -55,9 +55,9 @@ def contact_gains(
     The constraint is damped by c = 1.7 w, or by what `contact_damping` bears where that is less:
     noise of the force grows as sqrt(c), by c n sqrt(k T / (2 A c)), and the error of a force that
     changes as c lambda' / (A k). The integral of the force leaves the contact
-    s^3 + c s^2 + A k s + A k K_i, which is stable for K_i < c (Routh): K_i = 0.3 c. The observer
-    has the rate 0.8 w, since what it adds to velocity noise adds to that of the gains, and friction
-    is identified by w / 4, slower than the direction of a motion changes.
+    s^3 + c s^2 + A k s + A k K_i, which is stable for K_i < c (Routh): K_i = 0.4 c. The observer
+    has the rate w, so that it adds a third to the noise of the gains, and friction is identified by
+    w / 4, slower than the direction of a motion changes.
 
     Args:
         stiffness: k of the contact in N/m, positive.
@@ -80,4 +80,4 @@ def contact_gains(
         rate = min(rate, _JITTER / (3.0 * 2.0**0.5 * velocity_noise))
     damping = min(1.7 * rate, best)
     # Where samples cannot damp, the contact itself must: then the force is changed slowly.
-    return ContactGains(-rate, -0.3 * (damping or rate / 2.0), damping, 0.8 * rate, rate / 4.0)
+    return ContactGains(-rate, -0.4 * (damping or rate / 2.0), damping, rate, rate / 4.0)

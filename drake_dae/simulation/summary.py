@@ -93,6 +93,7 @@ def summary(
     kind = "in contact that gives way" if "contact_force" in record.signals else _PROJECTED
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
+    notes += _identified(record)
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
     ended = ""
     if run is not None:
@@ -190,6 +191,16 @@ def _controls(record: Record, limits: Limits) -> list[str]:
         ],
         left=2,
     ).lines()
+
+
+def _identified(record: Record) -> list[str]:
+    """What an observer has found of friction at the end."""
+    if "friction" not in record.signals:
+        return []
+    found = record.signals["friction"]
+    pairs = zip(found.signals, found.values[-1], strict=True)
+    text = ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
+    return [f"identified           {text} at the end"]
 
 
 def _number(value: float, size: float, digits: int) -> str:

@@ -8,6 +8,7 @@ from pydrake.systems.analysis import Simulator
 from runs import scenario
 
 from drake_dae import build_scenario, contact_gains, load_scenario
+from drake_dae.cli import main
 from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.advice import advised
 from drake_dae.diagrams.build import build_completed
@@ -58,6 +59,18 @@ def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
     completed, _ = build_completed(again)
     assert completed.notes == ()
     assert completed.scenario == run
+
+
+def test_run_tells_its_advice_and_what_it_identified(tmp_path, capsys):
+    out = tmp_path / "run"
+    write = "write={record: false, plots: false, animation: false}"
+    command = ["simulate", "wall_point_contact", "--out", str(out)]
+    assert main([*command, "--set", "duration=0.01", "--set", write]) == 0
+    assert "advised for a contact of 1e+05 N/m" in capsys.readouterr().out
+    told = (out / "summary.txt").read_text()
+    assert "advised for a contact of 1e+05 N/m" in told
+    assert "identified           wall.friction = " in told
+    assert load_scenario(out / "scenario.yaml").observer.friction == ["wall"]
 
 
 def test_what_is_said_stays():

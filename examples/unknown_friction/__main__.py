@@ -1,0 +1,242 @@
+"""Drake's own contact, and a law that knows neither its friction nor its stiffness: one table.
+
+    python examples/unknown_friction [--robot FILE.urdf] [--only WORD]
+
+Every row is a run of 6 s at 1 kHz with one sample of delay, with the gains that `contact_gains`
+advises, and from a coefficient of friction of 0; the figures are root mean squares after 2 s: the
+distance from the path, the force error, and how much the torques change from sample to sample.
+
+Claim: on all plants that the advice was made on, 0.02 mm and 0.03 N (0.05 N on a soft patch; with
+noise of encoders and force sensor 0.1 N; with 0.5 kg more in the tool 0.1 mm), and 0.4 N m.
+"""
+
+import argparse
+import logging
+import sys
+import tempfile
+import warnings
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
+
+import drake_dae as dd
+from drake_dae.diagrams.build import build_completed, start_scenario
+from drake_dae.diagrams.scenario import Scenario
+from drake_dae.diagrams.scenario_model import add_robot
+from drake_dae.diagrams.shipped import find_scenario
+
+SETTLED, DURATION = 2.0, 6.0
+ANGLE_NOISE, RATE_NOISE, FORCE_NOISE = 5e-6, 1e-3, 0.3  # rad, rad/s, N, of each sample.
+LATE = "sampling={period: 0.001, delay: 0.001}"
+POINT = "plant=!MultibodyPlant {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}"
+UNKNOWN = (
+    "gains=",
+    "constraints.0.friction=0.0",
+    "constraints.0.stiction_tolerance=1.0e-4",
+    POINT,
+    LATE,
+)
+TILTED = (
+    "constraints.0.surface.normal=[-0.965925826, -0.258819045, 0.0]",
+    "references={tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [1.0]},"
+    " tool.z: !Sinusoids {offset: 0.6, amplitudes: [0.1], frequencies: [1.0], phases: [1.5707963]},"
+    " tool.z_axis: !Constant {values: [0.258819045, 0.0]}, 'joint3, joint7': 0.0,"
+    " wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}}",
+)
+TURNS = (
+    "references={tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [1.0]},"
+    " tool.z: 0.7, tool.z_axis: 0.0, 'joint3, joint7': 0.0,"
+    " wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}}",
+)
+STOPS = (
+    "references={tool.y: !Line {start: [-0.1], end: [0.1],"
+    " limits: {speed: 0.1, acceleration: 0.5}, start_time: 2.5},"
+    " tool.z: 0.7, tool.z_axis: 0.0, 'joint3, joint7': 0.0,"
+    " wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}}",
+)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A row of the table.
+
+    Attributes:
+        name: What it is called.
+        scenario: The name of a shipped scenario, or a file.
+        settings: Changes of it, as those of `--set`.
+        noise: Whether the sensors are noisy.
+        load: What the tool has more than the law knows, in kg.
+        position, force: What is to be kept, in mm and N.
+    """
+
+    name: str
+    scenario: str | Path = "wall_point_contact"
+    settings: tuple[str, ...] = ()
+    noise: bool = False
+    load: float = 0.0
+    position: float = 0.02
+    force: float = 0.03
+
+
+TUNED = (
+    Condition("point contact, 1e5 N/m"),
+    Condition("point contact, 1e6 N/m", settings=("plant.stiffness=1.0e6",)),
+    Condition("hydroelastic, 1e8 Pa", "wall_hydroelastic", ("plant.modulus=1.0e8",)),
+    Condition("hydroelastic, 1e7 Pa", "wall_hydroelastic", force=0.05),
+    Condition(
+        "wall 2 mm farther", settings=("plant_parameters={wall.position: [0.702, 0.0, 0.0]}",)
+    ),
+    Condition("noise", noise=True, force=0.1),
+    Condition("0.5 kg more in the tool", load=0.5, position=0.1),
+)
+OTHERS = (
+    Condition("friction 0.1", settings=("plant.friction=0.1",)),
+    Condition("friction 0.6", settings=("plant.friction=0.6",)),
+    Condition("a line with reversals", settings=TURNS),
+    Condition("from rest to rest", settings=STOPS),
+    Condition("a plane tilted by 15 degrees", settings=TILTED),
+    Condition("a sphere", "seven_joint_dome", (*UNKNOWN, "start.errors={}")),
+    Condition("two-link arm", "two_link_wall", (*UNKNOWN, "start.errors={}")),
+)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The figures of a row: mm, N, N m, and the coefficient at the end."""
+
+    position: float
+    force: float
+    roughness: float
+    friction: float = field(default=np.nan)
+
+
+class NoisyPlant(dd.ContactPlant):
+    """Drake's contact, of whose state encoders tell; the other ports are without noise."""
+
+    __slots__ = ()
+
+    def __init__(self, plant: dd.ContactPlant) -> None:
+        Diagram.__init__(self)
+        self.__dict__.update({n: one for n, one in vars(plant).items() if "pydrake" not in n})
+        joints, builder = plant.dae.num_states // 2, DiagramBuilder()
+        builder.AddSystem(plant)
+        noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 2 * joints, 1e-3))
+        scale = np.repeat([ANGLE_NOISE, RATE_NOISE], joints)
+        scaled = builder.AddSystem(MatrixGain(np.diag(scale)))
+        measured = builder.AddSystem(Adder(2, 2 * joints))
+        builder.Connect(noise.get_output_port(), scaled.get_input_port())
+        builder.Connect(plant.GetOutputPort("state"), measured.get_input_port(0))
+        builder.Connect(scaled.get_output_port(), measured.get_input_port(1))
+        builder.ExportInput(plant.GetInputPort("control"), "control")
+        builder.ExportOutput(measured.get_output_port(), "state")
+        for port in map(plant.get_output_port, range(plant.num_output_ports())):
+            if port.get_name() != "state":
+                builder.ExportOutput(port, port.get_name())
+        builder.BuildInto(self)
+        self.set_name(plant.get_name())
+
+
+def closed_loop(condition: Condition) -> tuple[Scenario, dd.ClosedLoop]:
+    """The loop of a condition, with the scenario as it runs."""
+    path = condition.scenario
+    file = path if isinstance(path, Path) else find_scenario(path)
+    settings = [*condition.settings]
+    if condition.noise:
+        noise = f"sample_period: 0.001, noise_deviation: {FORCE_NOISE}"
+        settings.append(f"force=!MeasuredForce {{{noise}}}")
+    completed, loop = build_completed(dd.load_scenario(file, settings))
+    scenario = completed.scenario
+    if not condition.noise:
+        return scenario, loop
+    plant, law = loop.plant, loop.controller.law
+    fresh = dd.ContactPlant(
+        plant.model,
+        partial(add_robot, scenario.robot),
+        scenario.plant,
+        structure=plant.structure,
+        parameters=scenario.plant_parameters,
+    )
+    return scenario, dd.make_closed_loop(
+        NoisyPlant(fresh),
+        law,
+        dict(scenario.references),
+        sensor=scenario.force.sensor(plant.dae.num_constraints),
+        sampling=scenario.sampling,
+        observer=scenario.observer,
+    )
+
+
+def figures(condition: Condition, duration: float = DURATION) -> Figures:
+    """Runs a condition."""
+    scenario, loop = closed_loop(condition)
+    context = start_scenario(scenario, loop)
+    if condition.load:
+        inner = loop.plant.multibody
+        body = inner.GetFrameByName("tool").body()
+        own = inner.GetMyMutableContextFromRoot(context)
+        body.SetMass(own, body.get_mass(own) + condition.load)
+    dd.simulate(loop.diagram, context, duration, scenario.integrator)
+    record = loop.record(context)
+    late = record.time > min(SETTLED, duration / 2.0)
+    signals = record.signals["controlled_output"].signals
+    # Coordinates of points have the unit m, forces N.
+    error = (record["controlled_output"] - record["desired_output"])[late]
+    places = [i for i, signal in enumerate(signals) if signal.unit == "m"]
+    forces = [i for i, signal in enumerate(signals) if signal.unit == "N"]
+    steps = np.diff(record["control"][late], axis=0)
+    found = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (error, steps)]
+    distance, force = (
+        float(np.sqrt(np.mean(np.sum(error[:, rows] ** 2, axis=1)))) for rows in (places, forces)
+    )
+    return Figures(1e3 * distance, force, found[1], float(record["friction"][-1].max()))
+
+
+def rows(robot: Path | None) -> list[Condition]:
+    """All conditions, with a robot of one's own if there is one."""
+    found = [*TUNED, *OTHERS]
+    if robot is not None:
+        folder = Path(tempfile.mkdtemp())
+        _, text = dd.new_scenario(str(robot))
+        (folder / "task.yaml").write_text(text)
+        found.append(Condition(robot.stem, folder / "task.yaml", UNKNOWN))
+    return found
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--robot", type=Path, help="a robot file, for one row more")
+    parser.add_argument("--only", default="", help="rows whose name has this word")
+    options = parser.parse_args(arguments)
+    print(f"{'':32}{'mm':>9}{'of':>7}{'N':>9}{'of':>7}{'N m':>9}{'mu':>8}")
+    kept = True
+    for condition in rows(options.robot):
+        if options.only not in condition.name:
+            continue
+        try:
+            row = figures(condition)
+        except dd.DrakeDaeError as error:
+            print(f"{condition.name:32}{str(error)[:100]}", flush=True)
+            kept = False
+            continue
+        is_kept = row.position <= condition.position and row.force <= condition.force
+        kept = kept and is_kept and row.roughness <= 0.4
+        print(
+            f"{condition.name:32}{row.position:9.4f}{condition.position:7.2f}{row.force:9.4f}"
+            f"{condition.force:7.2f}{row.roughness:9.3f}{row.friction:8.3f}"
+            f"{'' if is_kept else '  missed'}",
+            flush=True,
+        )
+    print("claim: " + ("all rows are kept" if kept else "not all rows are kept"))
+    return 0
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    logging.getLogger("drake").setLevel(logging.ERROR)
+    sys.exit(main())
