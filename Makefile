@@ -20,7 +20,7 @@ HOUSE := $(PICTURES)/house.png
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark campaign house pictures clean lint
+.PHONY: help demo check test benchmark campaign peers house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -30,6 +30,7 @@ help:
 	@echo 'make test        lint, types and all tests'
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
+	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
@@ -55,6 +56,9 @@ benchmark: $(VENV)/installed-dev
 campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
+
+peers: $(VENV)/installed
+	PYTHONPATH=examples $(BIN)/python -m contact_peers $(ARGS)
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)

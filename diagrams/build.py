@@ -120,6 +120,7 @@ def wire_loop(
     structure: Structure,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
+    plant: ContactPlant | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
@@ -129,6 +130,7 @@ def wire_loop(
         structure: The structure of the model's system.
         scene_graph: Where the robot's geometry is registered; needed to draw it.
         meshcat: Where to draw while the run goes on; None draws nothing.
+        plant: What is simulated in place of what the scenario has; None for that.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -157,7 +159,7 @@ def wire_loop(
     # The diagram.
     limits = _limits(scenario, model)
     feedback = can_be_fed_back(law, scenario.sampling, limits)
-    plant = _plant(scenario, model, structure, feedback)
+    plant = plant or _plant(scenario, model, structure, feedback)
     with at("force" if force.is_measured else "start.positions"):
         return make_closed_loop(
             plant,
@@ -177,17 +179,31 @@ def _plant(
     scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
 ) -> RobotPlant | ContactPlant:
     """What is simulated."""
-    material = scenario.plant
-    if not isinstance(material, ContactMaterial):
+    if not isinstance(scenario.plant, ContactMaterial):
         return RobotPlant(model, structure=structure, feedback=feedback)
-    with at("plant or plant_parameters"):
-        return ContactPlant(
-            model,
-            partial(add_robot, scenario.robot),
-            material,
-            structure=structure,
-            parameters=scenario.plant_parameters,
-        )
+    return contact_plant(scenario, model, structure)
+
+
+@at("plant or plant_parameters")
+def contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
+    """The plant of a scenario in Drake's contact.
+
+    Args:
+        scenario: A scenario with `plant: !MultibodyPlant`.
+        model: The scenario's robot, by `scenario_model`.
+        structure: The structure of the model's system.
+
+    Raises:
+        ScenarioError: The robot cannot touch in this way.
+    """
+    assert isinstance(scenario.plant, ContactMaterial)
+    return ContactPlant(
+        model,
+        partial(add_robot, scenario.robot),
+        scenario.plant,
+        structure=structure,
+        parameters=scenario.plant_parameters,
+    )
 
 
 @at("saturation")
