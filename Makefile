@@ -21,7 +21,7 @@ HOUSE := $(PICTURES)/house.png
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark campaign unknowns friction house pictures clean lint
+.PHONY: help demo check test benchmark campaign unknowns friction peers house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -32,6 +32,7 @@ help:
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
+	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
@@ -75,6 +76,9 @@ unknowns: $(VENV)/installed
 
 friction: $(VENV)/installed
 	$(BIN)/python examples/unknown_friction
+
+peers: $(VENV)/installed
+	PYTHONPATH=examples $(BIN)/python -m contact_peers $(ARGS)
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)

@@ -141,6 +141,7 @@ def wire_loop(
     structure: Structure,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
+    plant: RobotPlant | ContactPlant | UnilateralRobotPlant | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
@@ -150,6 +151,7 @@ def wire_loop(
         structure: The structure of the model's system.
         scene_graph: Where the robot's geometry is registered; needed to draw it.
         meshcat: Where to draw while the run goes on; None draws nothing.
+        plant: What is simulated in place of what the scenario has; None for that.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -184,9 +186,10 @@ def wire_loop(
     # The diagram.
     limits = _limits(scenario, model)
     feedback = can_be_fed_back(law, scenario.sampling, limits)
-    own, plant_exogenous = own_model(scenario, model.links), None
+    own = own_model(scenario, model.links) if plant is None else None
+    plant_exogenous = None
     if own is None:
-        plant = _plant(scenario, model, structure, feedback)
+        plant = plant or _plant(scenario, model, structure, feedback)
     else:
         plant, scene_graph = _plant(scenario, own.model, own.structure, False), own.scene_graph
         degrees = plant.exogenous_layout.degrees
