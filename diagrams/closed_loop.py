@@ -451,6 +451,6 @@ def make_closed_loop(
         noise,
         moving[1],
         moving[0],
-        measured,
-        watch,
+        encoders=measured,
+        observer=watch,
     )

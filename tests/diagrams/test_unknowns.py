@@ -66,6 +66,7 @@ def test_push_leaves_the_error_of_statics(plant):
     assert_allclose(record["tracking_error"][-1, 0], expected, rtol=2e-2)
 
 
+@pytest.mark.slow
 @PLANTS
 def test_payload_that_nobody_knows_pulls_with_its_weight(plant):
     payload = "plant_payloads=[{frame: tool, mass: 0.5}]"
@@ -145,6 +146,7 @@ def test_what_is_not_there_is_refused(settings, message):
         build_scenario(two_link(settings, *CONTACT))
 
 
+@pytest.mark.slow
 def test_rollouts_know_payloads_and_refuse_pushes():
     """An accuracy of 1e-6 a step, of which some hundred go to round-off or to the poles."""
     settings = "plant_payloads=[{frame: tool, mass: 0.5}]", "duration=0.2"
