@@ -39,6 +39,7 @@ class Verdict:
         off: By how much its error is off the predicted one, at most, in its unit.
         time: When, in s; where it is not as predicted, since when.
         share: The same beside the output's size.
+        settled: The largest share in the second half of the run.
     """
 
     tracking: Tracking
@@ -46,6 +47,7 @@ class Verdict:
     off: float = 0.0
     time: float = 0.0
     share: float = 0.0
+    settled: float = 0.0
 
 
 def unit_sizes(record: Record) -> dict[str, float]:
@@ -109,7 +111,8 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     else:
         tracking, row = Tracking.OFF, int(np.argmax(shares[:, column] > NEAR))
     off = float(np.max(np.abs(error - predicted)[:, column]))
-    return Verdict(tracking, signals[column], off, float(record.time[row]), share)
+    settled = float(np.max(shares[len(shares) // 2 :]))
+    return Verdict(tracking, signals[column], off, float(record.time[row]), share, settled)
 
 
 def in_words(
@@ -152,7 +155,11 @@ def in_words(
         f"up to {off}, {beside} its size"
     )
     if reasons:
-        return f"{text}. Likely because {', and '.join(reasons)}."
+        text = f"{text}. Likely because {', and '.join(reasons)}."
+        if verdict.tracking is Tracking.OFF and verdict.settled <= NEAR:
+            late = f"{100.0 * verdict.settled:.2g} % of its size"
+            text += f" In the second half of the run none is off by more than {late}."
+        return text
     if verdict.tracking is Tracking.NEARLY:
         return f"{text}; {step}, and a finer one would tell whether that is why."
     return f"{text}; {step}. If a finer one changes nothing, plant and law differ."

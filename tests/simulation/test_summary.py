@@ -176,6 +176,16 @@ def test_a_run_that_drifted_says_where_and_why():
     assert text.endswith("If a finer one changes nothing, plant and law differ.")
 
 
+def test_a_run_that_settled_says_so():
+    later = PREDICTED + np.array([[0.1, 0.0], [2e-3, 0.0], [1e-3, 0.0]])
+    run = record(tracking_error=(later.tolist(), [("a", "m"), ("b", "")]))
+    text = verdict(summary(run, PREDICTED, reasons=["the law is sampled"]))
+    assert text.endswith(
+        "Likely because the law is sampled. In the second half of the run none is off by more than "
+        "0.4 % of its size."
+    )
+
+
 def test_a_run_that_failed_is_not_called_good():
     text = verdict(summary(record(**EXACT), PREDICTED, failure="singular there"))
     assert text.startswith("The run ended early, at 1 s; up to there: Tracked as predicted")
