@@ -26,7 +26,7 @@ from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
-from drake_dae.diagrams.unilateral import with_events
+from drake_dae.diagrams.unilateral import open_holds, with_events
 from drake_dae.diagrams.wiring import add_block, add_drives, add_exogenous, check_sizes
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.record import Record, Recorded
@@ -248,7 +248,8 @@ def make_closed_loop(
     Args:
         system: A `RobotPlant`, any `DaePlant`, or a `ContactPlant`, with which everything is logged
             at its steps; or a `UnilateralRobotPlant`: while a contact of it is open the law goes on
-            as it is, so that phi'' = -A(x) lambda_d, lambda_d being the force that is wanted.
+            as it is, so that phi'' = -A(x) lambda_d, lambda_d being the force that is wanted, and
+            the integral of its force stands still.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
             -> reference, as `references_by_name` takes them; or a Drake System that gives R(t), as
@@ -306,7 +307,8 @@ def make_closed_loop(
     builder.AddSystem(controller)
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     held = None if sampling is None else _hold_before(plant, sampling)
-    control, limits = add_drives(builder, controller, held, control_limits)
+    holds = open_holds(builder, plant, law) if isinstance(plant, UnilateralRobotPlant) else []
+    control, limits = add_drives(builder, controller, held, control_limits, holds)
     if is_fed_back:
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:

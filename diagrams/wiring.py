@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import DiagramBuilder, OutputPort
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.primitives import Adder, MatrixGain
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.tracking import TrackingLaw
@@ -82,9 +82,14 @@ def add_drives(
     controller: TrackingController,
     sampling: Sampling | None,
     control_limits: ArrayLike | None,
+    holds: Sequence[OutputPort] = (),
 ) -> tuple[OutputPort, ControlLimits | None]:
-    """Adds what stands between controller and plant, and returns the control that arrives."""
+    """Adds what stands between controller and plant, and returns the control that arrives.
+
+    Integrals stand still while a drive is at its limit, or where a port of `holds` is not 0.
+    """
     control, limits = controller.GetOutputPort("control"), None
+    found, count = list(holds), len(controller.law.integral.outputs)
     if sampling is not None:
         hold = builder.AddSystem(ControlHold(control.size(), sampling))
         builder.Connect(control, hold.get_input_port())
@@ -98,8 +103,15 @@ def add_drives(
             )
         builder.Connect(control, limits.get_input_port())
         control = limits.GetOutputPort("control")
-        if controller.law.integral.outputs:
-            hold = builder.AddSystem(MatrixGain(np.ones((len(controller.law.integral.outputs), 1))))
-            builder.Connect(limits.GetOutputPort("is_limited"), hold.get_input_port())
-            builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
+        if count:
+            gain = builder.AddSystem(MatrixGain(np.ones((count, 1))))
+            builder.Connect(limits.GetOutputPort("is_limited"), gain.get_input_port())
+            found.append(gain.get_output_port())
+    if len(found) > 1:
+        both = builder.AddSystem(Adder(len(found), count))
+        for i, port in enumerate(found):
+            builder.Connect(port, both.get_input_port(i))
+        found = [both.get_output_port()]
+    for port in found:
+        builder.Connect(port, controller.GetInputPort("hold"))
     return control, limits
