@@ -27,7 +27,7 @@ from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.observing import add_observer
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
-from drake_dae.diagrams.unilateral import with_events
+from drake_dae.diagrams.unilateral import open_holds, with_events
 from drake_dae.diagrams.wiring import (
     add_block,
     add_drives,
@@ -279,7 +279,8 @@ def make_closed_loop(
     Args:
         system: A `RobotPlant`, any `DaePlant`, or a `ContactPlant`, with which everything is logged
             at its steps; or a `UnilateralRobotPlant`: while a contact of it is open the law goes on
-            as it is, so that phi'' = -A(x) lambda_d, lambda_d being the force that is wanted.
+            as it is, so that phi'' = -A(x) lambda_d, lambda_d being the force that is wanted, and
+            the integral of its force stands still.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
             -> reference, as `references_by_name` takes them; or a Drake System that gives R(t), as
@@ -361,11 +362,14 @@ def make_closed_loop(
 
     own = exogenous if plant_exogenous is None else plant_exogenous
     moving = [add_exogenous(builder, *pair) for pair in ((plant, own), (controller, exogenous))]
-    watch, hold = None, None if limits is None else limits.GetOutputPort("is_limited")
+    holds = open_holds(builder, plant, law) if isinstance(plant, UnilateralRobotPlant) else []
+    watch = None
     if observer is not None:
         watch = add_observer(builder, plant, controller, observer, state, held, control, limits)
-        hold = watch.GetOutputPort("hold")
-    add_hold(builder, controller, hold)
+        holds.append(watch.GetOutputPort("hold"))
+    elif limits is not None:
+        holds.append(limits.GetOutputPort("is_limited"))
+    add_hold(builder, controller, holds)
 
     noise = None
     if law.measured_force:

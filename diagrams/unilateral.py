@@ -3,11 +3,13 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import AffineSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
@@ -56,6 +58,30 @@ class Unilateral:
         return UnilateralRobotPlant(
             model, chosen, settling_time=self.settling_time, structure=structure
         )
+
+
+def open_holds(
+    builder: DiagramBuilder, plant: UnilateralRobotPlant, law: TrackingLaw
+) -> list[OutputPort]:
+    """Ports for the `hold` of a controller: integrals of forces of open contacts stand still.
+
+    Args:
+        builder: The builder of the diagram, with the plant in it.
+        plant: The plant.
+        law: The law, whose integrals they are.
+    """
+    inputs = law.measured_force.inputs if law.measured_force else {}
+    found = np.zeros((len(law.integral.outputs), len(plant.contacts)))
+    for row, output in enumerate(law.integral.outputs):
+        for column, normal in enumerate(plant.normals):
+            found[row, column] = inputs.get(output) == normal
+    if not found.any():
+        return []
+    system = AffineSystem(D=-found, y0=found.sum(axis=1))
+    hold = builder.AddSystem(system)
+    hold.set_name("open_contacts")
+    builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
+    return [hold.get_output_port()]
 
 
 def with_events(

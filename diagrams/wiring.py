@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
-from pydrake.systems.primitives import LogVectorOutput, MatrixGain, VectorLogSink
+from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, VectorLogSink
 
 from drake_dae.dae.references import Reference
 from drake_dae.dae.tracking import TrackingLaw
@@ -135,14 +135,26 @@ def add_watch(
 
 
 def add_hold(
-    builder: DiagramBuilder, controller: TrackingController, source: OutputPort | None
+    builder: DiagramBuilder, controller: TrackingController, sources: Sequence[OutputPort]
 ) -> None:
-    """Lets the integrals of a controller stand still while a signal is not 0."""
+    """Lets the integrals of a controller stand still while a signal is not 0.
+
+    Args:
+        builder: The builder of the diagram.
+        controller: The controller.
+        sources: The signals: of one entry for all integrals, or of one for each.
+    """
     count = len(controller.law.integral.outputs)
-    if count and source is not None:
-        hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-        builder.Connect(source, hold.get_input_port())
-        builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
+    if not (count and sources):
+        return
+    total = builder.AddSystem(Adder(len(sources), count))
+    for index, source in enumerate(sources):
+        if source.size() != count:
+            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
+            builder.Connect(source, spread.get_input_port())
+            source = spread.get_output_port()
+        builder.Connect(source, total.get_input_port(index))
+    builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
 
 
 def log_steps(

@@ -26,11 +26,13 @@ def contact_notes(record: Record) -> list[tuple[str, str]]:
     if hits:
         hardest = max(hits, key=lambda event: max(event.impulses))
         lost = sum(event.energy_lost for event in hits)
-        count = f"{len(hits)} impacts, the first" if len(hits) > 1 else "1 impact,"
-        text = (
-            f"{count} at {hits[0].time:.4g} s; the hardest with {max(hardest.impulses):.3g} N s at "
-            f"{hardest.time:.4g} s; {lost:.3g} J lost"
-        )
+        strength = f"{max(hardest.impulses):.3g} N s"
+        text = f"1 impact, at {hits[0].time:.4g} s with {strength}; {lost:.3g} J lost"
+        if len(hits) > 1:
+            text = (
+                f"{len(hits)} impacts, the first at {hits[0].time:.4g} s, the hardest with "
+                f"{strength} at {hardest.time:.4g} s; {lost:.3g} J lost"
+            )
     notes = [("contacts", text)]
     modes, gaps, taken = record["mode"], record["gap"], np.diff(record.time, prepend=record.time[0])
     for column, signal in enumerate(record.signals["gap"].signals):

@@ -223,7 +223,7 @@ def test_a_summary_tells_of_impacts_and_of_open_contacts(run):
     _, _, record, predicted, *_ = run
     hits = [event for event in record.events if any(event.impulses)]
     text = summary(record, predicted, Limits(pushing=frozenset({"wall.force"})))
-    assert f"contacts             {len(hits)} impacts, the first at {hits[0].time:.4g} s;" in text
+    assert f"contacts             {len(hits)} impacts, the first at {hits[0].time:.4g} s, " in text
     lost = sum(event.energy_lost for event in hits)
     assert f"{lost:.3g} J lost" in text
     flight = hits[-1].time - record.events[0].time
@@ -280,6 +280,29 @@ def test_where_nothing_opens_a_loop_goes_as_with_an_ideal_plant(slider):
     assert hybrid.events == ideal.events == ()
     assert_allclose(hybrid["state"][-1], ideal["state"][-1], atol=1e-9)
     assert_allclose(hybrid["constraint_force"][-1], ideal["constraint_force"][-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("limits", [None, [100.0, 100.0]])
+def test_the_integral_of_a_force_stands_still_while_its_contact_is_open(slider, limits):
+    tracking = TrackingLaw(
+        slider.dae, poles(-5.0), measured_force=True, integral=["tool.z", "wall.force"]
+    )
+    plant = UnilateralRobotPlant(slider, {"wall": 0.0}, structure=tracking.structure)
+    references = [ConstantReference(0.2), SinusoidReference(0.0, -6.0, 4.0, -0.4)]
+    loop = make_closed_loop(plant, tracking, references, control_limits=limits)
+    context = loop.diagram.CreateDefaultContext()
+    plant.set_consistent_state(plant.GetMyMutableContextFromRoot(context), [0.0, 0.25, 0.0, 0.0])
+    controller = loop.controller
+    own = controller.GetMyMutableContextFromRoot(context)
+    controller.set_integral(own, [0.0, 0.1])
+    simulate(loop.diagram, context, 0.4, error_controlled(1e-6))
+    record = loop.record(context)
+    away = record["mode"][:, 0] == 0.0
+    assert 5 < away.sum() < away.size - 2
+    # It changes while it is closed, and that of the height all the time.
+    assert np.ptp(record["integral"][away, 1]) == 0.0
+    assert record["integral"][~away, 1].min() < 0.1
+    assert np.all(np.diff(record["integral"][:, 0]) != 0.0)
 
 
 # In scenarios.

@@ -206,15 +206,20 @@ def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArr
     sticking = np.asarray(np.linalg.solve(matrix, -wanted), float)
     if sticking[0] > 0.0 and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
         return sticking
-
-    ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
-    impulses, after = _slid(matrix, wanted, friction, ways)
-    fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (np.sum(after * ways, axis=0) >= 0.0)
+    if np.isinf(friction):
+        return None
+    # Where no impulse would do there are numbers that are none, and fit nothing.
+    with np.errstate(invalid="ignore"):
+        ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
+        impulses, after = _slid(matrix, wanted, friction, ways)
+        onward = np.sum(after * ways, axis=0)
+    fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (onward >= 0.0)
     if not fits.any():
         return None
     # Where several fit, that which goes on most as it came.
-    onward = np.where(fits, wanted[1:] @ after, -np.inf)
-    return impulses[:, int(np.argmax(onward))]
+    left = np.flatnonzero(fits)
+    best = int(np.argmax(wanted[1:] @ after[:, left]))
+    return np.asarray(impulses[:, left[best]])
 
 
 def _slid(
@@ -226,8 +231,7 @@ def _slid(
     impulses = push * np.divide(
         -wanted[0], mobility, out=np.full(mobility.shape, np.inf), where=mobility > 0.0
     )
-    with np.errstate(invalid="ignore"):
-        return impulses, wanted[1:, None] + matrix[1:] @ impulses
+    return impulses, wanted[1:, None] + matrix[1:] @ impulses
 
 
 def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:

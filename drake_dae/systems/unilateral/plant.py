@@ -86,6 +86,7 @@ class UnilateralRobotPlant(ModalPorts):
         modes: Which contacts are closed -> how the robot moves then; see `Mode`.
         gap_signals: Names and units of `gap`.
         mode_signals: Names of `mode`.
+        normals: Where the normal force of each contact stands in `constraint_force`.
         wrench_signals: Names and units of `constraint_wrenches`.
 
     Raises:

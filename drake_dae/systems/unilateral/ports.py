@@ -42,6 +42,7 @@ class ModalPorts(RobotPorts):
         modes: Which contacts are closed -> how the robot moves then; see `Mode`.
         gap_signals: Names and units of `gap`.
         mode_signals: Names of `mode`.
+        normals: Where the normal force of each contact stands in `constraint_force`.
         wrench_signals: Names and units of `constraint_wrenches`.
     """
 
@@ -63,6 +64,7 @@ class ModalPorts(RobotPorts):
         self.set_name(model.name)
         self.model = model
         self.contacts = bound.names
+        self.normals = tuple(bound.normals)
         self.gap_signals = tuple(Signal(f"{name}.gap", "m") for name in bound.names)
         self.mode_signals = tuple(Signal(f"{name}.closed") for name in bound.names)
         self.modes = Modes(bound, structure)
