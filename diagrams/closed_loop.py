@@ -414,7 +414,7 @@ def make_closed_loop(
         noise,
         moving[1],
         moving[0],
-        measured,
+        encoders=measured,
     )
 
 

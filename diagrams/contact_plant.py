@@ -250,7 +250,10 @@ def _check_model(model: RobotModel) -> None:
     if model.stages:
         raise ModelError("Drake's contact as the plant takes rigid joints; leave actuation out")
     if model.dae.exogenous or model.loads:
-        raise ModelError("Drake's contact as the plant takes no exogenous signals and no loads")
+        raise ModelError(
+            "Drake's contact as the plant takes no exogenous signals and no loads; forces that the "
+            "law does not know are pushes (plant_pushes)"
+        )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
     for constraint in model.constraints:
