@@ -23,7 +23,6 @@ from drake_dae.errors import (
     describe_os_error,
 )
 
-
 YOUNG = 50_000
 """So many new objects are there before garbage is looked for: what a command loads and builds
 stays, and to look through it as often as Python does takes a sixth of a short run."""

@@ -80,8 +80,8 @@ def test_wrong_usage_exits_with_2(options, capsys):
 def test_a_bar_with_the_time_left_on_a_terminal(tmp_path):
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "drake_dae", "sweep", "two_link_wall", *SHORT, "--workers=1", "--out", tmp_path,
-         "--vary", "start.errors.tool.z=[0, 0.01, 0.02, 3]"],
+        [sys.executable, "-m", "drake_dae", "sweep", "two_link_wall", *SHORT, "--out", tmp_path,
+         "--workers=1", "--vary", "start.errors.tool.z=[0, 0.01, 0.02, 3]"],
         stdout=subprocess.DEVNULL,
         stderr=theirs,
         env=os.environ | {"PYTHONUTF8": "1"},
