@@ -51,7 +51,7 @@ def interrupted(moments, parent, settings=()):
         (signal, exit code, folder) of each.
     """
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["drake_dae.cli"])
+    processes.set_forkserver_preload(["drake_dae.commands.simulate", "matplotlib.figure"])
     runs = []
     for number, (sent, after) in enumerate(moments):
         folder = parent / f"{sent.name}{number}"

@@ -101,9 +101,10 @@ class _Worker:
     """
 
     def __init__(self, settings: Sequence[Any]) -> None:
+        # What is loaded stays: the garbage collector need not look through it, then or later.
         code = (
-            f"import sys; sys.path[:] = {sys.path!r}; "
-            f"from {__name__} import serve; sys.exit(serve())"
+            f"import gc, sys; gc.disable(); sys.path[:] = {sys.path!r}; "
+            f"from {__name__} import serve; gc.freeze(); gc.enable(); sys.exit(serve())"
         )
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(

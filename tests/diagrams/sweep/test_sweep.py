@@ -60,7 +60,7 @@ def test_rollouts_give_the_figures_of_drake(study, rolled):
 
 @pytest.mark.slow
 def test_the_number_of_processes_changes_nothing(study, tmp_path):
-    other = dd.sweep(chosen(), VARIATIONS, tmp_path / "runs.jsonl", workers=3)
+    other = dd.sweep(chosen(), VARIATIONS, tmp_path / "runs.jsonl", workers=2)
     assert other.table() == study.table()
     assert study.table()["outcome"] == ["finished"] * COUNT
 
@@ -98,7 +98,7 @@ def command(folder, *more, keys=KEYS):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kills", "options"), [pytest.param((2, 7, 13), (), id="drake"), ((9,), ("--rollout",))]
+    ("kills", "options"), [pytest.param((2, 9), (), id="drake"), ((9,), ("--rollout",))]
 )
 def test_killed_in_the_middle_it_continues_there_to_the_same_table(
     kills, options, request, tmp_path
