@@ -17,8 +17,9 @@ from drake_dae.errors import ModelError
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.task.open_contact import output_of_force
+from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.progress import PhaseChange, Segment
-from drake_dae.systems.task.supervisor import CONTACT, FREE, TaskSupervisor
+from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
