@@ -55,6 +55,7 @@ benchmark: $(VENV)/installed-dev
 campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
+	$(BIN)/python tests/campaign/polish.py
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)
