@@ -59,6 +59,7 @@ campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
 	$(BIN)/python tests/woodpecker.py
+	$(BIN)/python tests/campaign/polish.py
 
 # Friction, stiffness, place and tilt of the wall; masses, a push, sensors. A law that does not track
 # all the same ends its run, with the reason.

@@ -24,6 +24,7 @@ from drake_dae.systems.robot_plant import RobotPlant
 from drake_dae.systems.sampling import ControlHold, Sampling
 from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import PhaseChange
 from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
@@ -93,7 +94,7 @@ class TaskLoop:
         The outputs are the positions, the force and the distance; in contact the distance that is
         wanted is zero, and else the force. "distance" has the distance and its derivative, "phase"
         1 for the phase that goes on and 0 for all others, "predicted_error" what theory says, see
-        `TaskController.predicted_error`. At the moment of an impact or of a change of phases all is
+        `predicted_errors`. At the moment of an impact or of a change of phases all is
         what was before.
 
         Args:
@@ -120,7 +121,9 @@ class TaskLoop:
             "controlled_output": outputs,
             "desired_output": desired,
             "tracking_error": outputs - desired,
-            "predicted_error": controller.predicted_error(own, logged.time, values),
+            "predicted_error": predicted_errors(
+                controller, controller.segments(own), logged.time, values
+            ),
         }
         named = {
             "phase": names,

@@ -275,7 +275,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
     "name of TaskController.set_parameter": lambda: "wall.position",
     "value of TaskController.set_parameter": lambda: [1.2, 0.0, 0.0],
-    "integrals": lambda: {},
     "plant of make_task_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
     "controller of make_task_loop": lambda: dd.TaskController(
         dd.Task([dd.Approach()]), laws()[0], laws()[1]

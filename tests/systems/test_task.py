@@ -233,6 +233,16 @@ def test_task_may_begin_in_contact():
     assert loop.changes(context)[-1].phase == "done"
 
 
+def test_robot_rests_after_a_release_as_a_free_one():
+    """It was let go at 0.5 N, and stays where it is."""
+    loop = task_loop([Press(5.0, over=0.02), Release(over=0.02)])
+    context = started(loop, distance=0.0)
+    run_on(loop, context, 0.1)
+    last = loop.changes(context)[-1]
+    assert (last.phase, last.in_contact) == ("done", False)
+    assert_allclose(loop.record(context)["distance"][-1], 0.0, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_arm_with_springs_in_its_joints_touches_and_presses():
     """Degrees 4 and 2: the force has a derivative, and goes on from it; 1e-8 a step."""

@@ -1,7 +1,5 @@
 """A task as a controller: a law for each member, and what leads from one to the other."""
 
-from collections.abc import Mapping
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,15 +8,15 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.dae.layout import Indices
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.task.open_contact import output_of_force
-from drake_dae.systems.task.progress import PhaseChange, Segment
-from drake_dae.systems.task.supervisor import CONTACT, FREE, TaskSupervisor
+from drake_dae.systems.task.planner import CONTACT, FREE
+from drake_dae.systems.task.progress import PhaseChange, Segment, places_at
+from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
@@ -35,8 +33,8 @@ class TaskController(Diagram):
     before, as a force when the robot touches, begins with what is measured.
 
     The control itself may jump where the law changes, since the other law explains the same motion
-    by other forces. Where the robot touches while the free law presses with lambda, so that
-    phi'' = w = -A lambda is what it wants there, it is
+    by other forces. Where a robot touches what does not rub, and the free law presses with lambda,
+    so that phi'' = w = -A lambda is what it wants there, it is
 
         B (u_c - u_f) = lambda (A M [P; J]^-1 (0, 1) - J^T),
 
@@ -203,46 +201,6 @@ class TaskController(Diagram):
             ]
         ).reshape(moments.size, -1)
 
-    def predicted_error(
-        self, context: Context, times: ArrayLike, values: Mapping[str, FloatArray]
-    ) -> FloatArray:
-        """The error that theory predicts for a run, shape (k, p + 1).
-
-        From each change of phases on it decays by the gains of the law that acts, from what it is
-        then. An impact makes errors anew; the change that follows a touch is after it. Of what no
-        law steers, the force while the free law acts, it is what it is. Of a contact that is open
-        where it should hold there is no theory.
-
-        Args:
-            context: The context of this system after the run.
-            times: Of the run, in s, shape (k,).
-            values: At these times: "state", "constraint_force", and "integral" and "free_integral"
-                where the laws have any; one row for each.
-        """
-        moments, segments = vector("times", times, None), self.segments(context)
-        places = places_at(segments, moments)
-        found = np.zeros((moments.size, len(self.output_signals)))
-        for which, segment in enumerate(segments):
-            rows = np.flatnonzero(places == which)
-            if not rows.size:
-                continue
-            start = max(rows[0] - 1, 0)  # At a change the state is known, and what was before.
-            is_free = not segment.change.in_contact
-            law, name = (self.free_law, "free_integral") if is_free else (self.law, "integral")
-            begin = max(segment.change.time, moments[start])
-            errors = law.predicted_error(
-                moments[rows] - moments[start],
-                values["state"][start],
-                segment.reference(begin),
-                integral=values[name][start] if law.integral.outputs else None,
-            )
-            columns = np.arange(errors.shape[1])
-            if is_free:
-                columns[self.place] = found.shape[1] - 1
-                found[rows, self.place] = values["constraint_force"][rows, self.force]
-            found[rows[:, None], columns] = errors
-        return found
-
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of the laws' model in a context, as `TrackingController` does.
 
@@ -260,12 +218,6 @@ class TaskController(Diagram):
         known = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
         at_supervisor = self.GetMutableSubsystemContext(self.supervisor, context)
         at_supervisor.get_mutable_numeric_parameter(0).SetFromVector(known)
-
-
-def places_at(segments: tuple[Segment, ...], times: FloatArray) -> Indices:
-    """Which segment held at each time; at the moment of a change that before."""
-    starts = [segment.change.time for segment in segments[1:]]
-    return np.searchsorted(starts, times, side="left")
 
 
 def _check_laws(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:

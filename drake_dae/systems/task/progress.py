@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.layout import Layout
+from drake_dae.dae.layout import Indices, Layout
 from drake_dae.errors import ModelError
 from drake_dae.systems.feedback import Immutable
 from drake_dae.systems.task.fade import fade
@@ -142,3 +142,9 @@ class Progress(Immutable):
     def changes(self) -> tuple[PhaseChange, ...]:
         """The record of the task."""
         return tuple(segment.change for segment in self.segments)
+
+
+def places_at(segments: Sequence[Segment], times: FloatArray) -> Indices:
+    """Which segment held at each time; at the moment of a change that before."""
+    starts = [segment.change.time for segment in segments[1:]]
+    return np.searchsorted(starts, times, side="left")

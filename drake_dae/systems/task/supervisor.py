@@ -1,9 +1,7 @@
 """What leads through the phases of a task: guards, changes and references."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
@@ -19,30 +17,13 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.references import ConstantReference, stack_references
-from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.errors import ModelError, ReferenceSignalError, SimulationError
+from drake_dae.errors import SimulationError
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.progress import DONE, HELD, PhaseChange, Progress, Segment
+from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
+from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.task import Task
-
-FREE, CONTACT = 0, 1
-"""The places of the two laws."""
-
-
-@dataclass(frozen=True, eq=False)
-class Goals:
-    """The references of a phase for its law.
-
-    Attributes:
-        function: R in s after its begin, zero for outputs that it does not name.
-        named: Which outputs it names.
-    """
-
-    function: Callable[[float], FloatArray]
-    named: tuple[int, ...]
 
 
 class TaskSupervisor(LeafSystem):
@@ -83,13 +64,7 @@ class TaskSupervisor(LeafSystem):
         super().__init__()
         self.set_name("task")
         self.task, self._laws, self._place, self._force = task, laws, place, force
-        self._goals = [
-            _goals(task, index, laws[contact], place) for index, contact in enumerate(task.contacts)
-        ]
-        self._nothing = [_no_goals(law) for law in laws]
-        free = laws[FREE]
-        distance = ca.vertcat(*free.structure.output_chains[place][:2])
-        self._seen = free.system.trace("distance", {"value": distance})
+        self._plan = Planner(task, laws, place)
         self._state_port = self.DeclareVectorInputPort(
             "estimated_state", laws[FREE].system.num_states
         )
@@ -154,100 +129,21 @@ class TaskSupervisor(LeafSystem):
     def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         return self._witnesses
 
-    # What a phase begins with.
+    def _now(self, context: Context) -> Now:
+        parameters = context.get_numeric_parameter(0).CopyToVector()
+        return Now(context.get_time(), self._state_port.Eval(context), parameters)
 
     def _segment(self, context: Context) -> Segment:
         """The references that hold now."""
         progress = self.progress(context)
-        return progress.segments[-1] if progress.segments else self._first(context)
-
-    def _first(self, context: Context) -> Segment:
-        contact = self.task.contacts[0]
-        law = self._laws[contact]
-        present = self._chain(context, law)
-        if contact and law.degrees[self._place] == 0:
-            present[law.layout.lowest[self._place]] = self.task.contact_force
-        moment = Moment(0.0, 0.0, *self._distance(context), 0.0)
-        phase = self.task.phases[0].name, 0
-        return self._started(context.get_time(), phase, contact, "the task begins", moment, present)
-
-    def _next(
-        self,
-        context: Context,
-        before: Segment,
-        moment: Moment,
-        phase: tuple[str, int],
-        reason: str,
-    ) -> Segment:
-        """The references from now on, which begin as those before are."""
-        time = context.get_time()
-        known = before.reference(time)
-        was, (name, place) = before.change.in_contact, phase
-        if name == HELD:  # It rests as it is: it touches, or is free.
-            contact = was and moment.force >= self.task.contact_force
-        else:
-            contact = was if name == DONE else self.task.contacts[place]
-        law = self._laws[contact]
-        if contact == was:
-            present = known
-        else:
-            present = self._chain(context, law)
-            if contact and law.degrees[self._place] == 0:
-                present[law.layout.lowest[self._place]] = moment.force
-            for i, first in enumerate(law.layout.lowest):
-                if i != self._place:
-                    size, old = law.degrees[i] + 1, before.layout.lowest[i]
-                    present[first : first + size] = known[old : old + size]
-        return self._started(time, phase, contact, reason, moment, present)
-
-    def _started(
-        self,
-        time: float,
-        phase: tuple[str, int],
-        contact: bool,
-        reason: str,
-        moment: Moment,
-        present: FloatArray,
-    ) -> Segment:
-        law, phases, (name, place) = self._laws[contact], self.task.phases, phase
-        rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
-        if place < len(phases):
-            rate[self._place] = -phases[place].speed_of_approach
-            over, goals = phases[place].over, self._goals[place]
-        change = PhaseChange(
-            time=float(time),
-            phase=name,
-            place=place,
-            in_contact=bool(contact),
-            reason=reason,
-            force=float(moment.force),
-            distance=float(moment.distance),
-            distance_rate=float(moment.rate),
-        )
-        return Segment.begin(change, law.layout, goals.function, goals.named, rate, present, over)
-
-    def _chain(self, context: Context, law: TrackingLaw) -> FloatArray:
-        """R that a law meets now: z_i, z_i', ..., and zero for the highest derivatives."""
-        found = np.zeros(law.layout.reference_size)
-        state = self._state_port.Eval(context)
-        parameters = context.get_numeric_parameter(0).CopyToVector()
-        coordinates = law.error_coordinates(state, found, parameters)
-        own = np.delete(coordinates, _integral_places(law))
-        found[law.layout.chained] = own
-        return found
-
-    def _distance(self, context: Context) -> tuple[float, float]:
-        """The distance and its derivative, by the model."""
-        parameters = context.get_numeric_parameter(0).value()
-        distance, rate = self._seen.evaluate(self._state_port.Eval(context), parameters)[0]
-        return float(distance), float(rate)
+        return progress.segments[-1] if progress.segments else self._plan.first(self._now(context))
 
     # What ends a phase.
 
     def _moment(self, context: Context, segment: Segment) -> Moment:
         time = context.get_time()
         force = float(self._force_port.Eval(context)[self._force])
-        distance, rate = self._distance(context)
+        distance, rate = self._plan.distance(self._now(context))
         wanted = segment.reference(time)[segment.layout.lowest[self._place]]
         return Moment(time - segment.change.time, force, distance, rate, float(wanted))
 
@@ -282,7 +178,7 @@ class TaskSupervisor(LeafSystem):
         if self.progress(context).segments:
             return EventStatus.DidNothing()  # A run that goes on.
         time = context.get_time()
-        self._put(state, Progress((self._first(context),), time, time))
+        self._put(state, Progress((self._segment(context),), time, time))
         return EventStatus.Succeeded()
 
     def _at_guard(
@@ -312,29 +208,23 @@ class TaskSupervisor(LeafSystem):
         self, context: Context, segment: Segment, moment: Moment, margins: FloatArray
     ) -> tuple[Segment, EventStatus]:
         """What follows where a phase has ended."""
-        task, place = self.task, segment.change.place
-        phase, count = task.phases[place], len(task.phases)
-        wanted = phase.awaited(task.contact_force)
-        status = EventStatus.Succeeded()
+        task, place, now = self.task, segment.change.place, self._now(context)
+        phase, status = task.phases[place], EventStatus.Succeeded()
+        awaited = phase.awaited(task.contact_force)
         if margins[0] <= 0.0:
-            after = self._named(place + 1)
-            return self._next(context, segment, moment, after, f"after {wanted}"), status
+            following = self._plan.following(now, segment, moment, place + 1, f"after {awaited}")
+            return following, status
         if margins[1] <= 0.0:
             reaction, reason = phase.if_lost, f"the contact of {phase.name} is lost"
         else:
             reaction = phase.if_late
-            reason = f"{phase.name} has waited {phase.within:g} s for {wanted}"
+            reason = f"{phase.name} has waited {phase.within:g} s for {awaited}"
         if reaction == "fail":
             raise self._failed(context, reason, moment)
-        again = task.last_approach(place) if reaction == "approach" else None
-        after = (HELD, count) if again is None else self._named(again)
         if reaction == "stop":
             status = EventStatus.ReachedTermination(self, reason)
-        return self._next(context, segment, moment, after, reason), status
-
-    def _named(self, place: int) -> tuple[str, int]:
-        phases = self.task.phases
-        return (phases[place].name if place < len(phases) else DONE), place
+        again = task.last_approach(place) if reaction == "approach" else None
+        return self._plan.following(now, segment, moment, again, reason), status
 
     def _failed(self, context: Context, reason: str, moment: Moment) -> SimulationError:
         time, state = context.get_time(), self._state_port.Eval(context)
@@ -366,7 +256,7 @@ class TaskSupervisor(LeafSystem):
         output.SetFromVector([float(self._segment(context).change.in_contact)])
 
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
-        segments = self.progress(context).segments or (self._first(context),)
+        segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
         force = self._force_port.Eval(context)[self._force]
         is_open = not begin.in_contact or force < self.task.contact_force
@@ -378,40 +268,3 @@ class TaskSupervisor(LeafSystem):
     def _calc_chosen(self, context: Context, value: AbstractValue) -> None:
         contact = self._segment(context).change.in_contact
         value.set_value(InputPortIndex(1 + (CONTACT if contact else FREE)))
-
-
-def _integral_places(law: TrackingLaw) -> list[int]:
-    """Where integrals stand among the error coordinates."""
-    found, place = [], 0
-    for i, degree in enumerate(law.degrees):
-        if i in law.integral.outputs:
-            found.append(place)
-            place += 1
-        place += degree
-    return found
-
-
-def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
-    """The references of a phase."""
-    phase = task.phases[index]
-    names = [signal.name for signal in law.system.output_signals]
-    found, degrees = [], law.degrees
-    for name, reference in phase.goals(names[place]).items():
-        try:
-            found.append(assigned(name, reference, names, degrees))
-        except ReferenceSignalError as error:
-            raise ModelError(
-                f"phase {index + 1} of the task, {phase.name}: reference '{name}': {error}"
-            ) from error
-    named = tuple(i for one in found for i in one.places)
-    rest = [name for i, name in enumerate(names) if i not in named]
-    found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
-    try:
-        return Goals(stack_references(in_order(found, names), degrees), named)
-    except ReferenceSignalError as error:
-        raise ModelError(f"phase {index + 1} of the task, {phase.name}: {error}") from error
-
-
-def _no_goals(law: TrackingLaw) -> Goals:
-    zero = np.zeros(law.layout.reference_size)
-    return Goals(lambda time: zero, ())

@@ -59,13 +59,13 @@ class Task:
 
     @property
     def contacts(self) -> tuple[bool, ...]:
-        """Whether each phase begins in contact."""
+        """Whether each phase begins in contact, and whether the robot rests so at the end."""
         found, left = [], False
         for phase in self.phases:
             begins = phase.begins_in_contact
             found.append(left if begins is None else begins)
             left = found[-1] if phase.ends_in_contact is None else phase.ends_in_contact
-        return tuple(found)
+        return (*found, left)
 
     def last_approach(self, index: int) -> int | None:
         """The place of the last phase up to one that leads into contact; None if there is none."""

@@ -1,0 +1,189 @@
+"""What a phase begins with: references that go on from those before."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.references import ConstantReference, stack_references
+from drake_dae.dae.references.by_name import assigned, in_order
+from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.errors import ModelError, ReferenceSignalError
+from drake_dae.systems.task.phases import Moment
+from drake_dae.systems.task.progress import DONE, HELD, PhaseChange, Segment
+from drake_dae.systems.task.task import Task
+
+FREE, CONTACT = 0, 1
+"""The places of the two laws."""
+
+
+@dataclass(frozen=True, eq=False)
+class Goals:
+    """The references of a phase for its law.
+
+    Attributes:
+        function: R in s after its begin, zero for outputs that it does not name.
+        named: Which outputs it names.
+    """
+
+    function: Callable[[float], FloatArray]
+    named: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Now:
+    """A moment of a run, as the laws' model sees it.
+
+    Attributes:
+        time: In s.
+        state: x, shape (n,).
+        parameters: Of the laws' system.
+    """
+
+    time: float
+    state: FloatArray
+    parameters: FloatArray
+
+
+class Planner:
+    """Makes the references of each phase of a task.
+
+    Args:
+        task: The phases.
+        laws: The law of the free robot and that in contact.
+        place: Which output is the distance of the first, and the force of the second.
+
+    Raises:
+        ModelError: A phase has a reference that does not fit its law.
+    """
+
+    def __init__(self, task: Task, laws: tuple[TrackingLaw, TrackingLaw], place: int) -> None:
+        self._task, self._laws, self._place = task, laws, place
+        pairs = enumerate(task.contacts[:-1])
+        self._goals = [_goals(task, index, laws[contact], place) for index, contact in pairs]
+        self._nothing = [_no_goals(law) for law in laws]
+        free = laws[FREE]
+        distance = ca.vertcat(*free.structure.output_chains[place][:2])
+        self._distance = free.system.trace("distance", {"value": distance})
+
+    def distance(self, now: Now) -> tuple[float, float]:
+        """The distance and its derivative, by the model."""
+        distance, rate = self._distance.evaluate(now.state, now.parameters)[0]
+        return float(distance), float(rate)
+
+    def first(self, now: Now) -> Segment:
+        """The references of the first phase, which begin as the outputs are."""
+        contact = self._task.contacts[0]
+        force = self._task.contact_force if contact else 0.0
+        moment = Moment(0.0, force, *self.distance(now), 0.0)
+        present = self._met(now, contact, moment)
+        return self._started(now, 0, self._name(0), contact, "the task begins", moment, present)
+
+    def following(
+        self, now: Now, before: Segment, moment: Moment, place: int | None, reason: str
+    ) -> Segment:
+        """The references from now on, which begin as those before are.
+
+        Args:
+            now: The moment.
+            before: The references before.
+            moment: What is measured.
+            place: The phase that begins, their number after the last one; None to rest for good.
+            reason: Why.
+        """
+        was, known = before.change.in_contact, before.reference(now.time)
+        if place is None:  # The robot rests as it is: it touches, or is free.
+            contact = was and moment.force >= self._task.contact_force
+            name, place = HELD, len(self._task.phases)
+        else:
+            contact, name = self._task.contacts[place], self._name(place)
+        if contact != was:
+            old, known = known, self._met(now, contact, moment)
+            for i, first in enumerate(self._laws[contact].layout.lowest):
+                if i != self._place:
+                    size, start = self._laws[contact].degrees[i] + 1, before.layout.lowest[i]
+                    known[first : first + size] = old[start : start + size]
+        return self._started(now, place, name, contact, reason, moment, known)
+
+    def _started(
+        self,
+        now: Now,
+        place: int,
+        name: str,
+        contact: bool,
+        reason: str,
+        moment: Moment,
+        present: FloatArray,
+    ) -> Segment:
+        law, phases = self._laws[contact], self._task.phases
+        rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
+        if place < len(phases):
+            rate[self._place] = -phases[place].speed_of_approach
+            over, goals = phases[place].over, self._goals[place]
+        change = PhaseChange(
+            time=float(now.time),
+            phase=name,
+            place=place,
+            in_contact=bool(contact),
+            reason=reason,
+            force=float(moment.force),
+            distance=float(moment.distance),
+            distance_rate=float(moment.rate),
+        )
+        return Segment.begin(change, law.layout, goals.function, goals.named, rate, present, over)
+
+    def _met(self, now: Now, contact: bool, moment: Moment) -> FloatArray:
+        """R that a law meets now: z_i, z_i', ..., and zero for the highest derivatives.
+
+        A force that a law reaches at once is what is measured.
+        """
+        law = self._laws[contact]
+        found = np.zeros(law.layout.reference_size)
+        coordinates = law.error_coordinates(now.state, found, now.parameters)
+        found[law.layout.chained] = np.delete(coordinates, _integral_places(law))
+        if contact and law.degrees[self._place] == 0:
+            found[law.layout.lowest[self._place]] = moment.force
+        return found
+
+    def _name(self, place: int) -> str:
+        phases = self._task.phases
+        return phases[place].name if place < len(phases) else DONE
+
+
+def _integral_places(law: TrackingLaw) -> list[int]:
+    """Where integrals stand among the error coordinates."""
+    found, place = [], 0
+    for i, degree in enumerate(law.degrees):
+        if i in law.integral.outputs:
+            found.append(place)
+            place += 1
+        place += degree
+    return found
+
+
+def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
+    """The references of a phase."""
+    phase = task.phases[index]
+    names = [signal.name for signal in law.system.output_signals]
+    found, degrees = [], law.degrees
+    for name, reference in phase.goals(names[place]).items():
+        try:
+            found.append(assigned(name, reference, names, degrees))
+        except ReferenceSignalError as error:
+            raise ModelError(
+                f"phase {index + 1} of the task, {phase.name}: reference '{name}': {error}"
+            ) from error
+    named = tuple(i for one in found for i in one.places)
+    rest = [name for i, name in enumerate(names) if i not in named]
+    found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
+    try:
+        return Goals(stack_references(in_order(found, names), degrees), named)
+    except ReferenceSignalError as error:
+        raise ModelError(f"phase {index + 1} of the task, {phase.name}: {error}") from error
+
+
+def _no_goals(law: TrackingLaw) -> Goals:
+    zero = np.zeros(law.layout.reference_size)
+    return Goals(lambda time: zero, ())
