@@ -320,7 +320,8 @@ def make_closed_loop(
     moving = [add_exogenous(builder, block, exogenous) for block in (plant, controller)]
     watch, hold = None, None if limits is None else limits.GetOutputPort("is_limited")
     if observer is not None:
-        watch = add_observer(builder, plant, controller, observer, held, control, limits)
+        goal = reference.GetOutputPort("reference")
+        watch = add_observer(builder, plant, controller, observer, held, control, goal, limits)
         hold = watch.GetOutputPort("hold")
     add_hold(builder, controller, hold)
 

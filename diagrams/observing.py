@@ -23,6 +23,7 @@ def add_observer(
     observing: Observing,
     sampling: Sampling | None,
     control: OutputPort,
+    reference: OutputPort,
     limits: ControlLimits | None,
 ) -> DisturbanceObserver:
     """Adds the observer that feeds a controller's exogenous signals, but not yet its force.
@@ -34,6 +35,7 @@ def add_observer(
         observing: How the observer observes.
         sampling: That of the hold behind the controller.
         control: What arrives at the plant.
+        reference: R(t).
         limits: The limits of the drives.
 
     Raises:
@@ -56,6 +58,7 @@ def add_observer(
     observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, period, lag))
     builder.Connect(plant.GetOutputPort("state"), observer.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
+    builder.Connect(reference, observer.GetInputPort("reference"))
     builder.Connect(observer.GetOutputPort("exogenous"), controller.GetInputPort("exogenous"))
     if not plant.dae.num_constraints:
         none = plant.GetOutputPort("constraint_force")
