@@ -365,7 +365,10 @@ def make_closed_loop(
     holds = open_holds(builder, plant, law) if isinstance(plant, UnilateralRobotPlant) else []
     watch = None
     if observer is not None:
-        watch = add_observer(builder, plant, controller, observer, state, held, control, limits)
+        goal = reference.GetOutputPort("reference")
+        watch = add_observer(
+            builder, plant, controller, observer, state, held, control, goal, limits
+        )
         holds.append(watch.GetOutputPort("hold"))
     elif limits is not None:
         holds.append(limits.GetOutputPort("is_limited"))

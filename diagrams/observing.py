@@ -24,6 +24,7 @@ def add_observer(
     state: OutputPort,
     sampling: Sampling | None,
     control: OutputPort,
+    reference: OutputPort,
     limits: ControlLimits | None,
 ) -> DisturbanceObserver:
     """Adds the observer that feeds a controller's exogenous signals, but not yet its force.
@@ -36,6 +37,7 @@ def add_observer(
         state: The state that the controller gets.
         sampling: That of the hold behind the controller.
         control: What arrives at the plant.
+        reference: R(t).
         limits: The limits of the drives.
 
     Raises:
@@ -58,6 +60,7 @@ def add_observer(
     observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, period, lag))
     builder.Connect(state, observer.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
+    builder.Connect(reference, observer.GetInputPort("reference"))
     builder.Connect(observer.GetOutputPort("exogenous"), controller.GetInputPort("exogenous"))
     if not plant.dae.num_constraints:
         none = plant.GetOutputPort("constraint_force")

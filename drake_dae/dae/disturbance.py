@@ -8,11 +8,12 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
+from drake_dae.dae.layout import Layout
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 DISTURBANCE = "disturbance"
@@ -91,6 +92,9 @@ class Observation:
             (Q c_j)^T E^-1 Q d / |Q c_j|^2 with |a|^2 = a^T E^-1 a, as rows, shape (c, k); and the
             speed of sliding by the power of friction, in m/s, shape (c,). Q d is d with what the
             constraint answers, Q = 1 + S^T g dalpha/dd.
+        wanted: (x, R, parameters) -> x with those velocities with which the outputs move as the
+            reference does and the constraints stay, shape (n,); None where outputs and constraints
+            do not determine them.
         rows: The states whose rates d enters.
         frictions: The names of the coefficients of friction, and which constraint input each is
             for.
@@ -98,6 +102,7 @@ class Observation:
 
     momentum: TracedFunction
     friction: TracedFunction
+    wanted: TracedFunction | None
     rows: tuple[int, ...]
     frictions: dict[str, int]
 
@@ -151,7 +156,27 @@ class Observation:
             "speeds": ca.vertcat(*speeds),
         }
         shared = system.trace("friction in a disturbance", found, {"constraint_input": v})
-        return cls(function, shared, tuple(rows), frictions)
+        return cls(function, shared, _wanted(structure, rows), tuple(rows), frictions)
+
+
+def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
+    """x with the velocities that the reference wants; None where it does not tell them."""
+    system, layout = structure.system, Layout(structure.output_degrees)
+    steered = [int(i) for i in layout.dynamic]
+    if any(structure.output_degrees[i] != 2 for i in steered):
+        return None
+    reference = ca.SX.sym("R", layout.reference_size)
+    kept = Layout(structure.constraint_degrees).ends.tolist()
+    rates = [structure.output_chains[i][1] - reference[int(layout.lowest[i]) + 1] for i in steered]
+    left = ca.vertcat(ca.SX(0, 1), *rates, structure.manifold.residual_expression[kept, :])
+    slope = ca.jacobian(left, system.state[list(rows), :])
+    if slope.shape[0] != slope.shape[1]:
+        return None
+    factors = Factorization(slope)
+    state = ca.SX(system.state)
+    state[list(rows), :] -= factors.solve(left)
+    inputs = {"reference": reference}
+    return system.trace("wanted velocities", {"state": state}, inputs, factors.pivot)
 
 
 def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:

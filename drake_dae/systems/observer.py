@@ -1,6 +1,7 @@
 """An observer of what a model lacks: a disturbance, and coefficients of friction."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,6 +48,14 @@ class Observing:
             positive(name, getattr(self, name))
 
 
+class _Friction(NamedTuple):
+    """What friction does in a state: see `Observation.friction`."""
+
+    forces: FloatArray
+    shares: FloatArray
+    speeds: FloatArray
+
+
 @checked(ModelError)
 class DisturbanceObserver(ParameterizedSystem):
     """Observes the disturbance d of E x' = f + S d + g v + h u, and identifies friction.
@@ -70,18 +79,26 @@ class DisturbanceObserver(ParameterizedSystem):
     contact slides by less than `least_speed`, or is pressed by less than `least_force`, since then
     friction does not tell its coefficient; also while the input `hold` is not 0. r needs no hold:
     it has the control that acts, also at its limits, and the force that is measured, also where a
-    contact is open. The speed of sliding is that by the power of friction, for surfaces that stand
-    still.
+    contact is open.
+
+    Friction acts against the motion that the reference wants, c = c(x_w), where x_w is x with the
+    velocities that follow from the reference and the constraints: where a motion turns or begins
+    the contact sticks, and its own velocity tells no direction. So r is what is left beside
+    mu c(x_w), and since the law's model has mu c(x), what it is told to cancel is
+    r + mu (c(x_w) - c(x)). Where outputs and constraints do not determine the velocities, or
+    `reference` has no wire, x_w = x. The speed of sliding is that by the power of friction, for
+    surfaces that stand still.
 
     Input ports:
         estimated_state: x, shape (n,).
         control: u as it acts, shape (p,).
         measured_force: v, shape (m,).
         hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire.
+        reference: R, as that of the controller; may be without a wire.
 
     Output ports:
-        exogenous: r and mu for the port of a `TrackingController` with the same law, which cancels
-            them; in the order of its system's.
+        exogenous: What to cancel, and mu, for the port of a `TrackingController` with the same
+            law, in the order of its system's.
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
         hold: 1 while the input `hold` is not 0 or a contact that rubs is lost, else 0, shape (1,):
@@ -142,7 +159,8 @@ class DisturbanceObserver(ParameterizedSystem):
         self.friction_signals = tuple(Signal(name) for name in names)
         self._mu = [system.parameter_slice(name) for name in names]
         self._contacts = list(found.frictions.values())
-        places = {DISTURBANCE: list(range(size))}
+        last = size + len(names)
+        places = {DISTURBANCE: list(range(last, last + size))}
         places |= {name: [size + j] for j, name in enumerate(names)}
         self._order = [place for p in system.exogenous.moving for place in places[p.name]]
         self._ports = [
@@ -151,9 +169,12 @@ class DisturbanceObserver(ParameterizedSystem):
             self.DeclareVectorInputPort("measured_force", system.num_constraints),
         ]
         self._hold = self.DeclareVectorInputPort("hold", 1)
-        # r and mu; then p, its rate without inputs, and u, of the sample before.
+        self._reference = self.DeclareVectorInputPort("reference", law.layout.reference_size)
+        # r, mu, and what is to cancel; then, of the sample before, p, its rate without inputs, u.
         start = [system.parameter_values[place] for place in self._mu]
-        self._estimate = self.DeclareDiscreteState(np.concatenate([np.zeros(size), *start]))
+        self._estimate = self.DeclareDiscreteState(
+            np.concatenate([np.zeros(size), *start, np.zeros(size)])
+        )
         self._before = self.DeclareDiscreteState(np.full(2 * size + system.num_controls, np.nan))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
@@ -187,7 +208,8 @@ class DisturbanceObserver(ParameterizedSystem):
                 f"{friction!r}"
             )
         values = context.get_discrete_state(self._estimate).CopyToVector()
-        values[len(self.observation.rows) :] = given
+        size = len(self.observation.rows)
+        values[size : size + len(self._mu)] = given
         context.SetDiscreteState(self._estimate, values)
 
     def _sample(self, context: Context, state: State) -> EventStatus:
@@ -195,7 +217,7 @@ class DisturbanceObserver(ParameterizedSystem):
         size = len(observation.rows)
         x, u, force = (port.Eval(context) for port in self._ports)
         estimate = context.get_discrete_state(self._estimate).CopyToVector()
-        r, mu = estimate[:size], estimate[size:]
+        r, mu, cancelled = np.split(estimate, [size, size + len(self._mu)])
         parameters = context.get_numeric_parameter(0).CopyToVector()
         for place, value in zip(self._mu, mu, strict=True):
             parameters[place] = value
@@ -204,20 +226,41 @@ class DisturbanceObserver(ParameterizedSystem):
         is_first = np.isnan(p_0[0])
         acted = u if is_first else self._lag * u_0 + (1.0 - self._lag) * u
         p, rate, inputs = self._run(observation.momentum, context, x, acted, force, parameters)
+        turned = np.zeros(size)
+        if mu.size:
+            goal = self._wanted(context, x, parameters)
+            moved, wanted = (self._friction(context, y, force, parameters) for y in (x, goal))
+            turned = (wanted.forces - moved.forces) @ mu
         if not is_first:
-            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs
+            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - turned
             r += -np.expm1(-observing.rate * period) * (d - r)
         if mu.size and not self._is_limited(context):
-            forces, shares, speeds = self._run(observation.friction, context, x, force, parameters)
+            speeds = np.minimum(moved.speeds, wanted.speeds)
             is_sure = (speeds >= observing.least_speed) & ~self._is_lost(force)
-            step = -np.expm1(-observing.friction_rate * period) * (shares @ r)
+            step = -np.expm1(-observing.friction_rate * period) * (moved.shares @ r)
             step = np.clip(mu + is_sure * step, 0.0, observing.largest_friction) - mu
             mu += step
-            r -= forces.reshape(size, -1) @ step
+            r -= wanted.forces @ step
+        cancelled[:] = r + turned
         discrete = state.get_mutable_discrete_state()
         discrete.set_value(self._estimate, estimate)
         discrete.set_value(self._before, np.concatenate([p, rate, u]))
         return EventStatus.Succeeded()
+
+    def _friction(
+        self, context: Context, state: FloatArray, force: FloatArray, parameters: FloatArray
+    ) -> "_Friction":
+        """What friction does where the state is another one."""
+        found = self._run(self.observation.friction, context, state, force, parameters)
+        forces, shares, speeds = (np.array(one) for one in found)
+        return _Friction(forces.reshape(len(self.observation.rows), -1), shares, speeds)
+
+    def _wanted(self, context: Context, state: FloatArray, parameters: FloatArray) -> FloatArray:
+        """The state with the velocities that the reference wants, as far as it is told."""
+        function = self.observation.wanted
+        if function is None or not self._reference.HasValue(context):
+            return state
+        return self._run(function, context, state, self._reference.Eval(context), parameters)[0]
 
     def _run(
         self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray

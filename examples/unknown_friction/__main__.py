@@ -37,7 +37,6 @@ POINT = "plant=!MultibodyPlant {time_step: 0.001, stiffness: 1.0e5, friction: 0.
 UNKNOWN = (
     "gains=",
     "constraints.0.friction=0.0",
-    "constraints.0.stiction_tolerance=1.0e-4",
     POINT,
     LATE,
 )

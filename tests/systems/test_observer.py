@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from arms import error_controlled, touching
+from arms import error_controlled, numbers, touching
 from numpy.testing import assert_allclose
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
@@ -201,6 +201,46 @@ def test_handing_over_to_friction_moves_nothing():
     wanted = [SinusoidReference(0.3, 0.1, 2.0), ConstantReference(20.0)]
     ends = [slide(wanted, 0.25, Observing(20.0, rate))[1]["control"][-1] for rate in (1e-6, 8.0)]
     assert_allclose(*ends, atol=0.2)
+
+
+def test_wanted_velocities_are_those_of_the_reference_on_the_constraints():
+    """v of P v = r', J v = 0, with P and J of the tool by MultibodyPlant."""
+    _, dae = rubbing(0.3)
+    law = TrackingLaw(dae, poles(-4.0))
+    observation = DisturbanceObserver(law, Observing(5.0), T).observation
+    state = law.structure.states[0]
+    reference = np.array([0.3, 0.25, 0.1, 20.0])
+    found = observation.wanted(state, reference, dae.parameter_values)[0]
+    n = numbers("two_link", *np.split(state, 2))
+    rows = np.vstack([n.output_jacobian, n.constraint_jacobian])
+    assert_allclose(found[:2], state[:2], rtol=1e-15)
+    assert_allclose(rows @ found[2:], [0.25, 0.0], atol=1e-12)
+
+
+def test_friction_is_cancelled_against_the_motion_that_is_wanted():
+    """At rest, where up is wanted: -mu lambda P^T, with P by MultibodyPlant; v_s is 1 mm/s."""
+    _, dae = rubbing(0.3)
+    law = TrackingLaw(dae, poles(-4.0))
+    observer = DisturbanceObserver(law, Observing(5.0), T)
+    state = law.structure.states[0]
+    state = np.array([*state[:2], 0.0, 0.0])
+    context = observer.CreateDefaultContext()
+    observer.set_friction(context, 0.4)
+    for name, value in (
+        ("estimated_state", state),
+        ("control", np.zeros(2)),
+        ("measured_force", [20.0]),
+        ("reference", [0.3, 0.25, 0.0, 20.0]),
+    ):
+        observer.GetInputPort(name).FixValue(context, value)
+    Simulator(observer, context).AdvanceTo(T / 2.0)
+    n = numbers("two_link", *np.split(state, 2))
+    told = observer.GetOutputPort("exogenous").Eval(context)
+    names = [signal.name for signal in dae.exogenous.signals]
+    assert names[0] == "wall.friction"
+    assert told[0] == 0.4
+    assert_allclose(told[1:], -0.4 * 20.0 * n.output_jacobian[0], rtol=1e-4)
+    assert_allclose(observer.GetOutputPort("disturbance").Eval(context), 0.0)
 
 
 def test_law_without_a_disturbance_is_that_of_the_system():
