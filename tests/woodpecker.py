@@ -199,7 +199,7 @@ def periods(times):
 
 
 if __name__ == "__main__":
-    LAST = 2.0
+    LAST = 1.0
     hand = [time for time, impulses, _ in by_hand(LAST) if "beak" in impulses]
     print(f"by hand, friction that sticks: period {1e3 * periods(hand)[-1]:.4f} ms")
     for tolerance in (1e-2, 1e-3, 1e-4):

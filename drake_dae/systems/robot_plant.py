@@ -9,14 +9,14 @@ from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.formulas import Formula, TracedFormula
-from drake_dae.systems.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.robot_ports import RobotPorts
 from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
-class RobotPlant(DaePlant, RobotPorts):
+class RobotPlant(DaePlant):
     """A constrained robot (37)-(40) with the ports of `DaePlant` and:
 
     Output ports:
@@ -60,10 +60,12 @@ class RobotPlant(DaePlant, RobotPorts):
     ) -> None:
         super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
         self.model = model
-        tickets = self._by_control if self._force_needs_control else self._by_state
-        self._declare_robot_ports(model.dae, self._by_state, tickets)
-        if model.loop_joints.signals:
-            self.functions["loop_state"] = self._loops
+        own = weakly(self._values), weakly(self._shown_force)
+        by_force = self._by_control if self._force_needs_control else self._by_state
+        self._ports = RobotPorts(self, model, model.dae, *own, self._by_state, by_force)
+        self.wrench_signals = self._ports.wrench_signals
+        if self._ports.loops is not None:
+            self.functions["loop_state"] = self._ports.loops
 
     def _shown_force(self, context: Context) -> FloatArray:
         return self._evaluate(self._force, context, self._force_needs_control)
@@ -71,19 +73,18 @@ class RobotPlant(DaePlant, RobotPorts):
     def _formulas(self) -> dict[str, Formula]:
         state = self.dae.state
         formulas = super()._formulas()
-        wrenches, force = self._wrench_formula
+        ports = self._ports
         derivatives = self.structure.derivatives
         constraint_input = derivatives.expand(derivatives.constraint_input)
-        acting = ca.substitute(wrenches, force, self.dae.forces(constraint_input))
+        acting = ca.substitute(ports.wrenches, ports.force, self.dae.forces(constraint_input))
         formulas["constraint_wrenches"] = TracedFormula(
             self.structure.trace("constraint wrenches", acting, self._force_needs_control),
             signals=self._signals,
         )
-        for name, part in self._parts.items():
+        for name, part in ports.parts.items():
             function = TracedFunction(name, {"state": state}, {"value": state[part]})
             formulas[name] = TracedFormula(function)
-        if self.model.loop_joints.signals:
-            formulas["loop_state"] = TracedFormula(self._loops)
-        if self.model.joint_force is not None:
-            formulas["joint_torque"] = TracedFormula(self._joint_force)
+        for name, known in (("loop_state", ports.loops), ("joint_torque", ports.joint_force)):
+            if known is not None:
+                formulas[name] = TracedFormula(known)
         return formulas

@@ -18,6 +18,7 @@ from drake_dae.dae.structure.constrained import (
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.along import function_along
+from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.robot_ports import RobotPorts
@@ -28,22 +29,13 @@ from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
-class ModalPorts(RobotPorts):
-    """State, mode and ports of a `UnilateralRobotPlant`; its mode stays as it is.
+class ModalPorts(ParameterizedSystem):
+    """State, mode and ports of a `UnilateralRobotPlant`, with its attributes; the mode stays.
 
     Args:
         model: The robot.
         contacts: Name of a constraint that can only push -> its coefficient of restitution.
         structure: The structure of `model.dae`, if it is known.
-
-    Attributes:
-        model: The robot.
-        contacts: The names of the contacts that open and close, in the order of `mode`.
-        modes: Which contacts are closed -> how the robot moves then; see `Mode`.
-        gap_signals: Names and units of `gap`.
-        mode_signals: Names of `mode`.
-        normals: Where the normal force of each contact stands in `constraint_force`.
-        wrench_signals: Names and units of `constraint_wrenches`.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -97,7 +89,9 @@ class ModalPorts(RobotPorts):
         self._declare("constraint_force", dae.num_constraints, self._calc_force, True)
         self._declare("constraint_residual", residual.numel(), self._calc_residual)
         self._declare("controlled_output", dae.num_outputs, self._calc_output, True)
-        self._declare_robot_ports(dae, self._by_state, self._by_control)
+        own = weakly(self._values), weakly(self._shown_force)
+        self._ports = RobotPorts(self, model, dae, *own, self._by_state, self._by_control)
+        self.wrench_signals = self._ports.wrench_signals
 
     def _declare(
         self, name: str, size: int, calc: Callable[..., None], by_control: bool = False
@@ -215,7 +209,9 @@ class ModalPorts(RobotPorts):
                     "gap": self._contacts.gaps,
                     "constraint_force": mode.force,
                     "controlled_output": mode.output,
-                }.get(port) or self._loops
+                    "loop_state": self._ports.loops,
+                }[port]
+                assert function is not None  # It is one of `functions`.
                 found[rows] = function_along(function, here)
         return self._pushing(found) if port == "constraint_force" else found
 
