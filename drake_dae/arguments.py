@@ -237,7 +237,8 @@ def _any_of(members: set[Any], order: Sequence[Any]) -> _Rule:
         if all(_wrong(what, value, rule) for rule in fits):
             yield what, value, fits[0]
 
-    return _Rule(words, lambda value: bool(fitting(value)), inside)
+    has_parts = any(rule.inside for rule in rules)
+    return _Rule(words, lambda value: bool(fitting(value)), inside if has_parts else None)
 
 
 def _list(entry: _Rule) -> _Rule:

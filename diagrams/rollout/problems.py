@@ -99,9 +99,9 @@ def problems_of(
     bad = [seed for seed in seeds or () if not 0 <= seed < 2**32]
     if bad:
         raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
-    rows = np.broadcast_to(given, (count, given.shape[1]))
     problems, lock = [], Lock()
-    for index, (start, row) in enumerate(zip(states, rows, strict=True)):
+    for index, start in enumerate(states):
+        row = given[min(index, len(given) - 1)]
         plant, law = row[:split].copy(), row[split:].copy()
         current = functions.plant_parameters(plant)
         loop.plant.check_start(start[: loop.plant.dae.num_states], current(times[0]))
