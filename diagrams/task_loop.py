@@ -15,6 +15,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.unilateral import with_events
 from drake_dae.diagrams.wiring import add_block, hold_before, log_steps
 from drake_dae.errors import WiringError
 from drake_dae.simulation.record import Record, Recorded
@@ -130,7 +131,10 @@ class TaskLoop:
             "distance": (signals[-1], signals[-1].derivative(1)),
         }
         told = {n: Recorded(v, named.get(n, signals)) for n, v in derived.items()}
-        return Record(logged.time, {**logged.signals, **told}).while_finite()
+        record = Record(logged.time, {**logged.signals, **told}).while_finite()
+        if isinstance(self.plant, UnilateralRobotPlant):
+            return with_events(record, self.plant, context, after)
+        return record
 
     @property
     def phase_signals(self) -> tuple[Signal, ...]:
@@ -213,8 +217,8 @@ def _signals(
     named["control"] = (control, dae.control_signals)
     named["phase"] = (controller.GetOutputPort("phase"), (Signal("phase"),))
     if isinstance(plant, UnilateralRobotPlant):
-        signals = tuple(Signal(f"{name}.closed") for name in plant.contacts)
-        named["mode"] = (plant.GetOutputPort("mode"), signals)
+        named["mode"] = (plant.GetOutputPort("mode"), plant.mode_signals)
+        named["gap"] = (plant.GetOutputPort("gap"), plant.gap_signals)
     if isinstance(plant, ContactPlant):
         named["contact_force"] = (plant.GetOutputPort("contact_force"), plant.contact_force_signals)
     for name, one in (("integral", law), ("free_integral", controller.free_law)):
