@@ -57,9 +57,8 @@ def mark_phases(figure: Figure, record: Record) -> None:
     spans = phase_spans(record)
     for axis in figure.axes:
         axis.margins(x=0.01)
-        for number, span in enumerate(spans):
-            if number % 2:
-                axis.axvspan(span.begin, span.end, color="0.93", zorder=0.2, linewidth=0)
+        for span in spans:
+            axis.axvline(span.begin, color="0.6", linewidth=0.6, linestyle=":", zorder=0.3)
             axis.text(
                 span.begin,
                 0.97,
