@@ -11,7 +11,7 @@ from contact_peers.measure import FAILED, Figures, run_law
 from contact_peers.plants import CONDITIONS, FRICTION
 from contact_peers.robot import NORMAL, WALL, Goals, Robot
 from contact_peers.search import load_gains
-from contact_peers.table import OURS, Row, better, short, table
+from contact_peers.table import FIGURES, OURS, ROWS, Row, better, load_rows, page, short, table
 from contact_peers.task_laws import (
     Hybrid,
     LeastSquares,
@@ -168,3 +168,9 @@ def test_table_tells_what_is_lost_and_what_is_better():
     assert line.startswith("- hybrid, friction known, force: point 1e5 N/m (0.004 against 0.02)")
     assert [short(value) for value in (31.94, 9.96, 0.0123, 7.1)] == ["32", "10", "0.012", "7.1"]
     assert replace(good, open=0.2).is_lost
+
+
+def test_committed_table_is_that_of_the_committed_figures():
+    rows = load_rows()
+    assert [(row.law, row.knows) for row in rows] == list(ROWS)
+    assert FIGURES.with_name("table.md").read_text() == page(rows)

@@ -8,8 +8,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
-from contact_peers.plants import CONDITIONS
+from contact_peers.plants import CONDITIONS, Condition
 from contact_peers.table import OURS, VERSION_0_1, Row
 
 STYLES = {
@@ -24,16 +25,16 @@ STYLES = {
 }
 """Law -> marker and colour."""
 
-X, Y = (2e-3, 1.5e2), (2e-3, 3e1)
-"""Limits in mm and N; what is lost stands at the upper right."""
+X, Y = (2e-4, 1.5e2), (1e-3, 6e1)
+"""Limits in mm and N."""
 
 
 def draw(rows: list[Row], path: Path) -> None:
     """Draws all figures into a file."""
     figure, grid = plt.subplots(2, 4, figsize=(13, 6.6), sharex=True, sharey=True)
-    figure.subplots_adjust(0.055, 0.085, 0.99, 0.93, 0.06, 0.16)
+    figure.subplots_adjust(0.055, 0.085, 0.99, 0.9, 0.06, 0.18)
     for axes, condition in zip(grid.flat, CONDITIONS, strict=False):
-        _panel(axes, rows, condition.title)
+        _panel(axes, rows, condition)
     for axes in grid[-1, :3]:
         axes.set_xlabel("position error [mm]")
     grid[0, 3].tick_params(labelbottom=True)
@@ -50,31 +51,36 @@ def draw(rows: list[Row], path: Path) -> None:
     plt.close(figure)
 
 
-def _panel(axes: Axes, rows: list[Row], title: str) -> None:
+def _panel(axes: Axes, rows: list[Row], condition: Condition) -> None:
     axes.set(xscale="log", yscale="log", xlim=X, ylim=Y)
-    axes.set_title(title, fontsize=10)
+    axes.set_title(condition.title, fontsize=10)
     axes.grid(True, which="major", color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
+    axes.add_patch(Rectangle((X[0], Y[0]), *condition.asked, color="tab:green", alpha=0.1))
+    lost = 0
     for name, (marker, color) in STYLES.items():
-        found = [row for row in rows if row.law == name]
-        places = [_place(row, title) for row in found]
-        axes.plot(*zip(*places, strict=True), color=color, linewidth=0.8, alpha=0.5, zorder=2)
-        for row, place in zip(found, places, strict=True):
-            size = 190 if name == OURS else 60
-            face = color if row.knows or marker == "x" else "white"
-            axes.scatter(
-                *place, s=size, marker=marker, facecolors=face, edgecolors=color, zorder=3,
-                linewidths=1.4, clip_on=False,
-            )  # fmt: skip
-            if row.figures[title].is_lost:
-                axes.annotate("lost", place, (-28, -3), textcoords="offset points", fontsize=8)
-
-
-def _place(row: Row, title: str) -> tuple[float, float]:
-    figures = row.figures[title]
-    if figures.is_lost:
-        return X[1], Y[1]
-    return min(max(figures.position, X[0]), X[1]), min(max(figures.force, Y[0]), Y[1])
+        kept = []
+        for row in (row for row in rows if row.law == name):
+            style = {
+                "s": 170 if name == OURS else 55,
+                "marker": marker,
+                "facecolors": color if row.knows or marker == "x" else "white",
+                "edgecolors": None if marker == "x" else color,
+                "linewidths": 1.4,
+                "zorder": 3,
+            }
+            figures = row.figures[condition.title]
+            if figures.is_lost:
+                axes.scatter(0.95 - 0.07 * lost, 0.93, transform=axes.transAxes, **style)
+                lost += 1
+            else:
+                kept.append((figures.position, figures.force))
+                axes.scatter(*kept[-1], **style)
+        if kept:
+            axes.plot(*zip(*kept, strict=True), color=color, linewidth=0.8, alpha=0.5, zorder=2)
+    if lost:
+        place = (0.9 - 0.07 * (lost - 1), 0.93)
+        axes.text(*place, "lost", transform=axes.transAxes, ha="right", va="center", fontsize=9)
 
 
 def _legend(axes: Axes) -> None:
@@ -83,7 +89,7 @@ def _legend(axes: Axes) -> None:
         Line2D([], [], marker=marker, color=color, linestyle="", markersize=13 if n == OURS else 8)
         for n, (marker, color) in STYLES.items()
     ]
-    labels = list(STYLES)
+    labels = [name.split(" + ")[0] for name in STYLES]
     for face, label in (("0.3", "friction known"), ("white", "friction unknown")):
         handles.append(
             Line2D(
@@ -91,4 +97,6 @@ def _legend(axes: Axes) -> None:
             )
         )
         labels.append(label)
-    axes.legend(handles, labels, loc="center left", fontsize=9, frameon=False, labelspacing=0.8)
+    handles.append(Rectangle((0, 0), 1, 1, color="tab:green", alpha=0.1))
+    labels.append("asked for")
+    axes.legend(handles, labels, loc="center left", fontsize=9, frameon=False, labelspacing=0.7)

@@ -17,7 +17,7 @@ FIGURES = Path(__file__).with_name("figures.json")
 OURS, VERSION_0_1 = "drake_dae, as shipped", "drake_dae 0.1, poles -8"
 
 WITHOUT = (
-    "gains.all=[-8.0]",
+    "gains=!Poles {all: [-8.0]}",
     "constraint_damping=null",
     "integral=[]",
     "force=!ModelForce {}",
