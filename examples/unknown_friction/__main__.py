@@ -6,8 +6,8 @@ Every row is a run of 6 s at 1 kHz with one sample of delay, with the gains that
 advises, and from a coefficient of friction of 0; the figures are root mean squares after 2 s: the
 distance from the path, the force error, and how much the torques change from sample to sample.
 
-Claim: on all plants that the advice was made on, 0.02 mm and 0.03 N (0.05 N on a soft patch; with
-noise of encoders and force sensor 0.1 N; with 0.5 kg more in the tool 0.1 mm), and 0.4 N m.
+Claim: on the seven plants that the advice was made on, 0.02 mm and 0.03 N (0.05 N on a soft patch;
+with noise of encoders and force sensor 0.1 N; with 0.5 kg more in the tool 0.1 mm), and 0.4 N m.
 """
 
 import argparse
@@ -31,6 +31,7 @@ from drake_dae.diagrams.scenario_model import add_robot
 from drake_dae.diagrams.shipped import find_scenario
 
 SETTLED, DURATION = 2.0, 6.0
+ROUGHNESS = 0.4  # N m from one sample to the next.
 ANGLE_NOISE, RATE_NOISE, FORCE_NOISE = 5e-6, 1e-3, 0.3  # rad, rad/s, N, of each sample.
 LATE = "sampling={period: 0.001, delay: 0.001}"
 POINT = "plant=!MultibodyPlant {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}"
@@ -221,18 +222,19 @@ def main(arguments: list[str] | None = None) -> int:
             row = figures(condition)
         except dd.DrakeDaeError as error:
             print(f"{condition.name:32}{str(error)[:100]}", flush=True)
-            kept = False
+            kept = kept and condition not in TUNED
             continue
         is_kept = row.position <= condition.position and row.force <= condition.force
-        kept = kept and is_kept and row.roughness <= 0.4
+        is_kept = is_kept and row.roughness <= ROUGHNESS
+        kept = kept and (is_kept or condition not in TUNED)
         print(
             f"{condition.name:32}{row.position:9.4f}{condition.position:7.2f}{row.force:9.4f}"
             f"{condition.force:7.2f}{row.roughness:9.3f}{row.friction:8.3f}"
             f"{'' if is_kept else '  missed'}",
             flush=True,
         )
-    print("claim: " + ("all rows are kept" if kept else "not all rows are kept"))
-    return 0
+    print(f"claim: what the advice was made on is {'' if kept else 'not '}kept")
+    return 0 if kept else 1
 
 
 if __name__ == "__main__":
