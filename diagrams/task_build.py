@@ -14,6 +14,7 @@ from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import add_robot, start_guess
 from drake_dae.diagrams.task_loop import TaskLoop, make_task_loop
+from drake_dae.diagrams.unilateral import Unilateral
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.model import RobotModel
@@ -75,7 +76,9 @@ def wire_task(
                 parameters=scenario.plant_parameters,
             )
         else:
-            plant = UnilateralRobotPlant(model, {contact.name: 0.0})
+            given = scenario.plant
+            made = given if isinstance(given, Unilateral) else Unilateral({contact.name: 0.0})
+            plant = made.plant(model, structure)
     period = scenario.sampling.period if scenario.sampling else plant.time_step
     with at("task"):
         controller = TaskController(task.made(), law, free_law, sample_period=period)
@@ -120,6 +123,10 @@ def check_task(scenario: Scenario) -> None:
         "references": "a task has the references of its phases; leave them out",
         "exogenous": "nothing may move in a task; leave it out",
         "saturation": "the drives of a task have no limits; leave it out",
+        **dict.fromkeys(
+            ("observer", "encoders", "tolerances", "plant_payloads", "plant_pushes"),
+            "a task does not know it; leave it out",
+        ),
     }
     found = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if scenario.start.errors:

@@ -22,6 +22,7 @@ from contact_peers.plants import (
 from contact_peers.robot import Goals, Robot
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.diagrams.advice import advised
 from drake_dae.diagrams.build import contact_plant, start_scenario, wire_loop
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.scenario import Scenario
@@ -101,7 +102,8 @@ class Setup:
     def of(cls, condition: Condition, friction: float, settings: tuple[str, ...] = ()) -> "Setup":
         scenario = task(condition, friction, *settings)
         model = scenario_model(scenario)
-        return cls(scenario, model, scenario_structure(model))
+        structure = scenario_structure(model)
+        return cls(advised(scenario, model, structure).scenario, model, structure)
 
     def plant(self, condition: Condition) -> MeasuredPlant:
         plant = contact_plant(self.scenario, self.model, self.structure)

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from runs import run_scenario, scenario
 
-from drake_dae import build_scenario, load_scenario, simulate, start_meshcat
+from drake_dae import Record, build_scenario, load_scenario, simulate, start_meshcat
 from drake_dae.cli import main
 from drake_dae.diagrams.build import build_loop
 from drake_dae.diagrams.feasibility import find_feasibility
@@ -51,6 +51,20 @@ def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
     assert (tmp_path / "run" / "outputs.png").stat().st_size > 10_000
     page = (tmp_path / "run" / "animation.html").read_text()
     assert '"phases": [[0.0, "Approach"], [0.' in page
+
+
+@pytest.mark.slow
+def test_command_runs_a_task_in_the_ideal_contact(file, tmp_path, capsys):
+    """Its contact opens and closes: the record has the impact, plots and animation show it."""
+    words = ["--set", "duration=0.3", "--set", "plant=!Unilateral {restitution: {wall: 0.0}}"]
+    assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
+    told = capsys.readouterr().out
+    assert "\nTracked as predicted" in told
+    assert "impact" in told
+    record = Record.load(tmp_path / "run" / "record.npz")
+    assert record.events[0].contacts == ("wall",)
+    assert_allclose(record.events[0].time, 0.25, atol=1e-3)
+    assert (tmp_path / "run" / "animation.html").exists()
 
 
 @pytest.mark.slow
