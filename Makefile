@@ -30,6 +30,7 @@ help:
 	@echo 'make test        lint, types and all tests'
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
+	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
