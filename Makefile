@@ -33,6 +33,7 @@ help:
 	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
+	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
