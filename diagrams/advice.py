@@ -15,6 +15,9 @@ from drake_dae.robots.model import RobotModel
 _FORCE = 10.0
 """The force in N at which a patch has the stiffness that is meant."""
 
+_NOISE = 1e-3
+"""The deviation of velocities in rad/s that is expected where no encoders tell it."""
+
 _DIGITS = 3
 """To so many digits numbers are advised."""
 
@@ -42,7 +45,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = _stiffness(material)
-    found = contact_gains(stiffness, mobility, period, late)
+    noise = _NOISE
+    if scenario.encoders is not None:
+        noise = float(np.max(scenario.encoders.velocity_deviation(period))) or _NOISE
+    found = contact_gains(stiffness, mobility, period, late, noise)
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
     points = _moved(model)
@@ -83,8 +89,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     )
     known = ", ".join(observer.friction) or "none"
     note = (
-        f"advised for a contact of {stiffness:.2g} N/m, {mobility:.2g} 1/kg and samples of "
-        f"{period:g} s: poles of positions at {_rounded(found.position_pole):g} 1/s and of forces "
+        f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
+        f"{period:g} s and velocities within {noise:.2g} rad/s: poles of positions at {_rounded(found.position_pole):g} 1/s and of forces "
         f"at {_rounded(found.force_pole):g} 1/s with integrals of {', '.join(integral)}, damping "
         f"of the constraint {_rounded(found.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}"
