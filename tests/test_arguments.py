@@ -10,6 +10,7 @@ import datetime
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -439,7 +440,7 @@ def public() -> Iterator[tuple[str, Any]]:
     for name in dd.__all__:
         member = getattr(dd, name)
         if callable(member) and not (
-            inspect.isclass(member) and issubclass(member, (Exception, Warning))
+            inspect.isclass(member) and issubclass(member, (Exception, Warning, Enum))
         ):
             yield name, member
 

@@ -158,6 +158,8 @@ def _bad_structure(choice: random.Random, folder: Path) -> BadInput:
         how = f"rename to '{new}'"
         if place is data and new.startswith("_"):
             excuse = "a place for anchors; the key has a default"
+        if place is data.get("references") and new.startswith(" "):
+            excuse = "names of outputs stand in a list, with spaces between them"
     elif how == "swap":
         other = choice.choice(list(place) if isinstance(place, dict) else range(len(place)))
         place[key], place[other] = place[other], place[key]
