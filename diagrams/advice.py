@@ -90,7 +90,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     known = ", ".join(observer.friction) or "none"
     note = (
         f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
-        f"{period:g} s and velocities within {noise:.2g} rad/s: poles of positions at {_rounded(found.position_pole):g} 1/s and of forces "
+        f"{period:g} s and velocities within {noise:.2g} rad/s: "
+        f"poles of positions at {_rounded(found.position_pole):g} 1/s and of forces "
         f"at {_rounded(found.force_pole):g} 1/s with integrals of {', '.join(integral)}, damping "
         f"of the constraint {_rounded(found.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}"
