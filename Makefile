@@ -67,6 +67,7 @@ campaign: $(VENV)/installed-dev
 unknowns: $(VENV)/installed
 	$(BIN)/drake-dae sweep wall_point_contact --random $(RUNS) --seed $(SEED) --out runs/unknowns \
 		--set duration=1.6 --set 'constraints.0.rpy=[0, 0, 0]' \
+		--set 'force=!MeasuredForce {sample_period: 0.001}' \
 		--set 'tolerances={outputs: {tool.y: 0.005, tool.z: 0.005, wall.force: 10}, after: 0.5}' \
 		--vary plant.friction=0.1..0.6 --vary 'plant.stiffness=[3.0e+4, 1.0e+5, 3.0e+5, 1.0e+6]' \
 		--vary 'plant_parameters.wall.position=[[0.698..0.702, 0, 0]]' \
@@ -87,6 +88,8 @@ house: $(VENV)/installed-dev
 	$(BIN)/python tests/draw_house.py $(HOUSE)
 
 pictures: $(VENV)/installed
+	$(BIN)/drake-dae simulate wall_polish --out runs/polish
+	$(BIN)/drake-dae film runs/polish --out $(PICTURES)/wall_polish.gif
 	$(BIN)/drake-dae simulate seven_joint_wall --set duration=8 --out runs/pictures
 	$(BIN)/drake-dae film runs/pictures --out $(PICTURES)/seven_joint_wall.gif
 	cp runs/pictures/path.png $(PICTURES)/seven_joint_wall_path.png

@@ -111,9 +111,10 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     if positions.keys() == first["positions"].keys():
         positions = first["positions"]
     own["start"] = {**first, "positions": positions}
-    tag = own["gains"].get(TAG, "!Poles")
-    if tag == base["gains"][TAG] != "!Matrices":
-        own["gains"] = base["gains"]
+    if own["gains"] and base["gains"]:  # Without any they are advised, by what is built.
+        tag = own["gains"].get(TAG, "!Poles")
+        if tag == base["gains"][TAG] != "!Matrices":
+            own["gains"] = base["gains"]
     if "seed" in own["force"]:
         own["force"] = {**own["force"], "seed": 0}
     if own["encoders"]:

@@ -95,6 +95,16 @@ def test_what_drakes_contact_has_otherwise_needs_a_loop_of_its_own():
 
 
 @pytest.mark.slow
+def test_what_is_advised_is_advised_anew_where_the_contact_is_another_one():
+    base = scenario_data(scenario("wall_point_contact"))
+    assert base["gains"] is None
+    stiff, later = ({"plant.stiffness": 1e6}, {"duration": 1.0})
+    assert structure_key(varied_data(base, later), base) == structure_key(base, base)
+    assert structure_key(varied_data(base, stiff), base) != structure_key(base, base)
+    given = varied_data(base, {"gains": {"all": [-8.0]}})
+    assert structure_key(given, base) != structure_key(base, base)
+
+
 def test_another_structure_is_built():
     base = scenario_data(scenario("two_link_wall", *SHORT))
     variations = [
