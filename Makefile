@@ -28,9 +28,9 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
 	@echo 'make check       lint, types and the quick tests: the daily round, some two minutes'
-	@echo 'make test        lint, types and all tests'
+	@echo 'make test        lint, types and tests'
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
-	@echo 'make campaign    bad inputs, random robots and memory, in full: some minutes'
+	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
@@ -48,10 +48,10 @@ lint: $(VENV)/installed-dev
 	$(BIN)/mypy
 
 check: lint
-	$(PYTEST) -m 'not slow'
+	$(PYTEST) -m 'not slow and not thorough'
 
 test: lint
-	$(PYTEST)
+	$(PYTEST) -m 'not thorough'
 
 benchmark: $(VENV)/installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -q
@@ -59,6 +59,7 @@ benchmark: $(VENV)/installed-dev
 campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
+	$(PYTEST) -m thorough
 	$(BIN)/python tests/woodpecker.py
 	$(BIN)/python tests/campaign/polish.py
 

@@ -1,14 +1,43 @@
 """Scenarios and closed loops, run into records."""
 
+from collections.abc import Callable
 from functools import cache
 
 import jsonschema
+import pytest
+from _pytest.mark import ParameterSet
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
 from drake_dae.diagrams.scenario import Scenario, scenario_schema
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.diagrams.shipped import find_scenario, shipped_scenarios
+
+DEAR = (
+    "planar_3rrr",
+    "seven_joint_dome",
+    "seven_joint_flexible",
+    "seven_joint_pipe",
+    "seven_joint_writing",
+    "slider_crank",
+    "two_arms",
+    "two_arms_free_box",
+    "two_link_flexible",
+)
+"""Scenarios that show nothing which cheaper ones do not, where code is made of all of them."""
+
+
+def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
+    """The shipped scenarios but for some: all slow but the first one, the dear ones thorough."""
+    marks = {
+        "two_link_wall": [],
+        **{name: [pytest.mark.slow, pytest.mark.thorough] for name in DEAR},
+    }
+    return [
+        pytest.param(name, marks=marks.get(name, [pytest.mark.slow]))
+        for name in shipped_scenarios()
+        if not left_out(name)
+    ]
 
 
 def scenario(name: str, *settings: str) -> Scenario:

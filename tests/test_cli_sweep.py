@@ -77,6 +77,7 @@ def test_wrong_usage_exits_with_2(options, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_bar_with_the_time_left_on_a_terminal(tmp_path):
     ours, theirs = pty.openpty()
     process = subprocess.Popen(

@@ -127,6 +127,7 @@ def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
     moments, signals = random.Random(13), (*ENDING_SIGNALS, signal.SIGKILL)
     chosen = [(sent, moments.uniform(0.1, 2.2 * SECONDS)) for sent in 3 * signals]

@@ -8,8 +8,8 @@ import pytest
 from campaign import bad_inputs, drops, random_robots
 from campaign.outcomes import BAD, REFUSED, RESULT
 
-FEW, MANY = range(40), range(40, 180)
-FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 56)
+FEW, MANY = range(40), range(40, 110)
+FEW_ROBOTS, MANY_ROBOTS = (8, 16, 17, 34), range(40, 48)
 
 
 def each(few, many):
@@ -33,13 +33,14 @@ def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Pa
 
 
 # In drop 46 a corner dips into the floor and comes out again, nearly within one step.
-@pytest.mark.parametrize("seed", each((*range(9), 46), range(9, 30)))
+@pytest.mark.parametrize("seed", each((*range(9), 46), range(9, 16)))
 def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path: Path):
     outcome = drops.attempt(seed, tmp_path, duration=0.5)
     assert outcome.kind == RESULT, outcome
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_prints_counts():
     command = [sys.executable, Path(__file__).with_name("run.py"), "--processes", "2"]
     done = subprocess.run(

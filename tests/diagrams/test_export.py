@@ -7,11 +7,10 @@ import subprocess
 
 import numpy as np
 import pytest
-from runs import scenario
+from runs import each_scenario, scenario
 
 from drake_dae import ClosedLoop, build_scenario, export_code
 from drake_dae.cli import main
-from drake_dae.diagrams.shipped import shipped_scenarios
 from drake_dae.errors import ModelError
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -41,11 +40,7 @@ def outcome(folder, name, flags: str = "-O1") -> "subprocess.CompletedProcess[st
 @needs_compiler
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=[] if name == "two_link_wall" else pytest.mark.slow)
-        for name in shipped_scenarios()
-        if name != "wall_polish"  # A task has two laws.
-    ],
+    each_scenario(lambda name: name == "wall_polish"),  # A task has two laws.
 )
 def test_the_test_program_passes(name, tmp_path):
     """To 1e-12 of the largest value in each vector, as the program says itself."""

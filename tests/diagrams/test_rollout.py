@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.trajectories import PiecewisePolynomial
-from runs import run, scenario
+from runs import each_scenario, run, scenario
 
 from drake_dae import (
     ConstantReference,
@@ -22,7 +22,6 @@ from drake_dae import (
     start_values,
 )
 from drake_dae.diagrams.rollout.scenario_run import roll_scenario
-from drake_dae.diagrams.shipped import shipped_scenarios
 from drake_dae.errors import (
     InconsistentStateError,
     MachineCodeWarning,
@@ -370,7 +369,7 @@ def test_without_a_compiler_it_warns_and_goes_on(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in shipped_scenarios() if not n.startswith("wall_")])
+@pytest.mark.parametrize("name", each_scenario(lambda name: name.startswith("wall_")))
 def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
     """To 1e-10 of the largest value: forces of light mechanisms cancel more than those of arms."""
     chosen = scenario(name, "duration=0.02", *fixed())

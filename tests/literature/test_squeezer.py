@@ -209,6 +209,7 @@ def by_one_angle(duration):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_end_is_the_published_one_as_far_as_that_is_right():
     """At 0.03 s, after two and a half turns of the crank: by two routes, and by the test set.
 

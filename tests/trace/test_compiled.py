@@ -13,10 +13,11 @@ import weakref
 import casadi as ca
 import numpy as np
 import pytest
+from runs import each_scenario
 
 from drake_dae import DaeSystem, build_scenario
 from drake_dae.diagrams.scenario import load_scenario
-from drake_dae.diagrams.shipped import find_scenario, shipped_scenarios
+from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiled import LIMIT, LOOK, Compiler, attempts, find_compiler
@@ -100,11 +101,8 @@ def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
     return found
 
 
-SLOW = [
-    pytest.param(name, marks=[] if name == "two_link_wall" else pytest.mark.slow)
-    for name in shipped_scenarios()
-    if not name.startswith("wall_")  # Their dynamics are Drake's, or those of modes.
-]
+# The dynamics of walls are Drake's, or those of modes.
+SLOW = each_scenario(lambda name: name.startswith("wall_"))
 
 
 OPTIMIZED = ("two_link_wall", "two_link_motors", "seven_joint_wall", "cart_wall")

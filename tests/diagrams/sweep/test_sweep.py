@@ -98,7 +98,11 @@ def command(folder, *more, keys=KEYS):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kills", "options"), [pytest.param((2, 9), (), id="drake"), ((9,), ("--rollout",))]
+    ("kills", "options"),
+    [
+        pytest.param((2, 9), (), id="drake"),
+        pytest.param((9,), ("--rollout",), marks=pytest.mark.thorough),
+    ],
 )
 def test_killed_in_the_middle_it_continues_there_to_the_same_table(
     kills, options, request, tmp_path
