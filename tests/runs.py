@@ -1,7 +1,8 @@
 """Scenarios and closed loops, run into records."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
+from typing import Any
 
 import jsonschema
 import pytest
@@ -38,6 +39,12 @@ def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
         for name in shipped_scenarios()
         if not left_out(name)
     ]
+
+
+def some(cases: Iterable[Any]) -> list[ParameterSet]:
+    """Cases of which every second one is thorough: they show the same."""
+    marks = ([], [pytest.mark.thorough])
+    return [pytest.param(case, marks=marks[i % 2]) for i, case in enumerate(cases)]
 
 
 def scenario(name: str, *settings: str) -> Scenario:

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from runs import run, scenario
+from runs import each_scenario, run, scenario
 from scipy.optimize import brentq
 
 from drake_dae import build_scenario
@@ -13,7 +13,6 @@ from drake_dae.cli import main
 from drake_dae.diagrams import feasibility as module
 from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.diagrams.feasibility_report import Feasibility
-from drake_dae.diagrams.shipped import shipped_scenarios
 from drake_dae.simulation.summary import Limits
 
 
@@ -313,7 +312,7 @@ def test_help_tells_the_exit_codes(capsys):
 
 @pytest.mark.slow
 # That which leaves its wall shall pull at it; its own test says so.
-@pytest.mark.parametrize("name", [n for n in shipped_scenarios() if n != "wall_bounce"])
+@pytest.mark.parametrize("name", each_scenario(lambda name: name == "wall_bounce"))
 def test_shipped_scenarios_have_no_problems(name):
     told = find_feasibility(scenario(name))
     assert told.problems == ()

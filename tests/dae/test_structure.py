@@ -14,6 +14,7 @@ from problems import (
     redundant,
     system_of,
 )
+from runs import some
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.dae.derivatives import Derivatives
@@ -121,7 +122,7 @@ def test_spread_and_count():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", some(range(30)))
 def test_hidden_normal_forms_are_found(seed):
     """Systems of random degrees behind a diffeomorphism, a feedback, mixed inputs and orders."""
     hidden = hidden_normal_form(seed)
