@@ -45,39 +45,41 @@ class LoopFunctions:
         """The law: (x, R, measured forces if it takes them, parameters) -> u, and the error."""
         return self.loop.controller.law.function
 
-    @cached_property
-    def projection(self) -> ca.Function:
-        """(x, the plant's parameters) -> x after two Newton steps to N*, and how long the last was.
+    def projection(self, count: int) -> ca.Function:
+        """(x, the plant's parameters) -> x after Newton steps to N*, and how long the last was.
 
-        Its length is that in states over their scale. Gradients of both are those at the start.
+        Its length is that in states over their scale. Gradients of all are those at the start.
+
+        Args:
+            count: How many steps.
         """
         dae, newton = self.loop.plant.dae, self.loop.plant.structure.manifold.newton_step.function
         sizes = {"x": dae.num_states, "plant": self.plant.sizes[-1]}
         inputs = [ca.SX.sym(name, size) for name, size in sizes.items()]
         start, plant = inputs
         x, left = start, ca.SX(0.0)
-        for _ in range(2):
+        for _ in range(count):
             change = newton(x, start, plant)[0]
             x, left = x + ca.DM(dae.scale) * change, ca.norm_2(change)
         values = ca.cse([ca.densify(x), ca.densify(left)])
         return ca.Function("projection", inputs, values, {"cse": False})
 
-    @cached_property
-    def motion(self) -> ca.Function:
+    @property
+    def rate(self) -> ca.Function:
         """Plant, law and sensor at once: what both compute of the state is computed once.
 
         A function of the state with that of the sensor and the law's integrals, of R, of what the
         sensor holds (or its noise), and of the parameters of plant and law. It returns the
-        derivative, v, a number that is finite if all have values and all matrices are regular, u as
-        drives give it, the measured force, and what drives cut off.
+        derivative, v, and a number that is finite if all have values and all matrices are regular.
+        Of a plant that is the law's own model the derivative follows from what the law wants.
         """
         return self._motions[0]
 
-    @cached_property
-    def rate(self) -> ca.Function:
-        """The first three values of `motion` alone, in fewer operations; `motion` if it has none.
+    @property
+    def row(self) -> ca.Function:
+        """A row of the record, and a number that is finite if all has values.
 
-        Of a plant that is the law's own model the derivative follows from what the law wants.
+        A function of what `rate` takes, and of the parameters of the plant that move.
         """
         return self._motions[1]
 
@@ -91,10 +93,11 @@ class LoopFunctions:
             dae.num_constraints,
             self.plant.sizes[-1],
             self.law.sizes[-1],
+            self.signals.function.numel_out(1),
         )
-        names = ("state", "reference", "hold", "plant", "law")
+        names = ("state", "reference", "hold", "plant", "law", "moving")
         inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
-        state, reference, hold, plant, law = inputs
+        state, reference, hold, plant, law, moving = inputs
         if self.is_model:
             plant, law = self._one_model(plant, law)
         places = np.cumsum([0, dae.num_states, lags, self.num_integrals]).tolist()
@@ -114,7 +117,7 @@ class LoopFunctions:
         if self.limits is not None:
             control = ca.fmax(-self.limits, ca.fmin(self.limits, wanted))
             excess = wanted - control
-        shown = [control, measured[0] if sensor is not None else ca.SX(0, 1), excess]
+        shown = measured[0] if sensor is not None else ca.SX(0, 1)
 
         def moved(by: TracedFunction, *arguments: ca.SX) -> list[ca.SX]:
             rate, force, *checks = by.function(*arguments)
@@ -128,18 +131,21 @@ class LoopFunctions:
                 rate = ca.vertcat(rate, rates)
             return [rate, force, checks[-1]]
 
-        def function(values: list[ca.SX], *more: ca.SX) -> ca.Function:
-            if more:
-                values = [*values[:2], values[2] + of_law[-1], *more]
-            return ca.Function("motion", inputs, ca.cse(values), {"cse": False})
+        def function(name: str, given: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
+            return ca.Function(name, given, ca.cse(values), {"cse": False})
 
-        both = function(moved(self.plant, x, control, plant), *shown)
+        moves = moved(self.plant, x, control, plant)
+        rate = function("rate", inputs[:-1], [*moves[:2], moves[2] + of_law[-1]])
         under = traced.trace_motion() if self.is_model and self.limits is None else None
         if under is not None:
-            values = moved(under, *given)
-            if function(values).n_instructions() < 0.9 * both.n_instructions():
-                return function(values, *shown), function(values)
-        return both, both
+            fewer = moved(under, *given)
+            shorter = function("rate", inputs[:-1], fewer)
+            if shorter.n_instructions() < 0.9 * rate.n_instructions():
+                rate, moves = shorter, fewer
+        rest, *checks = self.rest.function(x, moves[1], plant)
+        row = ca.vertcat(x, rest, control, reference, moving, shown, sigma, excess)
+        valid = moves[2] + of_law[-1] + checks[-1]
+        return rate, function("row", inputs, [row, valid])
 
     def _one_model(self, plant: ca.SX, law: ca.SX) -> tuple[ca.SX, ca.SX]:
         """The parameters of plant and law, the same symbols where the numbers are the same."""
@@ -220,10 +226,17 @@ class LoopFunctions:
     @property
     def num_operations(self) -> int:
         """How many operations all functions have together."""
-        own = [self.signals.function, self.motion, self.rest.function, self.projection]
-        if self.rate is not self.motion:
-            own.append(self.rate)
-        return sum(int(function.n_instructions()) for function in own)
+        return sum(int(function.n_instructions()) for function in self.generated.values())
+
+    @cached_property
+    def generated(self) -> dict[str, ca.Function]:
+        """Name -> function, of all that machine code is made of."""
+        return {
+            "signals": self.signals.function,
+            "rate": self.rate,
+            "row": self.row,
+            "newton": self.projection(1),
+        }
 
     @cached_property
     def columns(self) -> dict[str, Sequence[Signal]]:

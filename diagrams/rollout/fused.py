@@ -78,15 +78,11 @@ class Fused:
             plant[loop.plant.exogenous_places] = moving
             law[loop.controller.exogenous_places] = of_law
         options = {"cse": False}
-        rate, force, valid, *_ = functions.rate(state, reference, hold, plant, law)
+        rate, force, valid = functions.rate(state, reference, hold, plant, law)
         self._rate = ca.Function("rate", inputs, [rate, force, valid + checks[-1]], options)
-        _, force, valid, *shown = functions.motion(state, reference, hold, plant, law)
-        control, measured, excess = shown
-        rest, *of_rest = functions.rest.function(state[: dae.num_states], force, plant)
-        valid += checks[-1] + of_rest[-1]
-        row = ca.vertcat(state[: dae.num_states], rest, control, reference, moving, measured)
-        row = ca.vertcat(row, state[size - functions.num_integrals :], excess)
-        self._rows = Many(ca.Function("rows", inputs, ca.cse([row, valid]), options))
+        row, valid = functions.row(state, reference, hold, plant, law, moving)
+        row = ca.cse([row, valid + checks[-1]])
+        self._rows = Many(ca.Function("rows", inputs, row, options))
         self._projection = self._project_function()
         self._projections = Many(self._projection)
         self._steps: dict[bytes, tuple[Called, Called]] = {}
@@ -228,7 +224,7 @@ class Fused:
             own = ca.SX(plant)
             if loop.exogenous is not None:
                 own[loop.plant.exogenous_places] = functions.signals.function(time)[1]
-            x, left = functions.projection(x, own)
+            x, left = functions.projection(2)(x, own)
         found = ca.densify(ca.vertcat(x, state[loop.plant.dae.num_states :]))
         return ca.Function("projection", symbols, [found, ca.densify(left)], {"cse": False})
 

@@ -110,14 +110,7 @@ def _source(functions: LoopFunctions) -> str:
     loop = functions.loop
     plant, sensor = loop.plant, loop.sensor
     dae = plant.dae
-    calls = {
-        "signals": functions.signals.function,
-        "motion": functions.motion,
-        "rest": functions.rest.function,
-        "projection": functions.projection,
-    }
-    if functions.rate is not functions.motion:
-        calls["rate"] = functions.rate
+    calls = functions.generated
     columns = functions.columns
     moving = [len(block.exogenous_places) for block in (plant, loop.controller)]
     if loop.exogenous is None:
@@ -125,14 +118,9 @@ def _source(functions: LoopFunctions) -> str:
     sizes: dict[str, int] = {
         "NUM_STATES": dae.num_states,
         "NUM_LAGS": functions.num_lags,
-        "NUM_EXCESS": len(columns["excess"]),
-        "NUM_INTEGRALS": functions.num_integrals,
         "SIZE": functions.size,
         "NUM_FORCES": dae.num_constraints,
-        "NUM_CONTROLS": dae.num_controls,
         "NUM_REFERENCES": len(columns["reference"]),
-        "NUM_REST": sum(map(len, functions.rest_signals.values())),
-        "NUM_MEASURED": len(columns["measured_force"]),
         "NUM_PLANT_MOVING": moving[0],
         "NUM_LAW_MOVING": moving[1],
         "NUM_PLANT": functions.plant.sizes[-1],
@@ -144,7 +132,7 @@ def _source(functions: LoopFunctions) -> str:
     for name, function in calls.items():
         # At least as many as the initializers in stepper.c.
         sizes[f"{name.upper()}_ARG"] = function.sz_arg()
-        sizes[f"{name.upper()}_RES"] = max(7, function.sz_res())
+        sizes[f"{name.upper()}_RES"] = max(5, function.sz_res())
     zeros = np.zeros(dae.num_constraints)
     places = [plant.exogenous_places, loop.controller.exogenous_places]
     tables = {
@@ -159,8 +147,7 @@ def _source(functions: LoopFunctions) -> str:
         "dop_a_more": DOP853.A_EXTRA,
         "dop_c_more": DOP853.C_EXTRA,
     }
-    lines = [] if "rate" in calls else ["#define dae_rate dae_motion"]
-    lines += [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
+    lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for name, chosen, count in zip(("plant", "law"), places, moving, strict=True):
         listed = ", ".join(map(str, [*chosen[:count], 0]))
         lines.append(f"static const int {name}_places[] = {{{listed}}};")

@@ -10,8 +10,9 @@ $generated
 #include <string.h>
 
 $constants
-/* The last Newton step to a state on N*, and one after which those that follow are sure to reach. */
-static const double REACHED = 1e-11, NEAR = 1e-5;
+/* A Newton step to a state on N* after which what is left, its square, is round-off; and one after
+   which those that follow are sure to reach. */
+static const double REACHED = 1e-8, NEAR = 1e-5;
 
 /* How a call ended; Python has the same list. */
 enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW };
@@ -35,8 +36,7 @@ typedef struct {
 typedef struct {
   double plant[NUM_PLANT + 1], law[NUM_LAW + 1];
   double reference[NUM_REFERENCES + 1], moving[NUM_PLANT_MOVING + 1];
-  double control[NUM_CONTROLS + 1], force[NUM_FORCES + 1], measured[NUM_FORCES + 1];
-  double excess[NUM_CONTROLS + 1];
+  double force[NUM_FORCES + 1];
   const double *hold;
   double time; /* at which references and what moves are; not a number before the first */
 } Moment;
@@ -66,8 +66,8 @@ static int set_time(double time, Moment *m) {
 /* The derivative of the state; where it has no value all of it is nan. */
 static int rates(double time, const double *x, Moment *m, double *rate) {
   double valid;
-  const double *arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
-  double *res[MOTION_RES] = {rate, m->force, &valid, m->control, m->measured, m->excess};
+  const double *arg[RATE_ARG] = {x, m->reference, m->hold, m->plant, m->law};
+  double *res[RATE_RES] = {rate, m->force, &valid};
   int i, good = set_time(time, m);
   dae_rate(arg, res, 0, 0, 0);
   good &= isfinite(valid) != 0;
@@ -77,42 +77,31 @@ static int rates(double time, const double *x, Moment *m, double *rate) {
 
 /* One row of the record. */
 static int write(double time, const double *x, Moment *m, double *row) {
-  double rate[SIZE + 1], sum, checks[3];
-  const double *motion_arg[MOTION_ARG] = {x, m->reference, m->hold, m->plant, m->law};
-  double *motion_res[MOTION_RES] = {rate, m->force, &sum, m->control, m->measured, m->excess};
-  const double *arg[REST_ARG] = {x, m->force, m->plant};
-  double *res[REST_RES] = {row + NUM_STATES, checks, checks + 1};
-  int i, valid = set_time(time, m);
-  const double *parts[6] = {m->control,  m->reference,           m->moving,
-                            m->measured, x + SIZE - NUM_INTEGRALS, m->excess};
-  const int sizes[6] = {NUM_CONTROLS, NUM_REFERENCES, NUM_PLANT_MOVING,
-                        NUM_MEASURED, NUM_INTEGRALS,  NUM_EXCESS};
-  dae_motion(motion_arg, motion_res, 0, 0, 0);
-  valid &= isfinite(sum) != 0;
-  memcpy(row, x, NUM_STATES * sizeof(double));
-  dae_rest(arg, res, 0, 0, 0);
-  row += NUM_STATES + NUM_REST;
-  for (i = 0; i < 6; row += sizes[i++]) memcpy(row, parts[i], (size_t)sizes[i] * sizeof(double));
-  return valid & (isfinite(checks[1]) != 0);
+  double valid;
+  int good = set_time(time, m);
+  const double *arg[ROW_ARG] = {x, m->reference, m->hold, m->plant, m->law, m->moving};
+  double *res[ROW_RES] = {row, &valid};
+  dae_row(arg, res, 0, 0, 0);
+  return good & (isfinite(valid) != 0);
 }
 
-/* The state on N*, by two Newton steps, or by as many again; 0 where Python has to decide. */
+/* The state on N*, by Newton steps; 0 where Python has to decide. */
 static int project(double time, double *x, Moment *m) {
-  double found[NUM_STATES], start[NUM_STATES], left;
-  const double *arg[PROJECTION_ARG] = {start, m->plant};
-  double *res[PROJECTION_RES] = {found, &left};
+  double at[NUM_STATES], found[NUM_STATES], left;
+  const double *arg[NEWTON_ARG] = {at, m->plant};
+  double *res[NEWTON_RES] = {found, &left};
   int attempt;
   if (!PROJECTS) return 1;
   if (NUM_PLANT_MOVING) set_time(time, m);
-  memcpy(start, x, sizeof(start));
-  for (attempt = 0; attempt < 4; attempt++) {
-    dae_projection(arg, res, 0, 0, 0);
+  memcpy(at, x, sizeof(at));
+  for (attempt = 0; attempt < 8; attempt++) {
+    dae_newton(arg, res, 0, 0, 0);
     if (left <= REACHED) {
       memcpy(x, found, sizeof(found));
       return 1;
     }
-    if (!(left <= NEAR)) return 0;
-    memcpy(start, found, sizeof(start));
+    if (attempt && !(left <= NEAR)) return 0;
+    memcpy(at, found, sizeof(at));
   }
   return 0;
 }
