@@ -12,36 +12,21 @@ rows have c+ = 0, and each contact with its normal n and its rows t along the su
     T+ - T- = Lambda . c+ - Lambda . A Lambda / 2 <= 0.
 
 So where energy would be gained all coefficients of restitution are less, by the factor at which
-none is.
+none is; and likewise where contacts wedge a body, so that no impulses bring what they want.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Indices
+from drake_dae.systems.unilateral.cones import Cone, in_cones
 from drake_dae.systems.unilateral.impacts import DEPENDENT
 
-SWEEPS = 500
-"""So often impulses of one contact after the other are found, each with those of the others."""
-
-SETTLED = 1e-14
-"""A sweep that changes impulses by less, relative to the largest, is the last."""
-
-ANGLES = 72
-"""Among so many directions along a surface that is sought in which a contact slides on."""
-
-MOST_SETS = 4
-"""Of so many contacts all sets are tried where they go to and fro."""
-
-FITS = 1e-11
-"""What a set may violate, relative to what there is."""
-
-HALVINGS = 60
-"""So often the factor of restitution is halved in between: to round-off."""
+HALVINGS = 40
+"""So often the factor of restitution is halved in between: to 1e-12."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +61,7 @@ def impact(
         The impulses; None if none are found.
     """
     found = _impulses(matrix, before, kept, contacts)
-    if found is None or _gained(matrix, before, found) <= 0.0:
+    if found is not None and _gained(matrix, before, found) <= 0.0:
         return found
     least, most = 0.0, 1.0
     best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
@@ -113,142 +98,26 @@ def _impulses(
     for one in contacts:
         wanted[one.normal] += one.restitution * before[one.normal]
         blocks.append(_axes(A, one))
-    impulses, total = [np.zeros(axes.shape[1]) for axes in blocks], np.zeros(before.size)
-    parts = [axes.T @ A @ axes for axes in blocks]
-    for _ in range(SWEEPS):
-        change = 0.0
-        for i, (axes, part, one) in enumerate(zip(blocks, parts, contacts, strict=True)):
-            others = total - axes @ impulses[i]
-            own = _of_one(part, axes.T @ (wanted + A @ others), one.friction)
-            if own is None:
-                return None
-            change = max(change, float(np.abs(own - impulses[i]).max()))
-            impulses[i], total = own, others + axes @ own
-        if change <= SETTLED * np.abs(total).max(initial=0.0):
-            break
-    else:  # They go to and fro.
-        found = _of_sets(A, wanted, blocks, [one.friction for one in contacts])
-        if found is None:
-            return None
-        total = found
+    make = np.hstack(blocks)
+    ends = np.cumsum([axes.shape[1] for axes in blocks]).tolist()
+    cones = [
+        Cone(slice(end - axes.shape[1], end), one.friction)
+        for axes, end, one in zip(blocks, ends, contacts, strict=True)
+    ]
+    found = in_cones(make.T @ A @ make, make.T @ wanted, cones)
+    if found is None:
+        return None
+    total = make @ found
     total[kept] = -inverse @ (before[kept] + matrix[kept] @ total)
     return total
 
 
-def _of_sets(
-    matrix: FloatArray,
-    wanted: FloatArray,
-    blocks: Sequence[FloatArray],
-    frictions: Sequence[float],
-) -> FloatArray | None:
-    """The impulses of contacts in a plane that open, stick or slide: of all sets, the first to fit.
-
-    With y_t = -mu d y_n where a contact slides along d, all of it is linear.
-    """
-    if len(blocks) > MOST_SETS or any(axes.shape[1] != 2 for axes in blocks):
-        return None
-    size = np.abs(wanted).max()
-    for ways in product((None, 0.0, 1.0, -1.0), repeat=len(blocks)):
-        pushing = [
-            (axes, mu, way)
-            for axes, mu, way in zip(blocks, frictions, ways, strict=True)
-            if way is not None
-        ]
-        # What unknowns make, and the rates that are zero.
-        makes = [axes if not way else axes @ [[1.0], [-mu * way]] for axes, mu, way in pushing]
-        zero = [axes if not way else axes[:, :1] for axes, _, way in pushing]
-        total = np.zeros(wanted.size)
-        if pushing:
-            make, rows = np.hstack(makes), np.hstack(zero)
-            try:
-                total = make @ np.linalg.solve(rows.T @ matrix @ make, -rows.T @ wanted)
-            except np.linalg.LinAlgError:
-                continue
-        rates = wanted + matrix @ total
-        if all(
-            _fits(axes.T @ total, axes.T @ rates, mu, way, FITS * size)
-            for axes, mu, way in zip(blocks, frictions, ways, strict=True)
-        ):
-            return total
-    return None
-
-
-def _fits(
-    impulses: FloatArray, rates: FloatArray, friction: float, way: float | None, slack: float
-) -> bool:
-    """Whether a contact does as its set says: None is open, 0 sticks, else it slides that way."""
-    if way is None:
-        return bool(rates[0] >= -slack)
-    if way:
-        return bool(impulses[0] >= 0.0 and rates[1] * way >= -slack)
-    return bool(abs(impulses[1]) <= friction * impulses[0])
-
-
 def _axes(matrix: FloatArray, one: Rubbing) -> FloatArray:
-    """The normal, and those directions along the surface that impulses move, as columns."""
-    rows = one.along
+    """The normal, and those directions along the surface that it rubs along, as columns."""
+    rows = one.along if one.friction else one.along[:0]
     values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])
     moved = vectors[:, values > DEPENDENT * max(values.max(initial=0.0), 0.0)]
     axes = np.zeros((matrix.shape[0], 1 + moved.shape[1]))
     axes[one.normal, 0] = 1.0
     axes[rows, 1:] = moved
     return axes
-
-
-def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray | None:
-    """The impulses of one contact, its normal first: it opens, sticks or slides."""
-    if wanted[0] >= 0.0:
-        return np.zeros(wanted.size)
-    if wanted.size == 1 or friction == 0.0:
-        straight = np.zeros(wanted.size)
-        straight[0] = -wanted[0] / matrix[0, 0]
-        return straight
-    sticking = np.asarray(np.linalg.solve(matrix, -wanted), float)
-    if sticking[0] > 0.0 and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
-        return sticking
-    if np.isinf(friction):
-        return None
-    # Where no impulse would do there are numbers that are none, and fit nothing.
-    with np.errstate(invalid="ignore"):
-        ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
-        impulses, after = _slid(matrix, wanted, friction, ways)
-        onward = np.sum(after * ways, axis=0)
-    fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (onward >= 0.0)
-    if not fits.any():
-        return None
-    # Where several fit, that which goes on most as it came.
-    left = np.flatnonzero(fits)
-    best = int(np.argmax(wanted[1:] @ after[:, left]))
-    return np.asarray(impulses[:, left[best]])
-
-
-def _slid(
-    matrix: FloatArray, wanted: FloatArray, friction: float, ways: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Impulses that rub against ways along the surface, and what of c+ is along it; columns."""
-    push = np.vstack([np.ones((1, ways.shape[1])), -friction * ways])
-    mobility = matrix[0] @ push
-    impulses = push * np.divide(
-        -wanted[0], mobility, out=np.full(mobility.shape, np.inf), where=mobility > 0.0
-    )
-    return impulses, wanted[1:, None] + matrix[1:] @ impulses
-
-
-def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:
-    """The directions in a plane against which impulses rub that leave it sliding along them."""
-
-    def aside(angles: FloatArray) -> FloatArray:
-        """How much of c+ is across each direction."""
-        ways = np.array([np.cos(angles), np.sin(angles)])
-        after = _slid(matrix, wanted, friction, ways)[1]
-        return np.asarray(ways[0] * after[1] - ways[1] * after[0])
-
-    angles = np.linspace(0.0, 2.0 * np.pi, ANGLES + 1)
-    values = aside(angles)
-    crosses = np.flatnonzero(values[:-1] * values[1:] <= 0.0)
-    least, most, sign = angles[crosses], angles[crosses + 1], values[crosses]
-    for _ in range(HALVINGS):
-        middle = 0.5 * (least + most)
-        is_before = aside(middle) * sign > 0.0
-        least, most = np.where(is_before, middle, least), np.where(is_before, most, middle)
-    return np.array([np.cos(most), np.sin(most)])

@@ -1,0 +1,247 @@
+"""Impulses of contacts in their cones of friction, all at once; numbers alone.
+
+With u = W y + q, y the impulses and u what becomes of the rates, each contact has its normal first:
+
+    y in K = {|y_t| <= mu y_n},    u + mu |u_t| n in K*,    y . (u + mu |u_t| n) = 0,
+
+which is Coulomb's law (De Saxce and Feng, 1998). For given mu |u_t| that is a convex program, which
+the method of multipliers solves, and the shift follows along (Acary, Cadoux, Lemarechal and Malick,
+2011; Tasora, Mangoni, Benatti and Garziera, 2021). It need but tell which contacts open, stick and
+slide: with that Newton's method finds the impulses to round-off, and all conditions are checked.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+
+STEPS = 1000
+"""So many steps are taken at most."""
+
+LOOK = 20
+"""After so many steps each the ways of the contacts are tried."""
+
+MARGINS = (1e-8, 1e-5, 1e-3, 1e-2)
+"""How near to an edge of its cone an impulse is on it."""
+
+NEWTON_STEPS = 12
+"""So many steps of Newton's method are enough where the ways are right."""
+
+ROUND_OFF = 1e-14
+"""A step of Newton's method of this size, relative to the impulses, is the last."""
+
+FITS = 1e-11
+"""What may be violated, relative to what there is."""
+
+PENALTIES = 1e-4, 1e4
+"""Between these the penalty of the method of multipliers is sought."""
+
+BALANCE = 10.0
+"""By more than this the residuals of impulses and of rates do not differ for long."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cone:
+    """The cone of a contact.
+
+    Attributes:
+        rows: Where its impulses stand, the normal's first.
+        friction: mu, zero or more; infinite where it cannot slide.
+    """
+
+    rows: slice
+    friction: float
+
+    def nearest(self, values: FloatArray) -> FloatArray:
+        """The impulse of the cone next to another one."""
+        normal, along, mu = values[0], values[1:], self.friction
+        if np.isinf(mu):
+            return np.concatenate([[max(normal, 0.0)], along])
+        length = float(np.linalg.norm(along))
+        if length <= mu * normal:
+            return values
+        if mu * length <= -normal:
+            return np.zeros(values.size)
+        push = (normal + mu * length) / (1.0 + mu**2)
+        return np.concatenate([[push], mu * push / length * along if length else along])
+
+
+def in_cones(matrix: FloatArray, offset: FloatArray, cones: Sequence[Cone]) -> FloatArray | None:
+    """The impulses y, shape (k,); None if none are found.
+
+    Args:
+        matrix: W, positive semidefinite, shape (k, k).
+        offset: q, shape (k,).
+        cones: The contacts, which have all rows, one after the other.
+    """
+    if not offset.any():
+        return np.zeros(offset.size)
+    # One unit for all rows of a contact leaves its cone what it is.
+    unit = np.ones(offset.size)
+    for cone in cones:
+        unit[cone.rows] = 1.0 / np.sqrt(np.mean(np.diag(matrix)[cone.rows]))
+    W, q = matrix * unit * unit[:, None], offset * unit
+    size = float(np.abs(q).max())
+    found = _searched(W, q / size, cones)
+    return None if found is None else size * unit * found
+
+
+def _searched(W: FloatArray, q: FloatArray, cones: Sequence[Cone]) -> FloatArray | None:
+    """The impulses, by the method of multipliers: y = z, y of the program and z in the cones."""
+    penalty, identity = 1.0, np.eye(q.size)
+    inverse = np.linalg.inv(W + penalty * identity)
+    z = multiplier = np.zeros(q.size)
+    for step in range(STEPS):
+        shifted = q.copy()
+        for cone in cones:
+            if np.isfinite(cone.friction):
+                rates = W[cone.rows] @ z + q[cone.rows]
+                shifted[cone.rows.start] += cone.friction * np.linalg.norm(rates[1:])
+        y = inverse @ (penalty * z - multiplier - shifted)
+        before, z = z, _nearest(cones, y + multiplier / penalty)
+        multiplier = multiplier + penalty * (y - z)
+        if step % LOOK:
+            continue
+        found = _polished(W, q, cones, z)
+        if found is not None:
+            return found
+        apart, moved = np.linalg.norm(y - z), penalty * np.linalg.norm(z - before)
+        if max(apart, moved) > BALANCE * min(apart, moved):
+            penalty = float(np.clip(penalty * (2.0 if apart > moved else 0.5), *PENALTIES))
+            inverse = np.linalg.inv(W + penalty * identity)
+    return None
+
+
+def _nearest(cones: Sequence[Cone], values: FloatArray) -> FloatArray:
+    return np.concatenate([cone.nearest(values[cone.rows]) for cone in cones])
+
+
+def _polished(
+    W: FloatArray, q: FloatArray, cones: Sequence[Cone], start: FloatArray
+) -> FloatArray | None:
+    """The impulses of contacts that open, stick and slide as they nearly do; None if none fit."""
+    tried: list[list[int]] = []
+    largest = float(np.abs(start).max())
+    for margin in MARGINS:
+        ways = [_way(cone, start[cone.rows], margin * largest, margin) for cone in cones]
+        kinds = [0 if way is None else 1 + int(way.any()) for way in ways]
+        if kinds not in tried:
+            tried.append(kinds)
+            found = _solved(W, q, cones, start, ways)
+            if found is not None:
+                return found
+    return None
+
+
+def _solved(
+    W: FloatArray,
+    q: FloatArray,
+    cones: Sequence[Cone],
+    start: FloatArray,
+    ways: list[FloatArray | None],
+) -> FloatArray | None:
+    """The impulses of contacts in certain ways, by Newton's method; None if they do not fit.
+
+    A contact that sticks has u = 0; one that slides along d has y = y_n (1, -mu d), u_n = 0, and no
+    u across d, which is an unknown too.
+
+    Args:
+        W, q, cones: As they are searched for.
+        start: Where to begin.
+        ways: As of `_way`.
+    """
+    y = start.copy()
+    for cone, way in zip(cones, ways, strict=True):
+        if way is None:
+            y[cone.rows] = 0.0
+    for _ in range(NEWTON_STEPS):
+        frames = [_frame(cone, way, y[cone.rows]) for cone, way in zip(cones, ways, strict=True)]
+        makes, tests = (_diagonal(cones, each) for each in zip(*frames, strict=True))
+        ends = np.cumsum([make.shape[1] for make, _ in frames])
+        if not ends[-1]:
+            break
+        u, jacobian = W @ y + q, tests.T @ W @ makes
+        for cone, way, end in zip(cones, ways, ends, strict=True):
+            if way is not None and way.size == 2 and way.any():
+                jacobian[end - 1, end - 1] -= way @ u[cone.rows][1:]
+        change = np.linalg.lstsq(jacobian, -tests.T @ u)[0]
+        if not np.isfinite(change).all():
+            return None
+        for i, (cone, own) in enumerate(zip(cones, np.split(change, ends[:-1]), strict=True)):
+            way = ways[i]
+            if way is None:
+                continue
+            if not way.any():
+                y[cone.rows] += own
+                continue
+            if own.size == 2:
+                angle = np.arctan2(way[1], way[0]) + own[1]
+                way = ways[i] = np.array([np.cos(angle), np.sin(angle)])
+            y[cone.rows] = (y[cone.rows.start] + own[0]) * _against(cone, way)
+        if np.abs(change).max() <= ROUND_OFF * np.abs(y).max():
+            break
+    rates = W @ y + q
+    fits = (
+        _fits(cone, way, y[cone.rows], rates[cone.rows])
+        for cone, way in zip(cones, ways, strict=True)
+    )
+    return y if all(fits) else None
+
+
+def _diagonal(cones: Sequence[Cone], blocks: Sequence[FloatArray]) -> FloatArray:
+    """Blocks of columns, each in the rows of its contact."""
+    found = np.zeros((cones[-1].rows.stop, sum(block.shape[1] for block in blocks)))
+    first = 0
+    for cone, block in zip(cones, blocks, strict=True):
+        found[cone.rows, first : first + block.shape[1]] = block
+        first += block.shape[1]
+    return found
+
+
+def _way(cone: Cone, impulse: FloatArray, least: float, margin: float) -> FloatArray | None:
+    """The direction along which a contact slides; zero where it sticks, None where it opens."""
+    push, along = impulse[0], impulse[1:]
+    length = float(np.linalg.norm(along))
+    if push <= least:
+        return None
+    if not length or length < (1.0 - margin) * cone.friction * push:
+        return np.zeros(along.size)
+    return -along / length
+
+
+def _against(cone: Cone, way: FloatArray) -> FloatArray:
+    """The impulse of a contact that slides along a way, for a unit across the surface."""
+    return np.concatenate([[1.0], -cone.friction * way])
+
+
+def _frame(
+    cone: Cone, way: FloatArray | None, impulse: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What the unknowns of a contact change of its impulse, and which rates are zero; columns."""
+    identity = np.eye(impulse.size)
+    if way is None:
+        return identity[:, :0], identity[:, :0]
+    if not way.any():
+        return identity, identity
+    push = _against(cone, way)
+    if way.size == 1:
+        return push[:, None], identity[:, :1]
+    across = np.array([0.0, -way[1], way[0]])
+    turn = -cone.friction * impulse[0] * across
+    return np.column_stack([push, turn]), np.column_stack([identity[0], across])
+
+
+def _fits(cone: Cone, way: FloatArray | None, impulse: FloatArray, rates: FloatArray) -> bool:
+    """Whether a contact does as its way says, rates being relative to what there is."""
+    if way is None:
+        return bool(rates[0] >= -FITS)
+    if impulse[0] < 0.0:
+        return False
+    if not way.any():
+        most = cone.friction * impulse[0] if way.size else 0.0
+        return bool(np.linalg.norm(impulse[1:]) <= most and np.abs(rates).max() <= FITS)
+    onward = float(way @ rates[1:])
+    aside = float(np.linalg.norm(rates[1:] - onward * way))
+    return max(abs(rates[0]), aside, -onward) <= FITS
