@@ -2,15 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 
+import casadi as ca
+import numpy as np
+
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.contacts import jam
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.signals import Signal
+from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import (
     InconsistentStateError,
+    JammedContactError,
     NonFiniteError,
     SimulationError,
     SingularityError,
 )
-from drake_dae.trace.functions import Failure, Fault
+from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, Fault
 
 
 def simulation_error(
@@ -141,3 +148,92 @@ def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError)
 
 def _at(state: FloatArray) -> str:
     return f", state {show(state)}," if state.size else ""
+
+
+def off_start(name: str, manifold: Manifold, residual: FloatArray) -> InconsistentStateError:
+    """The exception for a run that starts off N*.
+
+    Args:
+        name: The system's name.
+        manifold: N*.
+        residual: How far each of its equations is from holding, shape (k,).
+    """
+    table = ", ".join(
+        f"{signal.name} = {value:.3g} {signal.unit}"
+        for signal, value in zip(manifold.residual_signals, residual, strict=True)
+        if not abs(value) <= 1e-3 * np.max(np.abs(residual))
+    )
+    return InconsistentStateError(
+        f"{name}: the start state is not on the constraint: {table}. Call "
+        "set_consistent_state(context, guess) to start from the nearest consistent state",
+        residual,
+    )
+
+
+def assembled_otherwise(
+    name: str, left_out: Manifold, state: FloatArray, residual: FloatArray
+) -> InconsistentStateError:
+    """The exception for a start at which redundant constraints that were left out do not hold.
+
+    Args:
+        name: The system's name.
+        left_out: What these constraints hold.
+        state: The start, shape (n,).
+        residual: How far each of their equations is from holding, shape (k,).
+    """
+    worst = int(np.argmax(np.abs(residual)))
+    signal = left_out.residual_signals[worst]
+    return InconsistentStateError(
+        f"{name}: the constraints that stay hold at state {show(state)}, but not "
+        f"the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
+        f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
+        "one of these constraints and not the others; start nearer to where all hold",
+        residual,
+    )
+
+
+def jammed_contact(
+    structure: ConstraintStructure,
+    error: SimulationError,
+    control: FloatArray,
+    parameters: FloatArray,
+    force: FloatArray,
+) -> JammedContactError | None:
+    """Where friction jams a contact, that, and whether any motion fits; None where it does not.
+
+    Args:
+        structure: The structure of the system that rubs.
+        error: What says that A(x) is singular, with time and state.
+        control: u, shape (p,).
+        parameters: Values of all parameters.
+        force: v there, shape (m,).
+    """
+    dae, elimination = structure.system, structure.elimination
+    rubbing, matrix = dae.rubbing, elimination.constraint_matrix
+    outputs = {
+        "A": ca.densify(matrix),
+        "A_0": ca.densify(rubbing.without_friction(matrix)),
+        "gradient": elimination.constraint_gradient,
+        "reserve": rubbing.reserve(matrix),
+    }
+    values = dae.trace("A(x)", outputs, often=False)(error.state, parameters)
+    m, reserve = dae.num_constraints, values[3].item()
+    if not reserve < SINGULAR_PIVOT:
+        return None
+    A, A_0, gradient = (value.reshape(m, -1) for value in values[:3])
+    fields = dict(zip(dae.fields.output_names, dae.fields(error.state, parameters), strict=True))
+    free = np.abs(fields["f"])
+    if control.size:
+        free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(control)
+    found = jam(A, A_0, force, np.abs(gradient) @ free, rubbing.rows)
+    names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in rubbing.rows)
+    outcome = f". What becomes of it is {found.value}" if found else ""
+    return JammedContactError(
+        f"{dae.name}: friction jams the contact of {names} at t = {error.time:.6g} s, "
+        f"state {show(error.state)} (Painleve): a principal minor of A(x) has come to "
+        f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
+        "other way, or hold the robot less steeply to the surface",
+        error.time,
+        error.state,
+        found,
+    )

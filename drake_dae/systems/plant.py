@@ -20,27 +20,30 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, unknown_name, vector
-from drake_dae.dae.contacts import jam
+from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.passage import Passage
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import (
     InconsistentStateError,
-    JammedContactError,
     ModelError,
     SimulationError,
     SingularityError,
 )
 from drake_dae.systems.along import function_along
 from drake_dae.systems.block import ParameterizedSystem
-from drake_dae.systems.failures import off_manifold
+from drake_dae.systems.failures import (
+    assembled_otherwise,
+    jammed_contact,
+    off_manifold,
+    off_start,
+)
 from drake_dae.systems.feedback import Feedback, motion_under, nothing
 from drake_dae.systems.formulas import Formula, TracedFormula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.trials import state_tickets
-from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
+from drake_dae.trace.functions import TracedFunction
 
 _CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
 
@@ -398,42 +401,12 @@ class DaePlant(ParameterizedSystem):
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
     ) -> SimulationError:
         """Where friction jams a contact, that, and whether any motion fits."""
-        rubbing = self.dae.rubbing
-        if not (rubbing and isinstance(error, SingularityError)):
+        if not (self.dae.rubbing and isinstance(error, SingularityError)):
             return error
-        elimination = self.structure.elimination
-        matrix = elimination.constraint_matrix
-        outputs = {
-            "A": ca.densify(matrix),
-            "A_0": ca.densify(rubbing.without_friction(matrix)),
-            "gradient": elimination.constraint_gradient,
-            "reserve": rubbing.reserve(matrix),
-        }
-        values = self.dae.trace("A(x)", outputs, often=False)(error.state, parameters)
-        m, reserve = self.dae.num_constraints, values[3].item()
-        if not reserve < SINGULAR_PIVOT:
-            return error
-        A, A_0, gradient = (value.reshape(m, -1) for value in values[:3])
-        fields = dict(
-            zip(self.dae.fields.output_names, self.dae.fields(error.state, parameters), strict=True)
-        )
-        free = np.abs(fields["f"])
-        if self._is_controlled:
-            free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(inputs[0])
-        control = inputs if self._force_needs_control else ()
-        force = self._force(error.state, *control, parameters)[0]
-        found = jam(A, A_0, force, np.abs(gradient) @ free, rubbing.rows)
-        names = ", ".join(f"'{self.dae.constraint_input_signals[i].name}'" for i in rubbing.rows)
-        outcome = f". What becomes of it is {found.value}" if found else ""
-        return JammedContactError(
-            f"{self.dae.name}: friction jams the contact of {names} at t = {error.time:.6g} s, "
-            f"state {show(error.state)} (Painleve): a principal minor of A(x) has come to "
-            f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
-            "other way, or hold the robot less steeply to the surface",
-            error.time,
-            error.state,
-            found,
-        )
+        control = inputs[0] if self._is_controlled else np.zeros(0)
+        given = (control,) if self._force_needs_control else ()
+        force = self._force(error.state, *given, parameters)[0]
+        return jammed_contact(self.structure, error, control, parameters, force) or error
 
     def _formulas(self) -> dict[str, Formula]:
         dae, residual = self.dae, self.structure.manifold.residual_expression
@@ -486,32 +459,15 @@ class DaePlant(ParameterizedSystem):
         if manifold.is_consistent(state, parameters):
             self._check_left_out(state, parameters)
             return
-        residual = manifold.residual(state, parameters)
-        table = ", ".join(
-            f"{signal.name} = {value:.3g} {signal.unit}"
-            for signal, value in zip(manifold.residual_signals, residual, strict=True)
-            if not abs(value) <= 1e-3 * np.max(np.abs(residual))
-        )
-        raise InconsistentStateError(
-            f"{self.dae.name}: the start state is not on the constraint: {table}. Call "
-            "set_consistent_state(context, guess) to start from the nearest consistent state",
-            residual,
-        )
+        raise off_start(self.dae.name, manifold, manifold.residual(state, parameters))
 
     def _check_left_out(self, state: FloatArray, parameters: FloatArray) -> None:
         """Refuses a state at which redundant constraints that were left out do not hold."""
         left_out = self._left_out
         if left_out is None or left_out.is_consistent(state, parameters):
             return
-        residual = left_out.residual(state, parameters)
-        worst = int(np.argmax(np.abs(residual)))
-        signal = left_out.residual_signals[worst]
-        raise InconsistentStateError(
-            f"{self.dae.name}: the constraints that stay hold at state {show(state)}, but not "
-            f"the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
-            f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
-            "one of these constraints and not the others; start nearer to where all hold",
-            residual,
+        raise assembled_otherwise(
+            self.dae.name, left_out, state, left_out.residual(state, parameters)
         )
 
     def _project(self, context: Context, state: State) -> EventStatus:
