@@ -13,10 +13,11 @@ from typing import Any, Self, cast
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
-from drake_dae.diagrams.build import build_loop, start_scenario
+from drake_dae.diagrams.build import build_completed, start_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.scenario import Scenario, read_scenario, varied_data
 from drake_dae.diagrams.sweep.variations import Variation
+from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import (
     AssumptionError,
@@ -111,7 +112,8 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     if positions.keys() == first["positions"].keys():
         positions = first["positions"]
     own["start"] = {**first, "positions": positions}
-    if own["gains"] and base["gains"]:  # Without any they are advised, by what is built.
+    # Without any they are advised, by what is built; and a task is built with its numbers.
+    if own["gains"] and base["gains"] and not own["task"]:
         tag = own["gains"].get(TAG, "!Poles")
         if tag == base["gains"][TAG] != "!Matrices":
             own["gains"] = base["gains"]
@@ -138,10 +140,10 @@ class Runner:
         self._base = base
         self._lasting = lasting
         self._key = ""
-        self._built: ClosedLoop | DrakeDaeError | None = None
+        self._built: ClosedLoop | TaskLoop | DrakeDaeError | None = None
         self.builds = 0
 
-    def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
+    def loop(self, data: Mapping[str, Any]) -> ClosedLoop | TaskLoop:
         """The closed loop of a scenario's data.
 
         Raises:
@@ -153,13 +155,15 @@ class Runner:
             self._key, self._built = "", None
             self.builds += 1
             try:
-                self._built = build_loop(read_scenario(built))
+                if self._lasting is not None and built["task"]:
+                    raise ScenarioError(("task", "rollouts know no tasks: run it by Drake"))
+                self._built = build_completed(read_scenario(built))[1]
             except DrakeDaeError as error:
                 self._built = error
             self._key = key
-        if isinstance(self._built, ClosedLoop):
-            return self._built
-        raise cast(DrakeDaeError, self._built)
+        if isinstance(self._built, DrakeDaeError):
+            raise self._built
+        return cast(ClosedLoop | TaskLoop, self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
         """What is wrong with the words of a variation; None if nothing is.
@@ -174,7 +178,7 @@ class Runner:
             return None if _is_about_states(error) else error
         except DrakeDaeError:
             return None
-        if self._lasting is not None:
+        if self._lasting is not None and isinstance(loop, ClosedLoop):
             from drake_dae.diagrams.rollout.rollout import functions_of
 
             try:
@@ -216,14 +220,14 @@ def _is_about_states(error: BaseException | None) -> bool:
 
 
 def _simulated(
-    number: int, scenario: Scenario, loop: ClosedLoop, lasting: float | None
+    number: int, scenario: Scenario, loop: ClosedLoop | TaskLoop, lasting: float | None
 ) -> RunResult:
     """What a run comes to, from a new context of the loop."""
     try:
         context = start_scenario(scenario, loop)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if lasting is None:
+            if lasting is None or isinstance(loop, TaskLoop):
                 record, steps, failure = _stepped(scenario, loop, context)
             else:
                 from drake_dae.diagrams.rollout.scenario_run import roll_scenario
@@ -241,7 +245,7 @@ def _simulated(
 
 
 def _stepped(
-    scenario: Scenario, loop: ClosedLoop, context: Context
+    scenario: Scenario, loop: ClosedLoop | TaskLoop, context: Context
 ) -> tuple[Record, int, SimulationError | None]:
     """What Drake's Simulator makes of a run: its record, how many steps it took, why it failed."""
     steps, failure = 0, None

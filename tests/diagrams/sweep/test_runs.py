@@ -160,6 +160,17 @@ def test_what_no_rollout_has_is_told_with_a_remedy():
     assert "run the loop by simulate" in str(Runner(base, 1.0).why_not({}))
 
 
+@pytest.mark.slow
+def test_tasks_vary_as_references_do():
+    """Their gains are built in; a rollout knows none of them."""
+    base = scenario_data(scenario("wall_polish", "duration=0.1", "compiled=false"))
+    slower = {"gains.all": [-20.0]}
+    assert structure_key(varied_data(base, slower), base) != structure_key(base, base)
+    (found,) = Runner(base).run_all([(0, slower)])
+    check(base, slower, found)
+    assert "rollouts know no tasks" in str(Runner(base, 1.0).why_not({}))
+
+
 def test_how_long_runs_of_one_structure_last():
     base = scenario_data(scenario("two_link_wall", *SHORT))
     walls = [{"constraints.0.surface.point": [x, 0.0, 0.0]} for x in (1.2, 1.25)]
