@@ -124,6 +124,8 @@ def load_yaml(text: str, name: str) -> Any:
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         what = ", ".join(part for part in (error.context, error.problem) if part)
+        if "<document start>" in what:
+            what = "more than one value; several stand in brackets, as in [[-4], [-8]]"
         raise ScenarioError((name, line + what)) from None
     except yaml.YAMLError as error:  # Control characters.
         raise ScenarioError((name, str(error))) from None

@@ -52,6 +52,7 @@ YAML = {
     "a date that is none": ("a: !!timestamp abc", "does not fit its value"),
     "a whole number that is none": ("a: !!int ''", "does not fit its value"),
     "a number that is none": ("a: !!float ''", "does not fit its value"),
+    "values without brackets": ("[-4], [-8]", r"more than one value; .* brackets, as in \[\["),
     "a null byte": ("a: \0", "not allowed"),
 }
 
