@@ -11,7 +11,8 @@ from drake_dae.errors import ModelError, WiringError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.limits import ControlLimits
-from drake_dae.systems.observer import DisturbanceObserver, Observing
+from drake_dae.systems.observer import DisturbanceObserver
+from drake_dae.systems.observer_rates import Observing
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.sampling import Sampling
 

@@ -70,8 +70,8 @@ def contact_gains(
 
     which is sqrt(14) w n for k_o = w and for k_o = 2 w: that is the faster one for nothing. Of it
     0.04 rad/s^2 are allowed; so that 1 kHz, one sample of delay and 1e-3 rad/s make w = 10.7 1/s.
-    What the observer finds moving, it finds with k_o = 2 w. Friction is identified by w / 3, slower
-    than the direction of a motion changes.
+    What the observer finds moving, it finds with k_o = 2 w. Friction is identified by k_o / 4, so
+    that what r has is the observer's before it is friction's.
 
     The force hears of noise by the damping c and by the observer's rate k_n in its own direction,
     both of which brake phi', and the contact rings with what damping the integral K_i leaves,
@@ -106,4 +106,4 @@ def contact_gains(
     damping = min(2.3 * rate, best)
     # Where samples cannot damp, the contact itself must: then the force is changed slowly.
     force_gain = 0.4 * (damping or rate / 2.0)
-    return ContactGains(1.5 * rate, force_gain, damping, 2.0 * rate, rate, rate / 3.0)
+    return ContactGains(1.5 * rate, force_gain, damping, 2.0 * rate, rate, rate / 2.0)

@@ -1,7 +1,5 @@
 """An observer of what a model lacks: a disturbance, and coefficients of friction."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, EventStatus, State
@@ -16,43 +14,11 @@ from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.failures import simulation_error
 from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
 _SHARP = 10.0
 """So many times faster than it is a motion rubs here: friction is full from v_s / 10 on."""
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class Observing:
-    """How fast a `DisturbanceObserver` observes, and when it believes what it sees of friction.
-
-    Attributes:
-        rate: k_o in 1/s, at which a disturbance is found that moves what the constraints leave.
-        force_rate: k_n in 1/s, at which that part is found that the constraints answer, and which
-            changes their forces alone; None for k_o.
-        friction_rate: k_f in 1/s, at which coefficients of friction take their share of it.
-        largest_friction: Above which no coefficient of friction goes.
-        least_speed: The speed in m/s below which a contact may stick: then its friction is any.
-        least_force: The force, in N, below which a contact is lost: its coefficient stands still,
-            and so do integrals.
-
-    Raises:
-        ModelError: A number is not positive.
-    """
-
-    rate: float
-    friction_rate: float = 3.0
-    largest_friction: float = 1.0
-    least_speed: float = 0.005
-    least_force: float = 1.0
-    force_rate: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "friction_rate", "largest_friction", "least_speed", "least_force"):
-            positive(name, getattr(self, name))
-        if self.force_rate is not None:
-            positive("force_rate", self.force_rate)
 
 
 @checked(ModelError)
