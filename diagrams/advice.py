@@ -58,16 +58,13 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     force = scenario.force
     if not force.is_measured:
         force = parts.MeasuredForce(sample_period=period)
-    # A force of degree 0 has a pole where it is integrated, and none otherwise.
-    of_forces = {
-        name: [_rounded(found.force_pole)] if name in integral else [] for name in forces.tolist()
+    # A force of degree 0 has a gain where it is integrated, and none otherwise.
+    of_forces = {name: [_rounded(found.force_gain)] for name in forces.tolist() if name in integral}
+    of_positions = {
+        name: [_rounded(gain) for gain in found.position_gains(3 if name in integral else 2)]
+        for name in positions.tolist()
     }
-    gains = parts.Poles(
-        outputs={
-            **{name: values for name, values in of_forces.items() if values},
-            "*": [_rounded(found.position_pole)],
-        }
-    )
+    gains = parts.Coefficients(outputs=of_positions | of_forces)
     damping = scenario.constraint_damping
     if damping is None and found.constraint_damping:
         damping = parts.Poles(all=[-_rounded(found.constraint_damping)])
@@ -76,6 +73,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         rubbing = [c.name for c in model.constraints if c.friction_parameter]
         observer = parts.Observer(
             rate=_rounded(found.observer_rate),
+            force_rate=_rounded(found.observer_force_rate),
             friction_rate=_rounded(found.friction_rate),
             friction=rubbing,
         )
@@ -91,9 +89,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     note = (
         f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and velocities within {noise:.2g} rad/s: "
-        f"poles of positions at {_rounded(found.position_pole):g} 1/s and of forces "
-        f"at {_rounded(found.force_pole):g} 1/s with integrals of {', '.join(integral)}, damping "
-        f"of the constraint {_rounded(found.constraint_damping):g} 1/s, an observer of "
+        f"Butterworth's poles of positions at {_rounded(found.position_rate):g} 1/s, and of "
+        f"forces one at {-_rounded(found.force_gain):g} 1/s, with integrals of "
+        f"{', '.join(integral)}, damping of the constraint "
+        f"{_rounded(found.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {known}"
     )
     return Completed(chosen, (note,))

@@ -44,7 +44,8 @@ from drake_dae.simulation.view import RobotBlock, add_live_view
 from drake_dae.systems.along import function_along
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.encoders import Encoders
-from drake_dae.systems.observer import DisturbanceObserver, Observing
+from drake_dae.systems.observer import DisturbanceObserver
+from drake_dae.systems.observer_rates import Observing
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling

@@ -11,7 +11,8 @@ from drake_dae.errors import ModelError, WiringError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.controller import TrackingController
 from drake_dae.systems.limits import ControlLimits
-from drake_dae.systems.observer import DisturbanceObserver, Observing
+from drake_dae.systems.observer import DisturbanceObserver
+from drake_dae.systems.observer_rates import Observing
 from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.sampling import Sampling
 
@@ -55,9 +56,9 @@ def add_observer(
         raise WiringError(
             "an observer needs the measured force; make the law with measured_force=True"
         )
-    rest = 0.0 if sampling is None else sampling.rest
-    lag = min((rest + step) / period, 1.0)
-    observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, period, lag))
+    rest, late = (0.0, 0.0) if sampling is None else (sampling.rest, sampling.delay + step)
+    lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
+    observer = builder.AddSystem(DisturbanceObserver(controller.law, observing, period, lag, delay))
     builder.Connect(state, observer.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
     builder.Connect(reference, observer.GetInputPort("reference"))

@@ -17,7 +17,7 @@ from drake_dae.diagrams.robot_file.payloads import Payload
 from drake_dae.diagrams.typed_yaml import TAG
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import contact, outputs
-from drake_dae.systems.observer import Observing
+from drake_dae.systems.observer_rates import Observing
 from drake_dae.systems.sensors import ForceSensor
 
 T = TypeVar("T")

@@ -115,7 +115,7 @@ from .systems.encoders import Encoders as Encoders
 from .systems.encoders import StateSensor as StateSensor
 from .systems.limits import ControlLimits as ControlLimits
 from .systems.observer import DisturbanceObserver as DisturbanceObserver
-from .systems.observer import Observing as Observing
+from .systems.observer_rates import Observing as Observing
 from .systems.plant import DaePlant as DaePlant
 from .systems.pushes import Push as Push
 from .systems.realization import StateRealization as StateRealization

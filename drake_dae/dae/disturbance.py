@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure.structure import Structure
@@ -21,6 +21,9 @@ DISTURBANCE = "disturbance"
 
 _TINY = 1e-200
 """What is divided by where nothing slides or pushes, and the quotient is of no use."""
+
+_FLAT = 1e-9
+"""Directions are one where the least of their squares is this part of the largest."""
 
 
 @checked(ModelError)
@@ -84,17 +87,23 @@ class Observation:
     With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
     derivative of a measurement is needed.
 
+    Where a contact slides, friction is S^T dg/dmu v mu. Where it sticks, it is a reaction, any
+    force T y in the directions of sliding, the slopes of S^T dg/dmu v by the velocities at rest;
+    and no momentum tells it from d.
+
     Attributes:
         momentum: (x, u, v, parameters) -> p, its rate without inputs and without d, and what the
             inputs add to that, S^T (h u + g v); shape (k,) each.
         friction: (x, v, parameters) -> of each coefficient of friction the force that one of 1
-            makes, C = S^T dg/dmu v, shape (k, c); the share that a d has of it,
-            (Q c_j)^T E^-1 Q d / |Q c_j|^2 with |a|^2 = a^T E^-1 a, as rows, shape (c, k); and the
-            speed of sliding by the power of friction, in m/s, shape (c,). Q d is d with what the
-            constraint answers, Q = 1 + S^T g dalpha/dd.
-        wanted: (x, R, parameters) -> x with those velocities with which the outputs move as the
-            reference does and the constraints stay, shape (n,); None where outputs and constraints
-            do not determine them.
+            makes, C = S^T dg/dmu v, shape (k, c), and the speed of sliding by the power of
+            friction, in m/s, shape (c,).
+        directions: (x, v, parameters) -> W = Q^T E^-1 Q and Q = 1 + S^T g dalpha/dd, shape (k, k),
+            where Q d is d with what the constraint answers, and d^T W d the square of the
+            acceleration that d makes, in the metric of kinetic energy; and T of each contact, side
+            by side, shape (k, c k).
+        wanted: (x, R, t, parameters) -> x with those velocities with which the outputs move as the
+            reference does t later, r' + t r'', and the constraints stay, shape (n,); None where
+            outputs and constraints do not determine them.
         rows: The states whose rates d enters.
         frictions: The names of the coefficients of friction, and which constraint input each is
             for.
@@ -102,6 +111,7 @@ class Observation:
 
     momentum: TracedFunction
     friction: TracedFunction
+    directions: TracedFunction
     wanted: TracedFunction | None
     rows: tuple[int, ...]
     frictions: dict[str, int]
@@ -135,39 +145,73 @@ class Observation:
         outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
         function = system.trace("momentum", outputs, {"control": u, "constraint_input": v})
 
-        # What a coefficient of friction of one does, in the directions that the constraint leaves.
+        # What a coefficient of friction of one does; it takes the power mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
         forces = ca.horzcat(ca.SX(len(rows), 0), *columns)
+        power = ca.mtimes(forces.T, x[rows])
+        speeds = [
+            ca.fabs(power[j]) / ca.fmax(ca.fabs(v[i]), _TINY)
+            for j, i in enumerate(frictions.values())
+        ]
+        pressed = {"constraint_input": v}
+        rubbing = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
+        friction = system.trace("friction", rubbing, pressed)
+
         reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
         projector = ca.SX.eye(len(rows)) + reaction
-        matched = ca.mtimes(projector, forces)
-        right = ca.SX(x.numel(), len(frictions))
-        right[rows, :] = matched
+        right = ca.SX(x.numel(), len(rows))
+        right[rows, :] = projector
         moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows, :]
-        # Friction takes the power mu lambda |v_t|.
-        power = ca.mtimes(forces.T, x[rows])
-        weights, speeds = [ca.SX(0, len(rows))], [ca.SX(0, 1)]
-        for j, i in enumerate(frictions.values()):
-            weights.append(moves[:, j].T / ca.fmax(ca.dot(matched[:, j], moves[:, j]), _TINY))
-            speeds.append(ca.fabs(power[j]) / ca.fmax(ca.fabs(v[i]), _TINY))
+        slopes = [ca.jacobian(column, x[rows]) for column in columns]
+        planes = ca.horzcat(ca.SX(len(rows), 0), *slopes)
         found = {
-            "forces": forces,
-            "weights": ca.mtimes(ca.vertcat(*weights), projector),
-            "speeds": ca.vertcat(*speeds),
+            "metric": ca.mtimes(projector.T, moves),
+            "free": projector,
+            "planes": ca.substitute(planes, x[rows], 0 * x[rows]),
         }
-        shared = system.trace("friction in a disturbance", found, {"constraint_input": v})
-        return cls(function, shared, _wanted(structure, rows), tuple(rows), frictions)
+        directions = system.trace("directions of friction", found, pressed)
+        wanted = _wanted(structure, rows)
+        return cls(function, friction, directions, wanted, tuple(rows), frictions)
+
+
+def shares(forces: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
+    """How much of each force c is in d, by the accelerations that they make, shape (c,):
+
+        (c^T W d) / (c^T W c).
+
+    Args:
+        forces: The forces as columns, shape (k, c).
+        metric: W, shape (k, k).
+        d: What is shared, shape (k,).
+    """
+    matched = metric @ forces
+    return np.asarray(d @ matched / np.maximum(np.sum(forces * matched, axis=0), _TINY))
+
+
+def beside(planes: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
+    """What is left of d beside all T y, by the accelerations that they make, shape (k,).
+
+    Args:
+        planes: T, shape (k, j), of any rank.
+        metric: W, shape (k, k).
+        d: What is shared, shape (k,).
+    """
+    matched = metric @ planes
+    found = np.linalg.lstsq(planes.T @ matched, d @ matched, rcond=_FLAT)[0]
+    return np.asarray(d - planes @ found)
 
 
 def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
-    """x with the velocities that the reference wants; None where it does not tell them."""
+    """x with the velocities that the reference wants then; None where it does not tell them."""
     system, layout = structure.system, Layout(structure.output_degrees)
     steered = [int(i) for i in layout.dynamic]
     if any(structure.output_degrees[i] != 2 for i in steered):
         return None
     reference = ca.SX.sym("R", layout.reference_size)
     kept = Layout(structure.constraint_degrees).ends.tolist()
-    rates = [structure.output_chains[i][1] - reference[int(layout.lowest[i]) + 1] for i in steered]
+    ahead, starts = ca.SX.sym("t"), {i: int(layout.lowest[i]) for i in steered}
+    goals = {i: reference[j + 1] + ahead * reference[j + 2] for i, j in starts.items()}
+    rates = [structure.output_chains[i][1] - goals[i] for i in steered]
     left = ca.vertcat(ca.SX(0, 1), *rates, structure.manifold.residual_expression[kept, :])
     slope = ca.jacobian(left, system.state[list(rows), :])
     if slope.shape[0] != slope.shape[1]:
@@ -175,7 +219,7 @@ def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
     factors = Factorization(slope)
     state = ca.SX(system.state)
     state[list(rows), :] -= factors.solve(left)
-    inputs = {"reference": reference}
+    inputs = {"reference": reference, "ahead": ahead}
     return system.trace("wanted velocities", {"state": state}, inputs, factors.pivot)
 
 

@@ -1,15 +1,12 @@
 """An observer of what a model lacks: a disturbance, and coefficients of friction."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, EventStatus, State
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, numbers, positive
-from drake_dae.dae.disturbance import DISTURBANCE, Observation
+from drake_dae.dae.disturbance import DISTURBANCE, Observation, beside, shares
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import ModelError
@@ -17,43 +14,11 @@ from drake_dae.systems.block import ParameterizedSystem
 from drake_dae.systems.failures import simulation_error
 from drake_dae.systems.formulas import Formula
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class Observing:
-    """How fast a `DisturbanceObserver` observes, and when it believes what it sees of friction.
-
-    Attributes:
-        rate: k_o in 1/s, at which a disturbance is found.
-        friction_rate: k_f in 1/s, at which coefficients of friction take their share of it.
-        largest_friction: Above which no coefficient of friction goes.
-        least_speed: The speed of sliding, in m/s, below which a coefficient stands still.
-        least_force: The force, in N, below which a contact is lost: its coefficient stands still,
-            and so do integrals.
-
-    Raises:
-        ModelError: A number is not positive.
-    """
-
-    rate: float
-    friction_rate: float = 3.0
-    largest_friction: float = 1.0
-    least_speed: float = 0.01
-    least_force: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "friction_rate", "largest_friction", "least_speed", "least_force"):
-            positive(name, getattr(self, name))
-
-
-class _Friction(NamedTuple):
-    """What friction does in a state: see `Observation.friction`."""
-
-    forces: FloatArray
-    shares: FloatArray
-    speeds: FloatArray
+_SHARP = 10.0
+"""So many times faster than it is a motion rubs here: friction is full from v_s / 10 on."""
 
 
 @checked(ModelError)
@@ -66,7 +31,8 @@ class DisturbanceObserver(ParameterizedSystem):
 
     of which r is low-passed with the rate k_o, r_k = e^(-k_o T) r_(k-1) + (1 - e^(-k_o T)) d_k: a
     constant d is found as 1 - e^(-k_o t), and noise n of the velocities, with M the mass, leaves
-    about k_o M n of noise in r.
+    about k_o M n of noise in r. That part of d which the constraints answer, d - Q d, is found with
+    the rate k_n = `force_rate`: it makes no motion, but its noise makes force.
 
     A coefficient of friction takes the share that r has of the force of friction c = S^T dg/dmu v,
 
@@ -76,18 +42,24 @@ class DisturbanceObserver(ParameterizedSystem):
     follows what acts with the rate k_o, whatever k_f is, and no motion tells when the share is
     handed over. Friction that is identified acts at once where the force or the direction changes;
     r is late by 1 / k_o. mu stays between 0 and `largest_friction`, and stands still where the
-    contact slides by less than `least_speed`, or is pressed by less than `least_force`, since then
-    friction does not tell its coefficient; also while the input `hold` is not 0. r needs no hold:
-    it has the control that acts, also at its limits, and the force that is measured, also where a
-    contact is open.
+    contact is pressed by less than `least_force`; also while the input `hold` is not 0. r needs no
+    hold: it has the control that acts, also at its limits, and the force that is measured, also
+    where a contact is open.
 
-    Friction acts against the motion that the reference wants, c = c(x_w), where x_w is x with the
+    Below `least_speed` a contact may stick, and its friction is a reaction like the constraint's:
+    no motion tells it, nor its coefficient. Then mu stands still, and so does r in the directions
+    in which the contact slides; in the others it goes on. Else r would take up what holds a tool
+    that turns, 2 mu lambda within a sample or two, and give it back for 1 / k_o.
+
+    Friction acts against the motion that the reference wants, c_w = c(x_w), where x_w is x with the
     velocities that follow from the reference and the constraints: where a motion turns or begins
-    the contact sticks, and its own velocity tells no direction. So r is what is left beside
-    mu c(x_w), and since the law's model has mu c(x), what it is told to cancel is
-    r + mu (c(x_w) - c(x)). Where outputs and constraints do not determine the velocities, or
-    `reference` has no wire, x_w = x. The speed of sliding is that by the power of friction, for
-    surfaces that stand still.
+    the contact sticks, and its own velocity tells no direction. It is that motion at the time at
+    which the control acts, tau = `control_delay` later: r' + tau r''. What wants has no noise and
+    does not creep, so c_w, and c in d where it slides, are those of ten times the velocity: full
+    from v_s / 10 on. Since the law's model has mu c(x), what it is told to cancel is
+    r + mu (c_w - c(x)), of one and the same x. Where outputs and constraints do not determine the
+    velocities, or `reference` has no wire, x_w = x. The speed of sliding is that by the power of
+    friction, for surfaces that stand still.
 
     Input ports:
         estimated_state: x, shape (n,).
@@ -104,7 +76,8 @@ class DisturbanceObserver(ParameterizedSystem):
         hold: 1 while the input `hold` is not 0 or a contact that rubs is lost, else 0, shape (1,):
             for the integrals of the controller.
 
-    All but the last are held between samples; r starts at 0, and mu at the model's coefficients.
+    `disturbance` and `friction` are held between samples; r starts at 0, and mu at the model's
+    coefficients.
 
     Args:
         law: The law, for a system that `with_disturbance` made; with rigid joints, where it needs
@@ -114,6 +87,8 @@ class DisturbanceObserver(ParameterizedSystem):
         control_lag: For which part of T the plant goes on with the control that the port had at a
             sample, from 0 to 1: all of it for a discrete plant of that step, none for a
             `ControlHold` without delay before a continuous one.
+        control_delay: tau in s, how much later than its sample a control acts in the mean: the
+            delay, and half of T, for which it is held.
 
     Attributes:
         observation, observing, sample_period: What is observed, and the arguments.
@@ -132,6 +107,7 @@ class DisturbanceObserver(ParameterizedSystem):
         observing: Observing,
         sample_period: float,
         control_lag: float = 0.0,
+        control_delay: float = 0.0,
     ) -> None:
         system = law.system
         signals = {
@@ -144,7 +120,9 @@ class DisturbanceObserver(ParameterizedSystem):
         self.observing, self.sample_period = observing, positive("sample_period", sample_period)
         if not 0.0 <= control_lag <= 1.0:
             raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
-        self._lag = control_lag
+        if not control_delay >= 0.0:
+            raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
+        self._lag, self._delay = control_lag, control_delay
         self.observation = found = Observation.of(law.structure)
         if any(law.exogenous_degrees):
             raise ModelError(
@@ -159,8 +137,7 @@ class DisturbanceObserver(ParameterizedSystem):
         self.friction_signals = tuple(Signal(name) for name in names)
         self._mu = [system.parameter_slice(name) for name in names]
         self._contacts = list(found.frictions.values())
-        last = size + len(names)
-        places = {DISTURBANCE: list(range(last, last + size))}
+        places = {DISTURBANCE: list(range(size))}
         places |= {name: [size + j] for j, name in enumerate(names)}
         self._order = [place for p in system.exogenous.moving for place in places[p.name]]
         self._ports = [
@@ -170,17 +147,21 @@ class DisturbanceObserver(ParameterizedSystem):
         ]
         self._hold = self.DeclareVectorInputPort("hold", 1)
         self._reference = self.DeclareVectorInputPort("reference", law.layout.reference_size)
-        # r, mu, and what is to cancel; then, of the sample before, p, its rate without inputs, u.
+        # r, mu; then, of the sample before, p, its rate without inputs, u.
         start = [system.parameter_values[place] for place in self._mu]
-        self._estimate = self.DeclareDiscreteState(
-            np.concatenate([np.zeros(size), *start, np.zeros(size)])
-        )
+        self._estimate = self.DeclareDiscreteState(np.concatenate([np.zeros(size), *start]))
         self._before = self.DeclareDiscreteState(np.full(2 * size + system.num_controls, np.nan))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
         sources = {self.discrete_state_ticket(self._estimate)}
+        read = (self._ports[0], self._ports[2], self._reference)
+        self.DeclareVectorOutputPort(
+            "exogenous",
+            len(self._order),
+            weakly(self._calc_exogenous),
+            sources | {self.input_port_ticket(port.get_index()) for port in read},
+        )
         for name, places_of in (
-            ("exogenous", self._order),
             ("disturbance", list(range(size))),
             ("friction", list(range(size, size + len(names)))),
         ):
@@ -217,50 +198,66 @@ class DisturbanceObserver(ParameterizedSystem):
         size = len(observation.rows)
         x, u, force = (port.Eval(context) for port in self._ports)
         estimate = context.get_discrete_state(self._estimate).CopyToVector()
-        r, mu, cancelled = np.split(estimate, [size, size + len(self._mu)])
-        parameters = context.get_numeric_parameter(0).CopyToVector()
-        for place, value in zip(self._mu, mu, strict=True):
-            parameters[place] = value
+        r, mu = np.split(estimate, [size])
+        parameters = self._parameters(context, 0.0 * mu)
         before = context.get_discrete_state(self._before).CopyToVector()
         p_0, rate_0, u_0 = np.split(before, [size, 2 * size])
         is_first = np.isnan(p_0[0])
         acted = u if is_first else self._lag * u_0 + (1.0 - self._lag) * u
         p, rate, inputs = self._run(observation.momentum, context, x, acted, force, parameters)
-        turned = np.zeros(size)
-        if mu.size:
-            goal = self._wanted(context, x, parameters)
-            moved, wanted = (self._friction(context, y, force, parameters) for y in (x, goal))
-            turned = (wanted.forces - moved.forces) @ mu
+        rubbing, speeds = self._friction(context, self._faster(x), force, parameters)
+        is_slow, is_lost = speeds < _SHARP * observing.least_speed, self._is_lost(force)
+        found = self._run(observation.directions, context, x, force, parameters)
+        metric, free, planes = (one.reshape((size, -1), order="F").copy() for one in found)
+        step = np.zeros(size)
         if not is_first:
-            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - turned
-            r += -np.expm1(-observing.rate * period) * (d - r)
+            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu
+            moves = free @ (d - r)
+            rates = np.array([observing.rate, observing.force_rate or observing.rate])
+            fast, slow = -np.expm1(-rates * period)
+            step = fast * moves + slow * (d - r - moves)
+        sticks = is_slow & ~is_lost
+        if sticks.any():
+            step = beside(planes[:, np.repeat(sticks, size)], metric, step)
+        r += step
         if mu.size and not self._is_limited(context):
-            speeds = np.minimum(moved.speeds, wanted.speeds)
-            is_sure = (speeds >= observing.least_speed) & ~self._is_lost(force)
-            step = -np.expm1(-observing.friction_rate * period) * (moved.shares @ r)
-            step = np.clip(mu + is_sure * step, 0.0, observing.largest_friction) - mu
-            mu += step
-            r -= wanted.forces @ step
-        cancelled[:] = r + turned
+            is_sure = ~(is_slow | is_lost)
+            part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, r)
+            change = np.clip(mu + is_sure * part, 0.0, observing.largest_friction) - mu
+            mu += change
+            r -= rubbing @ change
         discrete = state.get_mutable_discrete_state()
         discrete.set_value(self._estimate, estimate)
         discrete.set_value(self._before, np.concatenate([p, rate, u]))
         return EventStatus.Succeeded()
 
+    def _parameters(self, context: Context, friction: FloatArray) -> FloatArray:
+        """The model's parameters with other coefficients of friction."""
+        parameters = context.get_numeric_parameter(0).CopyToVector()
+        for place, value in zip(self._mu, friction, strict=True):
+            parameters[place] = value
+        return parameters
+
     def _friction(
         self, context: Context, state: FloatArray, force: FloatArray, parameters: FloatArray
-    ) -> "_Friction":
-        """What friction does where the state is another one."""
-        found = self._run(self.observation.friction, context, state, force, parameters)
-        forces, shares, speeds = (np.array(one) for one in found)
-        return _Friction(forces.reshape(len(self.observation.rows), -1), shares, speeds)
+    ) -> tuple[FloatArray, FloatArray]:
+        """The friction of coefficients of 1 in a state, and the speeds of sliding."""
+        forces, speeds = self._run(self.observation.friction, context, state, force, parameters)
+        return forces.reshape(len(self.observation.rows), -1).copy(), speeds.copy()
+
+    def _faster(self, state: FloatArray) -> FloatArray:
+        """The state in a motion that is so fast that friction is full."""
+        found, rows = state.copy(), list(self.observation.rows)
+        found[rows] *= _SHARP
+        return found
 
     def _wanted(self, context: Context, state: FloatArray, parameters: FloatArray) -> FloatArray:
         """The state with the velocities that the reference wants, as far as it is told."""
         function = self.observation.wanted
         if function is None or not self._reference.HasValue(context):
             return state
-        return self._run(function, context, state, self._reference.Eval(context), parameters)[0]
+        wanted, delay = self._reference.Eval(context), np.array([self._delay])
+        return self._run(function, context, state, wanted, delay, parameters)[0]
 
     def _run(
         self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
@@ -285,6 +282,18 @@ class DisturbanceObserver(ParameterizedSystem):
     def _calc_hold(self, context: Context, output: BasicVector) -> None:
         is_lost = bool(self._is_lost(self._ports[2].Eval(context)).any())
         output.SetFromVector([float(is_lost or self._is_limited(context))])
+
+    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
+        values = context.get_discrete_state(self._estimate).CopyToVector()
+        r, mu = np.split(values, [len(self.observation.rows)])
+        if mu.any():
+            x, force = self._ports[0].Eval(context), self._ports[2].Eval(context)
+            parameters = self._parameters(context, mu)
+            own, _ = self._friction(context, x, force, parameters)
+            goal = self._faster(self._wanted(context, x, parameters))
+            wanted, _ = self._friction(context, goal, force, parameters)
+            r += (wanted - own) @ mu
+        output.SetFromVector(values[self._order])
 
     def _copy(self, places: list[int], context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._estimate).value()[places])

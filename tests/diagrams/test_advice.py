@@ -43,9 +43,11 @@ def test_what_is_left_out_is_advised_and_told():
     wanted = contact_gains(1e5, mobility, 1e-3, 1)
     run = completed.scenario
     assert run.integral == ["tool.z", "wall.force"]
-    assert run.gains.outputs["*"] == [pytest.approx(wanted.position_pole, rel=1e-2)]
+    assert run.gains.outputs["tool.z"] == pytest.approx(wanted.position_gains(3), rel=1e-2)
+    assert run.gains.outputs["wall.force"] == [pytest.approx(wanted.force_gain, rel=1e-2)]
     assert run.constraint_damping.all == [pytest.approx(-wanted.constraint_damping, rel=1e-2)]
     assert run.observer.rate == pytest.approx(wanted.observer_rate, rel=1e-2)
+    assert run.observer.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
     assert run.force == parts.MeasuredForce(sample_period=1e-3)
     assert loop.observer is not None
     assert loop.observer.friction_signals[0].name == "wall.friction"

@@ -38,6 +38,7 @@ from drake_dae import (
     simulate,
     with_disturbance,
 )
+from drake_dae.dae.disturbance import beside, shares
 from drake_dae.errors import ModelError, WiringError
 
 T, RATE, MASS = 0.01, 8.0, 2.5
@@ -199,12 +200,24 @@ def test_friction_stays_between_zero_and_its_limit():
     assert record["friction"].min() >= 0.0
 
 
-def test_friction_stands_still_where_nothing_slides():
-    """What holds the arm still then is a disturbance, and no coefficient."""
-    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
-    _, record = slide(wanted, 0.3, Observing(20.0), change={"link2.mass": 5.0})
+@pytest.mark.parametrize("rate", [None, 5.0])
+def test_friction_stands_still_where_nothing_slides(rate):
+    """A reaction holds the arm still then; what is found is what the wall answers, at its own rate.
+
+    With t the joint velocities along the wall, t . r = 0: no part of r moves the tool.
+    """
+    wanted, duration = [ConstantReference(0.3), ConstantReference(20.0)], 0.3
+    observing = Observing(20.0, force_rate=rate)
+    _, record = slide(wanted, duration, observing, change={"link2.mass": 5.0})
     assert np.all(record["friction"] == 0.0)
-    assert np.abs(record["disturbance"][-1]).max() > 1.0
+    times, found = at_samples(record, "disturbance", 1e-3)
+    n = numbers("two_link", *np.split(record["state"][-1], 2))
+    along = np.array([n.constraint_jacobian[0, 1], -n.constraint_jacobian[0, 0]])
+    assert_allclose(found[-1] @ along, 0.0, atol=0.02 * np.linalg.norm(found[-1] * along))
+    grown = -np.expm1(-(rate or 20.0) * np.array([0.1, 0.29]))
+    sizes = np.linalg.norm(found[np.searchsorted(times, [0.1, 0.29])], axis=1)
+    assert sizes[1] > 0.4 * grown[1]
+    assert_allclose(sizes[1] / sizes[0], grown[1] / grown[0], rtol=0.1)
 
 
 def test_handing_over_to_friction_moves_nothing():
@@ -215,24 +228,28 @@ def test_handing_over_to_friction_moves_nothing():
 
 
 def test_wanted_velocities_are_those_of_the_reference_on_the_constraints():
-    """v of P v = r', J v = 0, with P and J of the tool by MultibodyPlant."""
+    """v of P v = r' + t r'', J v = 0, with P and J of the tool by MultibodyPlant; t = 20 ms."""
     _, dae = rubbing(0.3)
     law = TrackingLaw(dae, poles(-4.0))
     observation = DisturbanceObserver(law, Observing(5.0), T).observation
     state = law.structure.states[0]
     reference = np.array([0.3, 0.25, 0.1, 20.0])
-    found = observation.wanted(state, reference, dae.parameter_values)[0]
+    found = observation.wanted(state, reference, [0.02], dae.parameter_values)[0]
     n = numbers("two_link", *np.split(state, 2))
     rows = np.vstack([n.output_jacobian, n.constraint_jacobian])
     assert_allclose(found[:2], state[:2], rtol=1e-15)
-    assert_allclose(rows @ found[2:], [0.25, 0.0], atol=1e-12)
+    assert_allclose(rows @ found[2:], [0.252, 0.0], atol=1e-12)
 
 
-def test_friction_is_cancelled_against_the_motion_that_is_wanted():
-    """At rest, where up is wanted: -mu lambda P^T, with P by MultibodyPlant; v_s is 1 mm/s."""
+@pytest.mark.parametrize("velocity", [0.25, -0.005])
+def test_friction_is_cancelled_against_the_motion_that_is_wanted_when_the_control_acts(velocity):
+    """At rest, where up is wanted in 20 ms: -mu lambda P^T, with P by MultibodyPlant; v_s = 1 mm/s.
+
+    r' = -5 mm/s turns by then, with r'' = 1 m/s^2, to 15 mm/s, at which friction is nearly full.
+    """
     _, dae = rubbing(0.3)
     law = TrackingLaw(dae, poles(-4.0))
-    observer = DisturbanceObserver(law, Observing(5.0), T)
+    observer = DisturbanceObserver(law, Observing(5.0), T, control_delay=0.02)
     state = law.structure.states[0]
     state = np.array([*state[:2], 0.0, 0.0])
     context = observer.CreateDefaultContext()
@@ -241,10 +258,9 @@ def test_friction_is_cancelled_against_the_motion_that_is_wanted():
         ("estimated_state", state),
         ("control", np.zeros(2)),
         ("measured_force", [20.0]),
-        ("reference", [0.3, 0.25, 0.0, 20.0]),
+        ("reference", [0.3, velocity, 1.0, 20.0]),
     ):
         observer.GetInputPort(name).FixValue(context, value)
-    Simulator(observer, context).AdvanceTo(T / 2.0)
     n = numbers("two_link", *np.split(state, 2))
     told = observer.GetOutputPort("exogenous").Eval(context)
     names = [signal.name for signal in dae.exogenous.signals]
@@ -252,6 +268,55 @@ def test_friction_is_cancelled_against_the_motion_that_is_wanted():
     assert told[0] == 0.4
     assert_allclose(told[1:], -0.4 * 20.0 * n.output_jacobian[0], rtol=1e-4)
     assert_allclose(observer.GetOutputPort("disturbance").Eval(context), 0.0)
+
+
+def test_law_cancels_wanted_friction_whatever_velocity_it_has():
+    """mu c(x) of the law's model and what it is told beside it are mu c(x_w) for each x.
+
+    So noise of a velocity near 0, where friction is steep, makes no torque. With poles at -1e-6 the
+    law feeds no velocity back; what is left grows with its square.
+    """
+    _, dae = rubbing(0.3)
+    law = TrackingLaw(dae, poles(-1e-6))
+    observer = DisturbanceObserver(law, Observing(5.0), T)
+    reference, controls = np.array([0.3, 0.2, 0.0, 20.0]), []
+    for speed in (-1e-3, 0.0, 1e-3):
+        rest = law.structure.states[0][:2]
+        n = numbers("two_link", rest, np.zeros(2))
+        rows = np.vstack([n.output_jacobian, n.constraint_jacobian])
+        state = np.concatenate([rest, np.linalg.solve(rows, [speed, 0.0])])
+        context = observer.CreateDefaultContext()
+        observer.set_friction(context, 0.4)
+        for name, value in (
+            ("estimated_state", state),
+            ("measured_force", [20.0]),
+            ("reference", reference),
+        ):
+            observer.GetInputPort(name).FixValue(context, value)
+        told = observer.GetOutputPort("exogenous").Eval(context)
+        values = dae.parameter_values
+        values[dae.parameter_slice("wall.friction")] = told[0]
+        values[dae.parameter_slice("disturbance")] = told[1:]
+        controls.append(law.control(state, reference, parameters=values))
+    assert_allclose(controls[0], controls[1], atol=1e-3)
+    assert_allclose(controls[2], controls[1], atol=1e-3)
+
+
+def test_sharing_is_by_the_accelerations_that_forces_make():
+    """By a square root of W: the least squares of d on the columns, of which two are one."""
+    random = np.random.default_rng(0)
+    root = random.standard_normal((4, 4))
+    metric, d = root.T @ root, random.standard_normal(4)
+    column = random.standard_normal((4, 1))
+    wanted = np.linalg.lstsq(root @ column, root @ d, rcond=None)[0]
+    assert_allclose(shares(column, metric, d), wanted, rtol=1e-10)
+    other = random.standard_normal((4, 1))
+    planes = np.hstack([column, other, 2.0 * column])
+    left = beside(planes, metric, d)
+    assert_allclose(planes.T @ metric @ left, 0.0, atol=1e-10)
+    assert_allclose(np.cross((d - left)[:3], column[:3, 0]) @ other[:3, 0], 0.0, atol=1e-8)
+    assert_allclose(beside(0.0 * planes, metric, d), d)
+    assert_allclose(shares(0.0 * column, metric, d), 0.0)
 
 
 def test_law_without_a_disturbance_is_that_of_the_system():
@@ -287,8 +352,12 @@ def test_what_cannot_be_observed_is_refused():
     law = TrackingLaw(dae, poles(-4.0))
     with pytest.raises(ModelError, match="control_lag must be from 0 to 1"):
         DisturbanceObserver(law, Observing(5.0), T, 2.0)
+    with pytest.raises(ModelError, match="control_delay must be 0 s or more"):
+        DisturbanceObserver(law, Observing(5.0), T, 0.5, -1.0)
     with pytest.raises(ModelError, match="rate must be positive"):
         Observing(-5.0)
+    with pytest.raises(ModelError, match="force_rate must be positive"):
+        Observing(5.0, force_rate=0.0)
     wanted, plant = [ConstantReference(0.3), ConstantReference(20.0)], RobotPlant(model)
     with pytest.raises(WiringError, match="observes at samples"):
         make_closed_loop(plant, law, wanted, observer=Observing(5.0))
