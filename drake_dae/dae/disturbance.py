@@ -162,8 +162,9 @@ class Observation:
 def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
     """x with the velocities that the reference wants; None where it does not tell them."""
     system, layout = structure.system, Layout(structure.output_degrees)
-    steered = [int(i) for i in layout.dynamic]
-    if any(structure.output_degrees[i] != 2 for i in steered):
+    # Behind springs forces have a degree, too.
+    steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
+    if any(structure.output_degrees[i] < 2 for i in steered):
         return None
     reference = ca.SX.sym("R", layout.reference_size)
     kept = Layout(structure.constraint_degrees).ends.tolist()

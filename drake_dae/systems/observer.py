@@ -1,5 +1,6 @@
 """An observer of what a model lacks: a disturbance, and coefficients of friction."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, EventStatus, State
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, numbers, positive
 from drake_dae.dae.disturbance import DISTURBANCE, Observation
+from drake_dae.dae.lags import Lags
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import ModelError
@@ -68,18 +70,23 @@ class DisturbanceObserver(ParameterizedSystem):
     constant d is found as 1 - e^(-k_o t), and noise n of the velocities, with M the mass, leaves
     about k_o M n of noise in r.
 
+    Behind springs, motors or valves a law needs n derivatives of d, of which the differences of
+    d_k would be noise. There r is what n + 1 such lags leave, one behind the other, r =
+    (k_o / (s + k_o))^(n+1) d, which has them exactly; see `Lags`.
+
     A coefficient of friction takes the share that r has of the force of friction c = S^T dg/dmu v,
 
         mu' = k_f (c . r) / (c . c),    r' = k_o (d - r) - c mu',
 
     in the metric of kinetic energy, in the directions that the constraint leaves. So r + c mu
     follows what acts with the rate k_o, whatever k_f is, and no motion tells when the share is
-    handed over. Friction that is identified acts at once where the force or the direction changes;
-    r is late by 1 / k_o. mu stays between 0 and `largest_friction`, and stands still where the
-    contact slides by less than `least_speed`, or is pressed by less than `least_force`, since then
-    friction does not tell its coefficient; also while the input `hold` is not 0. r needs no hold:
-    it has the control that acts, also at its limits, and the force that is measured, also where a
-    contact is open.
+    handed over: nor do the derivatives that are told, r', r'', ... without the share and mu' = 0,
+    of whose errors c mu' and -c mu' the sum is zero. Friction that is identified acts at once where
+    the force or the direction changes; r is late by 1 / k_o. mu stays between 0 and
+    `largest_friction`, and stands still where the contact slides by less than `least_speed`, or is
+    pressed by less than `least_force`, since then friction does not tell its coefficient; also
+    while the input `hold` is not 0. r needs no hold: it has the control that acts, also at its
+    limits, and the force that is measured, also where a contact is open.
 
     Friction acts against the motion that the reference wants, c = c(x_w), where x_w is x with the
     velocities that follow from the reference and the constraints: where a motion turns or begins
@@ -97,8 +104,8 @@ class DisturbanceObserver(ParameterizedSystem):
         reference: R, as that of the controller; may be without a wire.
 
     Output ports:
-        exogenous: What to cancel, and mu, for the port of a `TrackingController` with the same
-            law, in the order of its system's.
+        exogenous: What to cancel, and mu, each with the derivatives that the law needs, for the
+            port of a `TrackingController` with the same law, in the order of its system's.
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
         hold: 1 while the input `hold` is not 0 or a contact that rubs is lost, else 0, shape (1,):
@@ -107,8 +114,7 @@ class DisturbanceObserver(ParameterizedSystem):
     All but the last are held between samples; r starts at 0, and mu at the model's coefficients.
 
     Args:
-        law: The law, for a system that `with_disturbance` made; with rigid joints, where it needs
-            no derivative of a disturbance.
+        law: The law, for a system that `with_disturbance` made.
         observing: The rates, and when friction is believed.
         sample_period: T in s.
         control_lag: For which part of T the plant goes on with the control that the port had at a
@@ -120,8 +126,7 @@ class DisturbanceObserver(ParameterizedSystem):
         disturbance_signals, friction_signals: Names and units of the output ports.
 
     Raises:
-        ModelError: The law's system has no disturbance; the law needs derivatives of it, as behind
-            springs; or a number makes no sense.
+        ModelError: The law's system has no disturbance, or a number makes no sense.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -146,23 +151,15 @@ class DisturbanceObserver(ParameterizedSystem):
             raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
         self._lag = control_lag
         self.observation = found = Observation.of(law.structure)
-        if any(law.exogenous_degrees):
-            raise ModelError(
-                f"{system.name}: the law needs {max(law.exogenous_degrees)} derivatives of a "
-                "disturbance, which here acts through springs, motors or valves, and an observer "
-                "gives none; take rigid joints, or integral action"
-            )
         size, names = len(found.rows), list(found.frictions)
+        self._lags = Lags.of(observing.rate, sample_period, max(law.exogenous_degrees))
         self.disturbance_signals = tuple(
             Signal(f"disturbance of {system.state_signals[i].name}") for i in found.rows
         )
         self.friction_signals = tuple(Signal(name) for name in names)
         self._mu = [system.parameter_slice(name) for name in names]
         self._contacts = list(found.frictions.values())
-        last = size + len(names)
-        places = {DISTURBANCE: list(range(last, last + size))}
-        places |= {name: [size + j] for j, name in enumerate(names)}
-        self._order = [place for p in system.exogenous.moving for place in places[p.name]]
+        self._order = self._told(names, law.exogenous_degrees)
         self._ports = [
             self.DeclareVectorInputPort("estimated_state", system.num_states),
             self.DeclareVectorInputPort("control", system.num_controls),
@@ -170,10 +167,12 @@ class DisturbanceObserver(ParameterizedSystem):
         ]
         self._hold = self.DeclareVectorInputPort("hold", 1)
         self._reference = self.DeclareVectorInputPort("reference", law.layout.reference_size)
-        # r, mu, and what is to cancel; then, of the sample before, p, its rate without inputs, u.
+        # r, mu, what is to cancel, its derivatives, 0, and what r lags behind; then, of the sample
+        # before, p, its rate without inputs, u.
         start = [system.parameter_values[place] for place in self._mu]
+        count = self._lags.degree * size
         self._estimate = self.DeclareDiscreteState(
-            np.concatenate([np.zeros(size), *start, np.zeros(size)])
+            np.concatenate([np.zeros(size), *start, np.zeros(size + count + 1 + count)])
         )
         self._before = self.DeclareDiscreteState(np.full(2 * size + system.num_controls, np.nan))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
@@ -193,6 +192,21 @@ class DisturbanceObserver(ParameterizedSystem):
             weakly(self._calc_hold),
             {self.input_port_ticket(port.get_index()) for port in ports},
         )
+
+    def _told(self, names: Sequence[str], degrees: Sequence[int]) -> list[int]:
+        """Where the estimate has what the port `exogenous` tells."""
+        size = len(self.observation.rows)
+        last, following = size + len(names), 2 * size + len(names)
+        still = following + self._lags.degree * size
+        heads = {DISTURBANCE: list(range(last, last + size))}
+        heads |= {name: [size + j] for j, name in enumerate(names)}
+        order, left = list[int](), iter(degrees)
+        for p in self.dae.exogenous.moving:
+            for i, head in enumerate(heads[p.name]):
+                of_d = [following + j * size + i for j in range(self._lags.degree)]
+                known = of_d if p.name == DISTURBANCE else [still] * self._lags.degree
+                order += [head, *known[: next(left)]]
+        return order
 
     def set_friction(self, context: Context, friction: ArrayLike) -> None:
         """Starts the coefficients of friction at values, shape (c,), or a number for all.
@@ -217,7 +231,10 @@ class DisturbanceObserver(ParameterizedSystem):
         size = len(observation.rows)
         x, u, force = (port.Eval(context) for port in self._ports)
         estimate = context.get_discrete_state(self._estimate).CopyToVector()
-        r, mu, cancelled = np.split(estimate, [size, size + len(self._mu)])
+        head, count = 2 * size + len(self._mu), self._lags.degree * size
+        parts = [size, size + len(self._mu), head, head + count, head + count + 1]
+        r, mu, cancelled, rates, _, lags = np.split(estimate, parts)
+        chain = np.vstack([lags.reshape(-1, size), r])
         parameters = context.get_numeric_parameter(0).CopyToVector()
         for place, value in zip(self._mu, mu, strict=True):
             parameters[place] = value
@@ -233,15 +250,17 @@ class DisturbanceObserver(ParameterizedSystem):
             turned = (wanted.forces - moved.forces) @ mu
         if not is_first:
             d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - turned
-            r += -np.expm1(-observing.rate * period) * (d - r)
+            chain = self._lags.after(chain, d)
         if mu.size and not self._is_limited(context):
             speeds = np.minimum(moved.speeds, wanted.speeds)
             is_sure = (speeds >= observing.least_speed) & ~self._is_lost(force)
-            step = -np.expm1(-observing.friction_rate * period) * (moved.shares @ r)
+            step = -np.expm1(-observing.friction_rate * period) * (moved.shares @ chain[-1])
             step = np.clip(mu + is_sure * step, 0.0, observing.largest_friction) - mu
             mu += step
-            r -= wanted.forces @ step
+            chain -= wanted.forces @ step
+        lags[:], r[:] = chain[:-1].ravel(), chain[-1]
         cancelled[:] = r + turned
+        rates[:] = self._lags.derivatives(chain).ravel()
         discrete = state.get_mutable_discrete_state()
         discrete.set_value(self._estimate, estimate)
         discrete.set_value(self._before, np.concatenate([p, rate, u]))

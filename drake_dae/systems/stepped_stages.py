@@ -12,14 +12,11 @@ from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
-_GROWTH = 1e-5
+_GROWTH = 1e-7
 """By how much more than 1 a step may multiply what swings: round-off of motions without a force."""
 
-_SHORTER = 1.1
-"""By which factor a step is shortened until it is short enough."""
-
-_TRIES = 100
-"""How often: to a ten-thousandth of the step."""
+_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]
+"""The parts of a step that is too long of which one may be short enough."""
 
 
 class SteppedStages(LeafSystem):
@@ -164,13 +161,13 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
         f"a time_step of {time_step:g} s is too long for what drives the joints, which has motions "
         f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step) - 1.0:.2g}"
     )
-    for power in range(1, _TRIES):
-        shorter = float(f"{time_step / _SHORTER**power:.1e}")
+    for part in _SHORTER:
+        shorter = float(f"{part * time_step:.1e}")
         if growth(shorter) <= 1.0 + _GROWTH:
             raise ModelError(
                 f"{what}. Take {shorter:g} s or less; the law may keep its period with `sampling`"
             )
-    raise ModelError(f"{what}, and so would shorter ones; damp it more, or take an ideal plant")
+    raise ModelError(f"{what}, and so is one of {shorter:g} s; damp it, or take an ideal plant")
 
 
 def _linear(model: RobotModel, parameters: FloatArray) -> tuple[FloatArray, Booleans]:
