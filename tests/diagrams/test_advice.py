@@ -95,7 +95,9 @@ def test_gains_that_are_given_leave_all_else_as_it_was():
 
 def test_nothing_is_advised_behind_springs():
     found = two_link("actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]")
-    with pytest.raises(ScenarioError, match="gains: behind springs, .* nothing is advised") as told:
+    with pytest.raises(
+        ScenarioError, match=r"gains: behind springs, .* nothing is advised"
+    ) as told:
         build_completed(found)
     assert "wall_flexible_contact" in str(told.value)
 

@@ -24,7 +24,6 @@ from drake_dae import (
     DaePlant,
     DaeSystem,
     DisturbanceObserver,
-    FlexibleJoints,
     ForceSensor,
     Observing,
     RobotModel,
