@@ -10,6 +10,7 @@ from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.scenario import Scenario
+from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 
 _FORCE = 10.0
@@ -36,10 +37,21 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
 
     Returns:
         The scenario, the same where nothing is advised, and what was chosen in words.
+
+    Raises:
+        ScenarioError: Nothing is known to advise, since there are stages of actuation.
     """
     material = scenario.plant
     if not (scenario.is_advised and isinstance(material, ContactMaterial)):
         return Completed(scenario)
+    if model.stages:
+        raise ScenarioError(
+            (
+                "gains",
+                "behind springs, motors and valves nothing is advised for Drake's own contact; say "
+                "them, with integral and observer. The scenario wall_flexible_contact tells how",
+            )
+        )
     sampling = scenario.sampling
     period = material.time_step if sampling is None else sampling.period
     late = 0 if sampling is None else sampling.late_samples

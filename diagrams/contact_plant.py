@@ -25,9 +25,10 @@ from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.layout import Layout
 from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.diagrams.contact_checks import changed_parameters, check_model, check_same
 from drake_dae.diagrams.contact_material import ContactMaterial, ball_properties, surface_properties
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import frame_named
@@ -36,6 +37,7 @@ from drake_dae.simulation.constraint_forces import ConstraintLoads, own_values
 from drake_dae.systems.contact_forces import ContactForces
 from drake_dae.systems.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.pushes import AppliedPushes, Push
+from drake_dae.systems.stepped_stages import SteppedStages, check_step
 
 
 def _is_of_use(record: logging.LogRecord) -> bool:
@@ -55,24 +57,30 @@ class ContactPlant(Diagram):
     t_(n+1), for which it takes the control that it finds at t_n. The force is that of the step that
     led to t_n.
 
+    Stages of actuation step beside it, and drive its joints: see `SteppedStages`. Rotors that turn
+    with a stage do not turn with the links.
+
     Input port:
-        control: The torques and forces of the actuators, N m (N), shape (p,).
+        control: u, shape (p,): the torques and forces of the actuators, N m (N), or what drives the
+            last stage.
 
     Output ports:
-        state, link_state: x = (q, v), shape (n,).
+        state: x = (q, v), and the states of the stages; shape (n,).
+        link_state: (q, v), shape (nq + nv,).
+        joint_torque, and those of the stages, as `motor_state`: as of a `RobotPlant`.
         constraint_force, contact_force, constraint_residual, controlled_output: As of
             `ContactForces`.
         contact_results: Drake's.
         query_object: Drake's, of the scene with the contact geometry.
 
     Args:
-        model: The robot: rigid joints, and each constraint a `PointOnSurface` that stands still, on
-            a surface that has a `solid`.
+        model: The robot: each constraint a `PointOnSurface` that stands still, on a surface that
+            has a `solid`.
         add_robot: Adds the robot to a plant as it was added to the one that the model is made of.
         material: How it touches.
         structure: The structure of the model's system.
         parameters: Parameter name -> what the plant has otherwise: positions and friction of
-            surfaces, and masses of bodies.
+            surfaces, masses of bodies, and the numbers of stages.
         pushes: Forces on the robot that its law does not know.
 
     Attributes:
@@ -81,7 +89,8 @@ class ContactPlant(Diagram):
         contact_force_signals: Names and units of `contact_force`.
 
     Raises:
-        ModelError: The robot cannot touch in this way; why.
+        ModelError: The robot cannot touch in this way, or the step is too long for its stages;
+            why.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -97,11 +106,13 @@ class ContactPlant(Diagram):
         pushes: Sequence[Push] = (),
     ) -> None:
         super().__init__()
-        _check_model(model)
+        check_model(model)
         self.model, self.dae, self.structure = model, model.dae, structure
         self.time_step = material.time_step
         self.exogenous_layout, self.exogenous_places = Layout(()), list[int]()
-        self._values = _changed(model, parameters or {})
+        self._values = changed_parameters(model, parameters or {})
+        if model.stages:
+            check_step(model, material.time_step, self._values)
         logging.getLogger("drake").addFilter(_is_of_use)
         builder = DiagramBuilder()
         config = MultibodyPlantConfig(
@@ -110,9 +121,12 @@ class ContactPlant(Diagram):
         plant, scene_graph = AddMultibodyPlant(config, builder)
         self.multibody = plant
         add_robot(plant, scene_graph)
+        if any(stage.carries_rotors for stage in model.stages):
+            for index in plant.GetJointActuatorIndices():
+                plant.get_mutable_joint_actuator(index).set_default_rotor_inertia(0.0)
         pairs = self._add_contacts(plant, scene_graph, material)
         plant.Finalize()
-        _check_same(plant, model)
+        check_same(plant, model)
         self._masses = self._other_masses()
         if pushes:
             frames = [frame_named(plant, push.frame) for push in pushes]
@@ -122,12 +136,24 @@ class ContactPlant(Diagram):
 
         forces = builder.AddSystem(ContactForces(model, structure, pairs, self._values))
         self.contact_force_signals = forces.contact_force_signals
-        builder.Connect(plant.get_state_output_port(), forces.GetInputPort("state"))
         results = plant.get_contact_results_output_port()
         builder.Connect(results, forces.GetInputPort("contact_results"))
-        builder.ExportInput(plant.get_actuation_input_port(), "control")
-        for name in ("state", "link_state"):
-            builder.ExportOutput(plant.get_state_output_port(), name)
+        links = state = plant.get_state_output_port()
+        self._stages = None
+        if model.stages:
+            stages = builder.AddSystem(SteppedStages(model, self.time_step, self._values))
+            self._stages, state = stages, stages.GetOutputPort("state")
+            builder.Connect(links, stages.GetInputPort("link_state"))
+            torque = stages.GetOutputPort("joint_torque")
+            builder.Connect(torque, plant.get_actuation_input_port())
+            builder.ExportInput(stages.GetInputPort("control"), "control")
+            for name in ("joint_torque", *stages.stage_ports):
+                builder.ExportOutput(stages.GetOutputPort(name), name)
+        else:
+            builder.ExportInput(plant.get_actuation_input_port(), "control")
+        builder.Connect(state, forces.GetInputPort("state"))
+        builder.ExportOutput(state, "state")
+        builder.ExportOutput(links, "link_state")
         for name in (
             "constraint_force",
             "contact_force",
@@ -149,7 +175,7 @@ class ContactPlant(Diagram):
             self.model.constraints, self._balls(plant, material.radius), strict=True
         ):
             solid = constraint.solid(own_values(constraint, self.dae, self._values))
-            assert solid is not None  # _check_model.
+            assert solid is not None  # check_model.
             friction = material.friction
             if friction is None:
                 name = constraint.friction_parameter
@@ -181,10 +207,10 @@ class ContactPlant(Diagram):
     def _balls(self, plant: MultibodyPlant, radius: float) -> list[tuple[Frame, FloatArray]]:
         """The frame of the robot that each constraint holds, and where in it the ball stands."""
         model, values, drawn = self.model, self._values, self.model.links.plant
-        assert drawn is not None  # _check_model.
+        assert drawn is not None  # check_model.
         state = self.structure.manifold.project(self.dae.nominal_state, values)
         context = drawn.CreateDefaultContext()
-        drawn.SetPositionsAndVelocities(context, state)
+        drawn.SetPositionsAndVelocities(context, state[: drawn.num_multibody_states()])
         loads = ConstraintLoads(model, values)
         # A unit of force shows the normal, where nothing rubs.
         state[model.links.q.numel() :] = 0.0
@@ -203,7 +229,7 @@ class ContactPlant(Diagram):
     def _other_masses(self) -> list[tuple[RigidBody, float]]:
         """The bodies with another mass than in the model, each with its own."""
         drawn = self.model.links.plant
-        assert drawn is not None  # _check_model.
+        assert drawn is not None  # check_model.
         bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
         found = []
         with_mass = (body for body in bodies if body.default_mass() > 0.0)
@@ -224,7 +250,11 @@ class ContactPlant(Diagram):
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         own = self.GetSubsystemContext(self.multibody, context)
-        return np.array(self.multibody.GetPositionsAndVelocities(own))
+        links = np.array(self.multibody.GetPositionsAndVelocities(own))
+        if self._stages is None:
+            return links
+        stages = self._stages.state(self.GetSubsystemContext(self._stages, context))
+        return np.concatenate([links, stages])
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -237,66 +267,10 @@ class ContactPlant(Diagram):
         """
         state = self.structure.manifold.settle(guess, self._values)
         own = self.GetMutableSubsystemContext(self.multibody, context)
-        self.multibody.SetPositionsAndVelocities(own, state)
+        links, stages = np.split(state, [self.multibody.num_multibody_states()])
+        self.multibody.SetPositionsAndVelocities(own, links)
+        if self._stages is not None:
+            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
         for body, mass in self._masses:
             body.SetMass(own, mass)
         return state
-
-
-def _check_model(model: RobotModel) -> None:
-    """Refuses what Drake's contact cannot stand for."""
-    if model.links.plant is None:
-        raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
-    if model.stages:
-        raise ModelError("Drake's contact as the plant takes rigid joints; leave actuation out")
-    if model.dae.exogenous or model.loads:
-        raise ModelError(
-            "Drake's contact as the plant takes no exogenous signals and no loads; forces that the "
-            "law does not know are pushes (plant_pushes)"
-        )
-    if not model.constraints:
-        raise ModelError("the robot has no constraints, so there is nothing to touch")
-    for constraint in model.constraints:
-        values = own_values(constraint, model.dae, model.dae.parameter_values)
-        if constraint.solid(values) is None:
-            raise ModelError(
-                f"'{constraint.name}' is no contact with a solid: take a PointOnSurface on a "
-                "Plane, or on the outside of a Sphere, or an ideal plant"
-            )
-
-
-def _changed(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
-    """The values of all parameters, those of what the robot touches as a plant has them."""
-    values = model.dae.parameter_values
-    own = [parameter for constraint in model.constraints for parameter in constraint.parameters]
-    own += model.links.parameters
-    known = {parameter.name: parameter for parameter in own}
-    for name, value in parameters.items():
-        if name not in known:
-            raise ModelError(
-                f"of Drake's contact as the plant {unknown_name('parameter', name, known)}; give "
-                "the law's model others instead"
-            )
-        given = numbers(f"parameter '{name}'", value)
-        if given.shape not in ((), known[name].value.shape):
-            raise ModelError(
-                f"parameter '{name}' has {known[name].value.size} entries, got {value!r}"
-            )
-        values[model.dae.parameter_slice(name)] = given
-        known[name].check(values[model.dae.parameter_slice(name)])
-    return values
-
-
-def _check_same(plant: MultibodyPlant, model: RobotModel) -> None:
-    """Refuses another robot than that of the model."""
-    drawn = model.links.plant
-    assert drawn is not None  # _check_model.
-    own, other = (
-        (one.GetPositionNames(), one.GetVelocityNames(), one.GetActuatorNames())
-        for one in (plant, drawn)
-    )
-    if own != other:
-        raise ModelError(
-            f"add_robot must add the robot of the model, with positions {', '.join(other[0])}; it "
-            f"has {', '.join(own[0]) or 'none'}"
-        )

@@ -43,7 +43,7 @@ def add_observer(
 
     Raises:
         WiringError: There are no samples to observe at, or the law takes no measured force.
-        ModelError: The law has no disturbance, or lies behind springs, motors or valves.
+        ModelError: The law has no disturbance.
     """
     step = plant.time_step
     period = step if sampling is None else sampling.period
@@ -83,12 +83,6 @@ def observed_structure(scenario: Scenario, model: RobotModel, structure: Structu
     with at("observer"):
         if scenario.exogenous:
             raise ModelError("not beside exogenous signals, whose port it feeds")
-        if model.stages:
-            raise ModelError(
-                "an observer takes rigid joints: behind springs, motors or valves the law needs "
-                "derivatives of a disturbance. Leave it out, and integrate the errors of the "
-                "outputs (integral)"
-            )
         rubbing = {c.name: c.friction_parameter for c in model.constraints if c.friction_parameter}
         for name in observer.friction:
             if name not in rubbing:

@@ -186,7 +186,8 @@ class Scenario:
         gains: The gains of the tracking law (28). Where left out: poles at -4 1/s with ideal
             constraints; in Drake's own contact they are advised, with what is left out of
             `integral`, `constraint_damping` and `observer`, and with measured force; see
-            `contact_gains`. The scenario as run has them all.
+            `contact_gains`. The scenario as run has them all. With `actuation` nothing is advised
+            there.
         integral: Names of outputs whose errors are integrated as well, which take a pole more:
             positions, and forces where `force` is measured; none where left out beside `gains`.
         constraint_damping: What the law's model demands of constraints that give way, written as

@@ -182,30 +182,31 @@ def shares(forces: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
     Args:
         forces: The forces as columns, shape (k, c).
         metric: W, shape (k, k).
-        d: What is shared, shape (k,).
+        d: What is shared, shape (k,), or as columns.
     """
     matched = metric @ forces
     return np.asarray(d @ matched / np.maximum(np.sum(forces * matched, axis=0), _TINY))
 
 
 def beside(planes: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
-    """What is left of d beside all T y, by the accelerations that they make, shape (k,).
+    """What is left of d beside all T y, by the accelerations that they make, in its shape.
 
     Args:
         planes: T, shape (k, j), of any rank.
         metric: W, shape (k, k).
-        d: What is shared, shape (k,).
+        d: What is shared, shape (k,), or as columns.
     """
     matched = metric @ planes
-    found = np.linalg.lstsq(planes.T @ matched, d @ matched, rcond=_FLAT)[0]
+    found = np.linalg.lstsq(planes.T @ matched, matched.T @ d, rcond=_FLAT)[0]
     return np.asarray(d - planes @ found)
 
 
 def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
     """x with the velocities that the reference wants then; None where it does not tell them."""
     system, layout = structure.system, Layout(structure.output_degrees)
-    steered = [int(i) for i in layout.dynamic]
-    if any(structure.output_degrees[i] != 2 for i in steered):
+    # Behind springs forces have a degree, too.
+    steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
+    if any(structure.output_degrees[i] < 2 for i in steered):
         return None
     reference = ca.SX.sym("R", layout.reference_size)
     kept = Layout(structure.constraint_degrees).ends.tolist()

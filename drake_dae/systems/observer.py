@@ -1,5 +1,7 @@
 """An observer of what a model lacks: a disturbance, and coefficients of friction."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, EventStatus, State
@@ -7,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, EventStatus, State
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, numbers, positive
 from drake_dae.dae.disturbance import DISTURBANCE, Observation, beside, shares
+from drake_dae.dae.lags import Lags
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import ModelError
@@ -34,17 +37,22 @@ class DisturbanceObserver(ParameterizedSystem):
     about k_o M n of noise in r. That part of d which the constraints answer, d - Q d, is found with
     the rate k_n = `force_rate`: it makes no motion, but its noise makes force.
 
+    Behind springs, motors or valves a law needs n derivatives of d, of which the differences of
+    d_k would be noise. There r is what n + 1 such lags leave, one behind the other, r =
+    (k_o / (s + k_o))^(n+1) d, which has them exactly; see `Lags`.
+
     A coefficient of friction takes the share that r has of the force of friction c = S^T dg/dmu v,
 
         mu' = k_f (c . r) / (c . c),    r' = k_o (d - r) - c mu',
 
     in the metric of kinetic energy, in the directions that the constraint leaves. So r + c mu
     follows what acts with the rate k_o, whatever k_f is, and no motion tells when the share is
-    handed over. Friction that is identified acts at once where the force or the direction changes;
-    r is late by 1 / k_o. mu stays between 0 and `largest_friction`, and stands still where the
-    contact is pressed by less than `least_force`; also while the input `hold` is not 0. r needs no
-    hold: it has the control that acts, also at its limits, and the force that is measured, also
-    where a contact is open.
+    handed over: nor do the derivatives that are told, r', r'', ... without the share and mu' = 0,
+    of whose errors c mu' and -c mu' the sum is zero. Friction that is identified acts at once where
+    the force or the direction changes; r is late by 1 / k_o. mu stays between 0 and
+    `largest_friction`, and stands still where the contact is pressed by less than `least_force`;
+    also while the input `hold` is not 0. r needs no hold: it has the control that acts, also at its
+    limits, and the force that is measured, also where a contact is open.
 
     Below `least_speed` a contact may stick, and its friction is a reaction like the constraint's:
     no motion tells it, nor its coefficient. Then mu stands still, and so does r in the directions
@@ -69,8 +77,8 @@ class DisturbanceObserver(ParameterizedSystem):
         reference: R, as that of the controller; may be without a wire.
 
     Output ports:
-        exogenous: What to cancel, and mu, for the port of a `TrackingController` with the same
-            law, in the order of its system's.
+        exogenous: What to cancel, and mu, each with the derivatives that the law needs, for the
+            port of a `TrackingController` with the same law, in the order of its system's.
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
         hold: 1 while the input `hold` is not 0 or a contact that rubs is lost, else 0, shape (1,):
@@ -80,8 +88,7 @@ class DisturbanceObserver(ParameterizedSystem):
     coefficients.
 
     Args:
-        law: The law, for a system that `with_disturbance` made; with rigid joints, where it needs
-            no derivative of a disturbance.
+        law: The law, for a system that `with_disturbance` made.
         observing: The rates, and when friction is believed.
         sample_period: T in s.
         control_lag: For which part of T the plant goes on with the control that the port had at a
@@ -95,8 +102,7 @@ class DisturbanceObserver(ParameterizedSystem):
         disturbance_signals, friction_signals: Names and units of the output ports.
 
     Raises:
-        ModelError: The law's system has no disturbance; the law needs derivatives of it, as behind
-            springs; or a number makes no sense.
+        ModelError: The law's system has no disturbance, or a number makes no sense.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -124,22 +130,18 @@ class DisturbanceObserver(ParameterizedSystem):
             raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
         self._lag, self._delay = control_lag, control_delay
         self.observation = found = Observation.of(law.structure)
-        if any(law.exogenous_degrees):
-            raise ModelError(
-                f"{system.name}: the law needs {max(law.exogenous_degrees)} derivatives of a "
-                "disturbance, which here acts through springs, motors or valves, and an observer "
-                "gives none; take rigid joints, or integral action"
-            )
         size, names = len(found.rows), list(found.frictions)
+        rates = observing.rate, observing.force_rate or observing.rate
+        self._lags, self._force_lags = (
+            Lags.of(rate, sample_period, max(law.exogenous_degrees)) for rate in rates
+        )
         self.disturbance_signals = tuple(
             Signal(f"disturbance of {system.state_signals[i].name}") for i in found.rows
         )
         self.friction_signals = tuple(Signal(name) for name in names)
         self._mu = [system.parameter_slice(name) for name in names]
         self._contacts = list(found.frictions.values())
-        places = {DISTURBANCE: list(range(size))}
-        places |= {name: [size + j] for j, name in enumerate(names)}
-        self._order = [place for p in system.exogenous.moving for place in places[p.name]]
+        self._order = self._told(names, law.exogenous_degrees)
         self._ports = [
             self.DeclareVectorInputPort("estimated_state", system.num_states),
             self.DeclareVectorInputPort("control", system.num_controls),
@@ -147,9 +149,13 @@ class DisturbanceObserver(ParameterizedSystem):
         ]
         self._hold = self.DeclareVectorInputPort("hold", 1)
         self._reference = self.DeclareVectorInputPort("reference", law.layout.reference_size)
-        # r, mu; then, of the sample before, p, its rate without inputs, u.
+        # r, mu, the derivatives of r, 0, and what r lags behind; then, of the sample before, p, its
+        # rate without inputs, u.
         start = [system.parameter_values[place] for place in self._mu]
-        self._estimate = self.DeclareDiscreteState(np.concatenate([np.zeros(size), *start]))
+        count = self._lags.degree * size
+        self._estimate = self.DeclareDiscreteState(
+            np.concatenate([np.zeros(size), *start, np.zeros(count + 1 + count)])
+        )
         self._before = self.DeclareDiscreteState(np.full(2 * size + system.num_controls, np.nan))
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
@@ -175,6 +181,21 @@ class DisturbanceObserver(ParameterizedSystem):
             {self.input_port_ticket(port.get_index()) for port in ports},
         )
 
+    def _told(self, names: Sequence[str], degrees: Sequence[int]) -> list[int]:
+        """Where the estimate has what the port `exogenous` tells."""
+        size = len(self.observation.rows)
+        following = size + len(names)
+        still = following + self._lags.degree * size
+        heads = {DISTURBANCE: list(range(size))}
+        heads |= {name: [size + j] for j, name in enumerate(names)}
+        order, left = list[int](), iter(degrees)
+        for p in self.dae.exogenous.moving:
+            for i, head in enumerate(heads[p.name]):
+                of_d = [following + j * size + i for j in range(self._lags.degree)]
+                known = of_d if p.name == DISTURBANCE else [still] * self._lags.degree
+                order += [head, *known[: next(left)]]
+        return order
+
     def set_friction(self, context: Context, friction: ArrayLike) -> None:
         """Starts the coefficients of friction at values, shape (c,), or a number for all.
 
@@ -198,7 +219,10 @@ class DisturbanceObserver(ParameterizedSystem):
         size = len(observation.rows)
         x, u, force = (port.Eval(context) for port in self._ports)
         estimate = context.get_discrete_state(self._estimate).CopyToVector()
-        r, mu = np.split(estimate, [size])
+        count = self._lags.degree * size
+        head = size + len(self._mu)
+        r, mu, rates, _, lags = np.split(estimate, [size, head, head + count, head + count + 1])
+        chain = np.vstack([lags.reshape(-1, size), r])
         parameters = self._parameters(context, 0.0 * mu)
         before = context.get_discrete_state(self._before).CopyToVector()
         p_0, rate_0, u_0 = np.split(before, [size, 2 * size])
@@ -209,23 +233,25 @@ class DisturbanceObserver(ParameterizedSystem):
         is_slow, is_lost = speeds < _SHARP * observing.least_speed, self._is_lost(force)
         found = self._run(observation.directions, context, x, force, parameters)
         metric, free, planes = (one.reshape((size, -1), order="F").copy() for one in found)
-        step = np.zeros(size)
+        step = np.zeros(chain.shape)
         if not is_first:
             d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu
-            moves = free @ (d - r)
-            rates = np.array([observing.rate, observing.force_rate or observing.rate])
-            fast, slow = -np.expm1(-rates * period)
-            step = fast * moves + slow * (d - r - moves)
+            fast, slow = (one.after(chain, d) - chain for one in (self._lags, self._force_lags))
+            step = slow + (fast - slow) @ free.T
         sticks = is_slow & ~is_lost
         if sticks.any():
-            step = beside(planes[:, np.repeat(sticks, size)], metric, step)
-        r += step
+            step = beside(planes[:, np.repeat(sticks, size)], metric, step.T).T
+        chain += step
         if mu.size and not self._is_limited(context):
             is_sure = ~(is_slow | is_lost)
-            part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, r)
+            part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, chain[-1])
             change = np.clip(mu + is_sure * part, 0.0, observing.largest_friction) - mu
             mu += change
-            r -= rubbing @ change
+            chain -= rubbing @ change
+        lags[:], r[:] = chain[:-1].ravel(), chain[-1]
+        moves = chain @ free.T
+        told = self._lags.derivatives(moves) + self._force_lags.derivatives(chain - moves)
+        rates[:] = told.ravel()
         discrete = state.get_mutable_discrete_state()
         discrete.set_value(self._estimate, estimate)
         discrete.set_value(self._before, np.concatenate([p, rate, u]))
@@ -285,7 +311,8 @@ class DisturbanceObserver(ParameterizedSystem):
 
     def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
         values = context.get_discrete_state(self._estimate).CopyToVector()
-        r, mu = np.split(values, [len(self.observation.rows)])
+        size = len(self.observation.rows)
+        r, mu, _ = np.split(values, [size, size + len(self._mu)])
         if mu.any():
             x, force = self._ports[0].Eval(context), self._ports[2].Eval(context)
             parameters = self._parameters(context, mu)

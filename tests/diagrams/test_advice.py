@@ -95,6 +95,15 @@ def test_gains_that_are_given_leave_all_else_as_it_was():
     assert found.observer is None
 
 
+def test_nothing_is_advised_behind_springs():
+    found = two_link("actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]")
+    with pytest.raises(
+        ScenarioError, match=r"gains: behind springs, .* nothing is advised"
+    ) as told:
+        build_completed(found)
+    assert "wall_flexible_contact" in str(told.value)
+
+
 def test_ideal_plants_are_not_advised():
     found = replace(two_link(), plant=parts.IdealConstraints())
     assert found.gains == parts.Poles(all=[-4.0])
@@ -139,15 +148,6 @@ def parameters(loop, wall):
         (["observer={rate: 5, friction: [wal]}"], "'wal' is no constraint with friction"),
         (["observer={rate: 5, friction: [wall]}"], "give it friction: 0.0"),
         (["observer={rate: 5}", "gains={all: [-9]}"], "needs the measured force"),
-        (
-            [
-                "observer={rate: 5}",
-                "plant=!IdealConstraints {}",
-                "force=!MeasuredForce {time_constant: 0.01}",
-                "actuation=[{stiffness: 8000, inertia: 0.5}]",
-            ],
-            "takes rigid joints",
-        ),
         (
             ["observer={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],
             "observes at samples",

@@ -22,6 +22,16 @@ class FlexibleJoints(Stage):
         M(q_1) q_1'' + H = J^T lambda + K_2 (q_2 - q_1) + D (q_2' - q_1'),
         M_2 q_2'' + K_2 (q_2 - q_1) + D (q_2' - q_1') = u.
 
+    A law that is late by tau (its delay, and half a sample) cancels the springs late as well. Of a
+    single joint, which swings freely with W_0^2 = K_2 (1 / M + 1 / M_2), two poles at -w and two at
+    -W are stable for 2 (W + w) (W^2 + 3 W w + w^2) > W_0^2 tau W w: four alike for
+    20 w > W_0^2 tau, faster ones beside slow ones from less on. And the law takes accelerations of
+    the links from its model. Where friction holds a tool, the model has one that is not there, for
+    which a'' + K_i4 a' + (K_i3 - kappa) a = 0, with the gains of (32) and the eigenvalues kappa of
+    P M^-1 K_2 M^-1 P^T (P M^-1 P^T)^-1 for the Jacobian P of what is held; so
+    K_i3 = W^2 + 4 W w + w^2 must be above kappa. Springs that are stiffer than samples allow are
+    better taken for rigid.
+
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4
     for positions and 2 for forces; 3 and 1 with damping. Damping leaves p zero dynamics, which the
     law does not move: K_2 d + D d' = tau for the deflections d, with the rates of D^-1 K_2. They

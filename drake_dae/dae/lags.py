@@ -1,0 +1,64 @@
+"""A filter that tells the derivatives of what it lets pass."""
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from scipy.linalg import expm
+
+from drake_dae.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Lags:
+    """n + 1 lags of the rate k, one behind the other, of a signal d that is held between samples:
+
+        s_0' = k (d - s_0),    s_j' = k (s_(j-1) - s_j),    r = s_n = (k / (s + k))^(n+1) d.
+
+    So r has n derivatives, r^(j) = k^j sum_i (-1)^(j-i) C(j, i) s_(n-i), which do not change where
+    all s change alike. A constant d is found as
+
+        r = d (1 - e^(-k t) (1 + k t + ... + (k t)^n / n!)),
+
+    and a ramp (n + 1) / k late.
+
+    Attributes:
+        rate: k in 1/s.
+        degree: n.
+        step, gain: s of the next sample is step s + gain d, shapes (n + 1, n + 1) and (n + 1,).
+        slopes: Rows that make r', ..., r^(n) of s, shape (n, n + 1).
+    """
+
+    rate: float
+    degree: int
+    step: FloatArray
+    gain: FloatArray
+    slopes: FloatArray
+
+    @classmethod
+    def of(cls, rate: float, period: float, degree: int) -> "Lags":
+        """The lags at samples.
+
+        Args:
+            rate: k in 1/s.
+            period: The time between samples, s.
+            degree: n, how many derivatives are told.
+        """
+        size = degree + 1
+        both = np.zeros((size + 1, size + 1))
+        both[:size, :size] = rate * (np.eye(size, k=-1) - np.eye(size))
+        both[0, size] = rate
+        found = expm(both * period)
+        slopes = np.zeros((degree, size))
+        for j in range(1, size):
+            for i in range(j + 1):
+                slopes[j - 1, degree - i] = rate**j * (-1) ** (j - i) * comb(j, i)
+        return cls(rate, degree, found[:size, :size], found[:size, size], slopes)
+
+    def after(self, lags: FloatArray, signal: FloatArray) -> FloatArray:
+        """s at the next sample, shape (n + 1, k), where it was `lags` and d is of shape (k,)."""
+        return np.asarray(self.step @ lags + np.outer(self.gain, signal))
+
+    def derivatives(self, lags: FloatArray) -> FloatArray:
+        """r', ..., r^(n), shape (n, k)."""
+        return np.asarray(self.slopes @ lags)
