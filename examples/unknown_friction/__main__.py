@@ -4,8 +4,8 @@
 
 Every row is a run of 6 s at 1 kHz with one sample of delay, with the gains that `contact_gains`
 advises (behind flexible joints with those of the scenario), and from a coefficient of friction of
-0; the figures are root mean squares after 2 s: the
-distance from the path, the force error, and how much the torques change from sample to sample.
+0; the figures are root mean squares after 2 s: the distance from the path, the force error, and how
+much the torques change from sample to sample.
 All have 2 s of motion to identify friction in, but "from rest to rest": that breaks away at 2.5 s
 for the first time. Beside them are the same law on the ideal plant, whose friction of 0.3 it does
 not know either, and the law of version 0.1 on points: poles at -8, and nothing else.
@@ -210,8 +210,11 @@ def figures(condition: Condition, duration: float = DURATION) -> Figures:
     error = (record["controlled_output"] - record["desired_output"])[late]
     places = [i for i, signal in enumerate(signals) if signal.unit == "m"]
     forces = [i for i, signal in enumerate(signals) if signal.unit == "N"]
-    stride = round(scenario.sampling.period / loop.plant.time_step)
-    steps = np.diff(record["control"][late][::stride], axis=0)
+    # A plant may step more often than the law samples.
+    times = record.time[late]
+    samples = np.arange(times[0], times[-1], scenario.sampling.period)
+    held = np.searchsorted(times, samples + 1e-9, side="right") - 1
+    steps = np.diff(record["control"][late][held], axis=0)
     found = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (error, steps)]
     distance, force = (
         float(np.sqrt(np.mean(np.sum(error[:, rows] ** 2, axis=1)))) for rows in (places, forces)
