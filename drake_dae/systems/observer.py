@@ -209,17 +209,15 @@ class DisturbanceObserver(ParameterizedSystem):
         is_slow, is_lost = speeds < _SHARP * observing.least_speed, self._is_lost(force)
         found = self._run(observation.directions, context, x, force, parameters)
         metric, free, planes = (one.reshape((size, -1), order="F").copy() for one in found)
-        step = np.zeros(size)
         if not is_first:
-            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu
-            moves = free @ (d - r)
+            left = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu - r
+            sticks = is_slow & ~is_lost
+            if sticks.any():
+                left = beside(planes[:, np.repeat(sticks, size)], metric, left)
+            moves = free @ left
             rates = np.array([observing.rate, observing.force_rate or observing.rate])
             fast, slow = -np.expm1(-rates * period)
-            step = fast * moves + slow * (d - r - moves)
-        sticks = is_slow & ~is_lost
-        if sticks.any():
-            step = beside(planes[:, np.repeat(sticks, size)], metric, step)
-        r += step
+            r += fast * moves + slow * (left - moves)
         if mu.size and not self._is_limited(context):
             is_sure = ~(is_slow | is_lost)
             part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, r)
