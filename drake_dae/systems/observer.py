@@ -233,15 +233,15 @@ class DisturbanceObserver(ParameterizedSystem):
         is_slow, is_lost = speeds < _SHARP * observing.least_speed, self._is_lost(force)
         found = self._run(observation.directions, context, x, force, parameters)
         metric, free, planes = (one.reshape((size, -1), order="F").copy() for one in found)
-        step = np.zeros(chain.shape)
         if not is_first:
             d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu
-            fast, slow = (one.after(chain, d) - chain for one in (self._lags, self._force_lags))
-            step = slow + (fast - slow) @ free.T
-        sticks = is_slow & ~is_lost
-        if sticks.any():
-            step = beside(planes[:, np.repeat(sticks, size)], metric, step.T).T
-        chain += step
+            steps = [one.after(chain, d) - chain for one in (self._lags, self._force_lags)]
+            sticks = is_slow & ~is_lost
+            if sticks.any():
+                held = planes[:, np.repeat(sticks, size)]
+                steps = [beside(held, metric, step.T).T for step in steps]
+            fast, slow = steps
+            chain += slow + (fast - slow) @ free.T
         if mu.size and not self._is_limited(context):
             is_sure = ~(is_slow | is_lost)
             part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, chain[-1])

@@ -199,24 +199,25 @@ def test_friction_stays_between_zero_and_its_limit():
     assert record["friction"].min() >= 0.0
 
 
-@pytest.mark.parametrize("rate", [None, 5.0])
-def test_friction_stands_still_where_nothing_slides(rate):
+def test_friction_stands_still_where_nothing_slides():
     """A reaction holds the arm still then; what is found is what the wall answers, at its own rate.
 
-    With t the joint velocities along the wall, t . r = 0: no part of r moves the tool.
+    With t the joint velocities along the wall, t . r = 0: no part of r moves the tool. What is
+    found of a constant load in 0.29 s is 1 - e^(-k_n t) of it, whatever k_n is; the rest is how the
+    arm comes to rest.
     """
-    wanted, duration = [ConstantReference(0.3), ConstantReference(20.0)], 0.3
-    observing = Observing(20.0, force_rate=rate)
-    _, record = slide(wanted, duration, observing, change={"link2.mass": 5.0})
-    assert np.all(record["friction"] == 0.0)
-    times, found = at_samples(record, "disturbance", 1e-3)
-    n = numbers("two_link", *np.split(record["state"][-1], 2))
-    along = np.array([n.constraint_jacobian[0, 1], -n.constraint_jacobian[0, 0]])
-    assert_allclose(found[-1] @ along, 0.0, atol=0.02 * np.linalg.norm(found[-1] * along))
-    grown = -np.expm1(-(rate or 20.0) * np.array([0.1, 0.29]))
-    sizes = np.linalg.norm(found[np.searchsorted(times, [0.1, 0.29])], axis=1)
-    assert sizes[1] > 0.4 * grown[1]
-    assert_allclose(sizes[1] / sizes[0], grown[1] / grown[0], rtol=0.1)
+    wanted, found = [ConstantReference(0.3), ConstantReference(20.0)], []
+    for rate in (None, 5.0):
+        observing = Observing(20.0, force_rate=rate)
+        _, record = slide(wanted, 0.3, observing, change={"link2.mass": 5.0})
+        assert np.all(record["friction"] == 0.0)
+        r = at_samples(record, "disturbance", 1e-3)[1][290]
+        n = numbers("two_link", *np.split(record["state"][-1], 2))
+        along = np.array([n.constraint_jacobian[0, 1], -n.constraint_jacobian[0, 0]])
+        assert_allclose(r @ along, 0.0, atol=0.02 * np.linalg.norm(r * along))
+        found.append(r / -np.expm1(-(rate or 20.0) * 0.29))
+    assert np.abs(found[0]).max() > 0.5
+    assert_allclose(found[1], found[0], rtol=0.1)
 
 
 def test_handing_over_to_friction_moves_nothing():
