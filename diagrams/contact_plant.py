@@ -256,6 +256,19 @@ class ContactPlant(Diagram):
         stages = self._stages.state(self.GetSubsystemContext(self._stages, context))
         return np.concatenate([links, stages])
 
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Sets the state x in a context, shape (n,), in contact or not.
+
+        Raises:
+            ModelError: The shape is wrong.
+        """
+        own = self.GetMutableSubsystemContext(self.multibody, context)
+        count = self.multibody.num_multibody_states()
+        links, stages = np.split(self.dae.state_vector(state), [count])
+        self.multibody.SetPositionsAndVelocities(own, links)
+        if self._stages is not None:
+            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
+
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
 
@@ -266,11 +279,8 @@ class ContactPlant(Diagram):
             InconsistentStateError: None is found near the guess.
         """
         state = self.structure.manifold.settle(guess, self._values)
+        self.set_state(context, state)
         own = self.GetMutableSubsystemContext(self.multibody, context)
-        links, stages = np.split(state, [self.multibody.num_multibody_states()])
-        self.multibody.SetPositionsAndVelocities(own, links)
-        if self._stages is not None:
-            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
         for body, mass in self._masses:
             body.SetMass(own, mass)
         return state

@@ -78,12 +78,7 @@ class TaskLoop:
             ModelError: The shape is wrong.
         """
         own = self.plant.GetMyMutableContextFromRoot(context)
-        x = self.plant.dae.state_vector(state)
-        if isinstance(self.plant, ContactPlant):
-            inner = self.plant.GetMutableSubsystemContext(self.plant.multibody, own)
-            self.plant.multibody.SetPositionsAndVelocities(inner, x)
-        else:
-            self.plant.set_state(own, x)
+        self.plant.set_state(own, state)
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
         """When each phase of a run began, and why."""

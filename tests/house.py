@@ -57,6 +57,7 @@ PAPER = (
     "constraint_damping",
     "contact_gains",
     "disturbance",
+    "lags",
     "references",
     "measured_force",
     "integral",
