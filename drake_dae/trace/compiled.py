@@ -51,8 +51,8 @@ FLAGS = (
 
 NATIVE = "-march=native"
 """All that the processor at hand can do. Where the older instructions of x86-64 meet the newer ones
-of libm and memcpy, a call takes a tenth longer, and at times twice as long. The values have the same
-bits."""
+of libm and memcpy, a call takes a tenth longer, and at times twice as long. The values have the
+same bits."""
 
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
 """Options of Python that make it a C compiler, where ziglang is installed. Code for any processor:

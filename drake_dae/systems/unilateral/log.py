@@ -21,6 +21,7 @@ class Log:
         time: When the step began that is being made, in s.
         gaps, rates: Those of all contacts then, in m and m/s; empty before a run.
         before: Time and state before the last reset.
+        waits: Whether the first step is to choose the mode, with the control that there is then.
     """
 
     events: list[ContactEvent] = field(default_factory=list)
@@ -28,6 +29,7 @@ class Log:
     gaps: FloatArray = field(default_factory=lambda: np.zeros(0))
     rates: FloatArray = field(default_factory=lambda: np.zeros(0))
     before: tuple[float, bytes] = (np.nan, b"")
+    waits: bool = False
 
 
 def clearance(log: Log, time: float, gaps: FloatArray, rates: FloatArray) -> FloatArray:

@@ -212,14 +212,23 @@ class UnilateralRobotPlant(ModalPorts):
                 f"'{self.contacts[deepest]}'; start outside",
                 gaps,
             )
-        status, log = self._reset(context, state), self._log(context)
+        log = self._log(context)
+        if np.isnan(self._control(context)).any():
+            # What is held between samples comes with this event: the first step begins with it.
+            log.waits = True
+            closed = self._resets.resting(x, values)
+            state.get_mutable_discrete_state().set_value(numbers_of(closed))
+            self._begin_step(context, x, values)
+            return EventStatus.Succeeded()
+        status = self._reset(context, state)
         # To begin closed is no event.
         log.events = [event for event in log.events if event.kind is not ContactChange.CLOSING]
         return status
 
     def _advance(self, context: Context, state: State) -> EventStatus:
-        self._log(context).time = context.get_time()
-        if (self._margins(context) <= 0.0).any():
+        log = self._log(context)
+        log.time, waits, log.waits = context.get_time(), log.waits, False
+        if waits or (self._margins(context) <= 0.0).any():
             return self._reset(context, state)
         x, values = self.state(context), self._values(context)
         try:
