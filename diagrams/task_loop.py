@@ -80,6 +80,8 @@ class TaskLoop:
         own = self.plant.GetMyMutableContextFromRoot(context)
         x = self.plant.dae.state_vector(state)
         if isinstance(self.plant, ContactPlant):
+            # Masses that the plant has otherwise are in its context, and come with a state of N*.
+            self.plant.set_consistent_state(own, self.plant.dae.nominal_state)
             inner = self.plant.GetMutableSubsystemContext(self.plant.multibody, own)
             self.plant.multibody.SetPositionsAndVelocities(inner, x)
         else:
@@ -113,7 +115,9 @@ class TaskLoop:
         }
         found = function_along(controller.outputs, given)
         outputs, signals = found[:, :-1], controller.output_signals
-        desired = controller.desired_along(own, logged.time)
+        desired = np.zeros_like(outputs)
+        if logged.time.size:  # Not where a run failed before it began.
+            desired = controller.desired_along(own, logged.time)
         places, names = logged["phase"].astype(int), self.phase_signals
         values = {name: recorded.values for name, recorded in logged.signals.items()}
         derived = {

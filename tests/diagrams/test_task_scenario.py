@@ -126,3 +126,29 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
 def test_what_knows_no_tasks_says_so(file):
     with pytest.raises(ScenarioError, match="task: what is done here knows references alone"):
         build_loop(load_scenario(file))
+
+
+def test_a_rollout_of_a_task_is_refused_in_its_words(file, tmp_path, capsys):
+    assert main(["simulate", str(file), "--rollout", "--out", str(tmp_path / "run")]) == 1
+    assert "a rollout does not know tasks" in capsys.readouterr().err
+
+
+def test_a_task_that_begins_in_contact_starts_on_it(file):
+    """The positions of the file are 20 mm before the wall."""
+    change = ["task.phases=[!Press {force: 10}]", "start.positions.joint1=1.2"]
+    loop, context = build_scenario(load_scenario(file, change))
+    own = loop.plant.GetMyContextFromRoot(context)
+    assert abs(loop.plant.GetOutputPort("gap").Eval(own).item()) < 1e-12
+
+
+def test_a_link_is_heavier_in_either_plant(file):
+    """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
+    sagged = []
+    for plant in ("!Unilateral {}", "!MultibodyPlant {time_step: 1.0e-4}"):
+        change = [f"plant={plant}", "plant_parameters={link2.mass: 13}", "duration=0.05"]
+        found = load_scenario(file, change)
+        loop, context = build_scenario(found)
+        simulate(loop.diagram, context, found.duration, found.integrator)
+        sagged.append(loop.record(context)["tracking_error"][-1, 0])
+    assert abs(sagged[0]) > 1e-3
+    assert sagged[1] == pytest.approx(sagged[0], rel=5e-3)

@@ -144,10 +144,10 @@ class Resets:
         matrix = contacts.terms(state, control, parameters).impulse_matrix
         gaps, rates = (value.copy() for value in contacts.gaps.evaluate(state, parameters))
         found: list[int] = []
-        for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)):
+        for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
             trial = [contacts.touches[j] for j in (*found, i)]
             if rows_of(matrix, contacts.kept, trial) is not None:
-                found.append(int(i))
+                found.append(i)
         return tuple(i in found for i in range(len(contacts.touches)))
 
     def _impact(
