@@ -15,6 +15,7 @@ from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import add_robot, start_guess
 from drake_dae.diagrams.task_loop import TaskLoop, make_task_loop
 from drake_dae.diagrams.unilateral import Unilateral
+from drake_dae.diagrams.wiring import hold_before
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.model import RobotModel
@@ -79,7 +80,11 @@ def wire_task(
             given = scenario.plant
             made = given if isinstance(given, Unilateral) else Unilateral({contact.name: 0.0})
             plant = made.plant(model, structure)
-    period = scenario.sampling.period if scenario.sampling else plant.time_step
+    period = plant.time_step
+    if scenario.sampling is not None:
+        period = scenario.sampling.period
+        with at("sampling"):
+            hold_before(plant, scenario.sampling)
     with at("task"):
         controller = TaskController(task.made(), law, free_law, sample_period=period)
         return make_task_loop(
