@@ -94,7 +94,9 @@ def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop
     """
     loop = build_completed(scenario, meshcat)[1]
     if isinstance(loop, TaskLoop):
-        raise ScenarioError(("task", "what is done here knows references alone, and no tasks"))
+        raise ScenarioError(
+            ("task", "sweeps and exports know `references` alone; `drake-dae simulate` runs a task")
+        )
     return loop
 
 

@@ -124,7 +124,7 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
 
 
 def test_what_knows_no_tasks_says_so(file):
-    with pytest.raises(ScenarioError, match="task: what is done here knows references alone"):
+    with pytest.raises(ScenarioError, match="task: sweeps and exports know `references` alone"):
         build_loop(load_scenario(file))
 
 
