@@ -152,3 +152,11 @@ def test_a_link_is_heavier_in_either_plant(file):
         sagged.append(loop.record(context)["tracking_error"][-1, 0])
     assert abs(sagged[0]) > 1e-3
     assert sagged[1] == pytest.approx(sagged[0], rel=5e-3)
+
+
+def test_a_phase_takes_a_file_beside_the_scenario(file):
+    (file.parent / "path.csv").write_text("time,z\n0,0.30\n0.1,0.31\n0.2,0.32\n")
+    rows = "!Csv {file: path.csv, columns: [z]}"
+    loop, _ = build_scenario(load_scenario(file, [f"task.phases.2.references.tool.z={rows}"]))
+    reference = loop.controller.task.phases[2].references["tool.z"]
+    assert reference.file == str(file.parent / "path.csv")
