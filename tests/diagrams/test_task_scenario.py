@@ -160,3 +160,14 @@ def test_a_phase_takes_a_file_beside_the_scenario(file):
     loop, _ = build_scenario(load_scenario(file, [f"task.phases.2.references.tool.z={rows}"]))
     reference = loop.controller.task.phases[2].references["tool.z"]
     assert reference.file == str(file.parent / "path.csv")
+
+
+def test_a_summary_tells_that_a_task_stops_its_run(file, tmp_path, capsys):
+    words = ["--set", "task.phases.0.within=0.1", "--set", "task.phases.0.if_late=stop"]
+    words += ["--set", "write={plots: false, animation: false}", "--out", str(tmp_path / "run")]
+    assert main(["simulate", str(file), *words]) == 0
+    told = capsys.readouterr().out
+    assert "\n0.1 s: held, Approach has waited 0.1 s for a force of 0.5 N;" in told
+    assert "\nThe task stops the run there, 0.9 s early.\n" in told
+    assert main(["simulate", str(file), *words, "--set", "duration=0.05"]) == 0
+    assert "early" not in capsys.readouterr().out
