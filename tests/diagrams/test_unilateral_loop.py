@@ -305,6 +305,19 @@ def test_a_sampled_law_begins_in_contact_and_leaves_at_its_first_sample_that_pul
     )
 
 
+def test_a_control_that_pulls_for_a_part_of_a_step_opens_a_contact():
+    """Held from 2.086 s on it pulls for 0.2 ms: steps of a sample see that as ten in each do."""
+    settings = ["wall_bounce", "sampling={period: 0.001}", "integrator.start_time=2.0"]
+    found = []
+    for step in (1e-3, 1e-4):
+        chosen = scenario(*settings, "duration=0.1", f"integrator.max_step_size={step}")
+        found.append(run_scenario(chosen)[2].events)
+    assert [event.kind for event in found[0]] == [event.kind for event in found[1]]
+    times = [[event.time for event in events] for events in found]
+    assert_allclose(times[0], times[1], atol=1e-8)
+    assert times[0][0] == pytest.approx(2.086, abs=1e-9)
+
+
 @pytest.mark.parametrize("limits", [None, [100.0, 100.0]])
 def test_the_integral_of_a_force_stands_still_while_its_contact_is_open(slider, limits):
     tracking = TrackingLaw(
