@@ -158,6 +158,24 @@ def test_one_contact_in_space_always_finds_its_impulse():
     assert slid > 100
 
 
+@pytest.mark.parametrize("bounce", [0.0, 0.5])
+@pytest.mark.parametrize("slope", [0.2, -3.0, 3.0])
+def test_a_lever_of_one_freedom_rubs(slope, bounce):
+    """Its tip moves along (1, slope) alone; with slope > 1 / mu sliding on would lock it.
+
+    At rest it may be held by many pairs of impulses, each with the same sum: the motion is one.
+    """
+    mu, J = 0.5, np.array([1.0, slope])
+    A, before = np.outer(J, J), -2.0 * J
+    impulses = impact(A, before, rows(), [Rubbing(0, rows(1), mu, bounce)])
+    after = before + A @ impulses
+    assert impulses[0] > 0.0
+    assert abs(impulses[1]) <= mu * impulses[0] * (1.0 + 1e-12)
+    # Leaving, the tip slides along slope, where it rubs by -mu sign(slope).
+    locks = 1.0 - mu * abs(slope) <= 0.0
+    assert_allclose(after, 0.0 if locks else 2.0 * bounce * J, atol=1e-9)
+
+
 def test_a_block_that_lands_on_one_foot_sticks_or_slides():
     """A point mass: A is 1 / m. It sticks where |c_t| <= mu |c_n|, else it slows down."""
     contact = [Rubbing(0, rows(1, 2), 0.5, 0.0)]

@@ -11,8 +11,8 @@ rows have c+ = 0, and each contact with its normal n and its rows t along the su
 
     T+ - T- = Lambda . c+ - Lambda . A Lambda / 2 <= 0.
 
-So where energy would be gained all coefficients of restitution are less, by the factor at which
-none is.
+So where energy would be gained, or where it jams and no impulse bounces as it shall, all
+coefficients of restitution are less, by the largest factor at which that is not so.
 """
 
 from collections.abc import Sequence
@@ -79,11 +79,11 @@ def impact(
         The impulses; None if none are found.
     """
     found = _impulses(matrix, before, kept, contacts)
-    if found is None or _gained(matrix, before, found) <= 0.0:
+    if found is not None and _gained(matrix, before, found) <= 0.0:
         return found
     least, most = 0.0, 1.0
     best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
-    for _ in range(HALVINGS):
+    for _ in range(HALVINGS if best is not None else 0):
         middle = 0.5 * (least + most)
         tried = _impulses(matrix, before, kept, _bouncing(contacts, middle))
         if tried is not None and _gained(matrix, before, tried) <= 0.0:
@@ -206,8 +206,8 @@ def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArr
         straight = np.zeros(wanted.size)
         straight[0] = -wanted[0] / matrix[0, 0]
         return straight
-    sticking = np.asarray(np.linalg.solve(matrix, -wanted), float)
-    if sticking[0] > 0.0 and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
+    sticking = _sticking(matrix, wanted)
+    if sticking is not None and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
         return sticking
     if np.isinf(friction):
         return None
@@ -223,6 +223,24 @@ def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArr
     left = np.flatnonzero(fits)
     best = int(np.argmax(wanted[1:] @ after[:, left]))
     return np.asarray(impulses[:, left[best]])
+
+
+def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
+    """Impulses that push and leave w = 0, of several those that rub least; None if none do.
+
+    Of a robot with fewer freedoms than a contact has rows these depend on each other.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    is_moved = values > NOTHING * values[-1]
+    moved, idle = vectors[:, is_moved], vectors[:, ~is_moved]
+    if not idle.size:
+        found = np.linalg.solve(matrix, -wanted)
+    else:
+        found = -moved @ ((moved.T @ wanted) / values[is_moved])
+        if np.abs(idle.T @ wanted).max() > FITS * np.abs(wanted).max():
+            return None
+        found += idle @ np.linalg.lstsq(idle[1:], -found[1:])[0]
+    return np.asarray(found) if found[0] > 0.0 else None
 
 
 def _slid(
