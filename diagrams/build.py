@@ -36,6 +36,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.task_build import check_task, start_task, wire_task
 from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.diagrams.unilateral import Unilateral
+from drake_dae.diagrams.wiring import hold_before
 from drake_dae.errors import (
     AssumptionError,
     InconsistentStateError,
@@ -93,7 +94,9 @@ def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop
     """
     loop = build_completed(scenario, meshcat)[1]
     if isinstance(loop, TaskLoop):
-        raise ScenarioError(("task", "what is done here knows references alone, and no tasks"))
+        raise ScenarioError(
+            ("task", "sweeps and exports know `references` alone; `drake-dae simulate` runs a task")
+        )
     return loop
 
 
@@ -194,6 +197,9 @@ def wire_loop(
         plant, scene_graph = _plant(scenario, own.model, own.structure, False), own.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
+    if scenario.sampling is not None:
+        with at("sampling"):
+            hold_before(plant, scenario.sampling)
     if scenario.encoders is not None:
         with at("encoders"):
             period = scenario.sampling.period if scenario.sampling else plant.time_step

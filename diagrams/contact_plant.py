@@ -259,6 +259,8 @@ class ContactPlant(Diagram):
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x in a context, shape (n,), in contact or not.
 
+        Bodies get the masses that the plant has otherwise: Drake has these in its context.
+
         Raises:
             ModelError: The shape is wrong.
         """
@@ -266,21 +268,19 @@ class ContactPlant(Diagram):
         count = self.multibody.num_multibody_states()
         links, stages = np.split(self.dae.state_vector(state), [count])
         self.multibody.SetPositionsAndVelocities(own, links)
+        for body, mass in self._masses:
+            body.SetMass(own, mass)
         if self._stages is not None:
             self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
 
-        The robot then touches without a force, and sinks in when the run begins. Bodies get the
-        masses that the plant has otherwise: Drake has these in its context.
+        The robot then touches without a force, and sinks in when the run begins.
 
         Raises:
             InconsistentStateError: None is found near the guess.
         """
         state = self.structure.manifold.settle(guess, self._values)
         self.set_state(context, state)
-        own = self.GetMutableSubsystemContext(self.multibody, context)
-        for body, mass in self._masses:
-            body.SetMass(own, mass)
         return state

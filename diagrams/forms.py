@@ -251,7 +251,7 @@ class Reader(Generic[T]):
     def __init__(self, form: type[T]) -> None:
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
         self.schema: dict[str, Any] = self._adapter.json_schema()
-        #: Dotted keys of the dictionaries with any names.
+        #: Dotted keys of the dictionaries with any names; "*" is any entry of a list.
         self.free_names = set(_free_names(self.schema, ""))
 
     def read(self, data: Any, folder: Path | None = None) -> T:
@@ -328,9 +328,9 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
 
 
 def _with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The only one of several types that has parts; the schema itself where it is not one."""
-    inside = [one for one in schema.get("anyOf", ()) if not _PARTS.isdisjoint(one)]
-    return inside[0] if len(inside) == 1 else schema
+    """What there may be or nothing, if it has parts; else the schema itself."""
+    inside = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
+    return inside[0] if len(inside) == 1 and not _PARTS.isdisjoint(inside[0]) else schema
 
 
 def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
@@ -396,11 +396,13 @@ def _tags(schema: Mapping[str, Any]) -> str:
 
 
 def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:
+    schema = _with_parts(schema)
     if isinstance(schema.get("additionalProperties"), dict):
         yield path
     for one in schema.get("oneOf", ()):
         yield from _free_names(one, path)
-    for name, inner in schema.get("properties", {}).items():
+    inside = {"*": schema["items"]} if isinstance(schema.get("items"), dict) else {}
+    for name, inner in {**schema.get("properties", {}), **inside}.items():
         yield from _free_names(inner, f"{path}.{name}" if path else name)
 
 

@@ -11,6 +11,7 @@ from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.keys import each
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import completed_model, scenario_structure
+from drake_dae.errors import ModelError
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
@@ -64,9 +65,15 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
 
 
 def check_pushes(pushes: Sequence[Push], links: Links) -> None:
-    """Refuses pushes on frames that are not there.
+    """Refuses pushes on frames that are not there, or stand still.
 
     Raises:
-        ScenarioError: There is no such frame.
+        ScenarioError: There is no such frame of the robot.
     """
-    each("plant_pushes", pushes, lambda push: links.position(push.frame, push.point))
+
+    def check(push: Push) -> None:
+        links.position(push.frame, push.point)
+        if push.frame == "world":
+            raise ModelError("a push on the world moves nothing; name a frame of the robot")
+
+    each("plant_pushes", pushes, check)

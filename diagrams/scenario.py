@@ -6,7 +6,7 @@ a choice between several is written with the name as a tag, for example `surface
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -358,13 +358,22 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         raise ScenarioError(("robot", f"no path: {error}")) from None
 
     def located(one: Any) -> Any:
+        if isinstance(one, Mapping):
+            return {name: located(inner) for name, inner in one.items()}
+        if isinstance(one, list):
+            return [*map(located, one)]
+        if isinstance(one, phases.Phase):
+            inside = {part.name: located(getattr(one, part.name)) for part in fields(one)}
+            return replace(one, **inside)
         return one.beside(here) if isinstance(one, references.Reference) else one
 
+    task = scenario.task
     return replace(
         scenario,
         robot=replace(robot, file=file, packages=packages),
-        references={name: located(one) for name, one in scenario.references.items()},
-        exogenous={name: [*map(located, rows)] for name, rows in scenario.exogenous.items()},
+        references=located(scenario.references),
+        exogenous=located(scenario.exogenous),
+        task=None if task is None else replace(task, phases=located([*task.phases])),
     )
 
 

@@ -14,9 +14,10 @@ from drake_dae.systems.task.task import Task
 class ScenarioTask:
     """What the robot does phase by phase, in place of `references`.
 
-    It begins free, or in contact where the first phase does, at rest at start.positions. Where the
-    contact is open its distance is an output, "wall.distance" for example, in place of its force.
-    With ideal constraints in `plant` the contact opens and closes without a bounce.
+    It begins free, or in contact where the first phase does, at rest at start.positions or, on what
+    it touches, next to them. Where the contact is open its distance is an output, "wall.distance"
+    for example, in place of its force. With ideal constraints in `plant` the contact opens and
+    closes without a bounce.
 
     Attributes:
         phases: The phases, one after the other; after the last one the robot rests.

@@ -15,6 +15,7 @@ from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import add_robot, start_guess
 from drake_dae.diagrams.task_loop import TaskLoop, make_task_loop
 from drake_dae.diagrams.unilateral import Unilateral
+from drake_dae.diagrams.wiring import hold_before
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.model import RobotModel
@@ -79,7 +80,11 @@ def wire_task(
             given = scenario.plant
             made = given if isinstance(given, Unilateral) else Unilateral({contact.name: 0.0})
             plant = made.plant(model, structure)
-    period = scenario.sampling.period if scenario.sampling else plant.time_step
+    period = plant.time_step
+    if scenario.sampling is not None:
+        period = scenario.sampling.period
+        with at("sampling"):
+            hold_before(plant, scenario.sampling)
     with at("task"):
         controller = TaskController(task.made(), law, free_law, sample_period=period)
         return make_task_loop(
@@ -95,20 +100,26 @@ def wire_task(
 def start_task(scenario: Scenario, loop: TaskLoop) -> Context:
     """A new context of a task's loop at a scenario's start: at rest at start.positions.
 
+    Where the first phase is in contact, or other constraints hold, it is on these next to them.
+
     The arguments and errors are those of `start_scenario`.
     """
     context = loop.diagram.CreateDefaultContext()
     context.SetTime(scenario.integrator.start_time)
     plant, model = loop.plant, loop.plant.model
+    own = plant.GetMyMutableContextFromRoot(context)
     if not isinstance(plant, ContactPlant):
-        own = plant.GetMyMutableContextFromRoot(context)
         with at("plant_parameters"):
             for name, numbers in scenario.plant_parameters.items():
                 plant.set_parameter(own, name, numbers)
+    controller, values = loop.controller, plant.current_parameters(own)
+    law = controller.law if controller.task.contacts[0] else controller.free_law
     with at("start"):
-        q = start_guess(scenario.start.positions, model.links)
+        guess = start_guess(scenario.start.positions, model.links)
         forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
-        loop.set_state(context, model.rest_state(q, forces))
+        near = model.rest_state(guess, forces, values)
+        q = law.structure.manifold.settle(near, values)[: guess.size]
+        loop.set_state(context, model.rest_state(q, forces, values))
     loop.set_seed(context, scenario.force.seed)
     return context
 

@@ -108,7 +108,9 @@ class TaskLoop:
         }
         found = function_along(controller.outputs, given)
         outputs, signals = found[:, :-1], controller.output_signals
-        desired = controller.desired_along(own, logged.time)
+        desired = np.zeros_like(outputs)
+        if logged.time.size:  # Not where a run failed before it began.
+            desired = controller.desired_along(own, logged.time)
         places, names = logged["phase"].astype(int), self.phase_signals
         values = {name: recorded.values for name, recorded in logged.signals.items()}
         derived = {

@@ -148,7 +148,8 @@ def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
     Args:
         data: Lists and dictionaries; changed in place.
         setting: A dotted key, "=", and a value in YAML.
-        names: Dotted keys of dictionaries whose names may have dots themselves.
+        names: Dotted keys of dictionaries whose names may have dots themselves; "*" is any entry
+            of a list.
 
     Raises:
         ScenarioError: There is no such place, or the YAML is broken.
@@ -166,7 +167,8 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
         data: Lists and dictionaries; changed in place.
         key: The key.
         value: Plain data.
-        names: Dotted keys of dictionaries whose names may have dots themselves.
+        names: Dotted keys of dictionaries whose names may have dots themselves; "*" is any entry
+            of a list.
 
     Raises:
         ScenarioError: There is no such place.
@@ -174,9 +176,9 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
     parts = key.split(".")
     if not all(parts):
         raise ScenarioError((brief(key), "expected a dotted key, for example start.errors.tool.z"))
-    path = ""
+    path = form = ""
     while True:
-        count = _name_length(data, parts) if path in names else 1
+        count = _name_length(data, parts) if form in names else 1
         part, rest = ".".join(parts[:count]), parts[count:]
         slot: str | int = part
         if isinstance(data, list):
@@ -189,10 +191,12 @@ def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> No
         if not rest:
             data[slot] = value
             return
+        path = f"{path}.{part}" if path else part
+        kind = part if isinstance(data, dict) else "*"
+        form = f"{form}.{kind}" if form else kind
         if isinstance(data, dict):
             data.setdefault(slot, {})
         data, parts = data[slot], rest
-        path = f"{path}.{part}" if path else part
 
 
 def _name_length(data: Any, parts: list[str]) -> int:

@@ -43,7 +43,7 @@ def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -
         plant: The plant.
 
     Raises:
-        ScenarioError: There is no such frame, or another body has the name.
+        ScenarioError: There is no such frame of the robot, or another body has the name.
     """
     for index, payload in enumerate(payloads):
         with at(f"{key}.{index}"):
@@ -52,6 +52,11 @@ def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -
 
 def _add(payload: Payload, plant: MultibodyPlant) -> None:
     frame = frame_named(plant, payload.frame)
+    if frame.body() == plant.world_body():
+        raise ModelError(
+            f"'{payload.frame}' is a frame of the world, and a payload there moves nothing; name a "
+            "frame of the robot"
+        )
     if plant.HasBodyNamed(payload.name):
         raise ModelError(f"a payload needs a name of its own; a body '{payload.name}' is there")
     inertia = SpatialInertia(payload.mass, [0.0, 0.0, 0.0], UnitInertia(0.0, 0.0, 0.0))

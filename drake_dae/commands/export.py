@@ -4,9 +4,12 @@ import argparse
 from pathlib import Path
 
 from drake_dae.diagrams.build import build_loop, start_scenario
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.export.export import export_code
-from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.diagrams.scenario import Scenario, load_scenario
 from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -18,4 +21,20 @@ def run_command(options: argparse.Namespace) -> int:
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
     print(f"written to {folder}/: {', '.join(file.name for file in files)}")
+    if missing := _left_out(scenario, loop):
+        print(f"not among them: {'; '.join(missing)}")
     return 0
+
+
+def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
+    """What the scenario runs beside law, plant and projection."""
+    closed = "the code has the plant with all contacts closed"
+    parts = {
+        "the observer, which finds the disturbance and the friction among law_parameters": (
+            loop.observer is not None
+        ),
+        "the limits of the drives": scenario.saturation,
+        f"Drake's own contact: {closed}, and ideal": isinstance(loop.plant, ContactPlant),
+        f"how contacts open: {closed}": isinstance(loop.plant, UnilateralRobotPlant),
+    }
+    return [text for text, is_run in parts.items() if is_run]

@@ -33,7 +33,7 @@ from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
-from drake_dae.simulation.remarks import surface_remarks
+from drake_dae.simulation.remarks import stop_remarks, surface_remarks
 from drake_dae.simulation.run_folder import (
     ANIMATION,
     FILES,
@@ -197,7 +197,8 @@ def _write(run: _Run) -> bool:
         if isinstance(loop.plant, RobotBlock):
             text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
         if isinstance(loop, TaskLoop):
-            text = "\n".join([text, "", *map(str, loop.changes(run.context))])
+            stopped = stop_remarks(run.statistics, run.scenario.duration)
+            text = "\n".join([text, "", *map(str, loop.changes(run.context)), *stopped])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)

@@ -1,6 +1,5 @@
 """What becomes of the law (28) where a computer runs it: late, and held between samples."""
 
-from collections.abc import Sequence
 from math import floor
 
 import numpy as np
@@ -10,12 +9,19 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, number, numbers, positive, vector
 from drake_dae.dae.linearization.linearization import linearize, linearize_loop
-from drake_dae.dae.linearization.models import ComplexArray
+from drake_dae.dae.linearization.models import ComplexArray, Linearization
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
+
+RESTS = 1e-4
+"""A state is an equilibrium if nothing in it changes by more, relative to its scale, in the time of
+the fastest pole."""
+
+MOST_STATES = 2000
+"""Of more states, late ones included, poles would take minutes."""
 
 
 @checked(ModelError)
@@ -55,7 +61,7 @@ def sampled_poles(
 
     Raises:
         InconsistentStateError: The state is not on N*.
-        ModelError: The law is another one, or a number makes no sense.
+        ModelError: The law is another one, the state is no equilibrium, or a number makes no sense.
     """
     _check(law)
     period, delay = positive("period", period), _delay(delay)
@@ -65,9 +71,14 @@ def sampled_poles(
     )
     A = plant.minimal.A
     G = loop.minimal.A - A
-    late = floor(delay / period + _SAME)
+    _check_rest(law, loop, A + G)
+    size, late = len(A), floor(delay / period + _SAME)
+    if (late + 2) * size > MOST_STATES:
+        raise ModelError(
+            f"a delay of {delay:g} s is {late} periods of {period:g} s, each with {size} states, "
+            f"and there may be {MOST_STATES}; take a longer period"
+        )
     rest = max(delay - late * period, 0.0)
-    size = len(A)
     begin, end = (_held(A, G, length) for length in (rest, period - rest))
     matrix = np.eye((late + 2) * size, k=-size)
     matrix[:size] = 0.0
@@ -133,7 +144,11 @@ def sampling_error(
     moments = vector("times", times, None)
     if moments.size < 3 or np.any(np.diff(moments) <= 0.0):
         raise ModelError("times must be three or more, and increase")
-    courses = _courses(moments.size, ("states", states), ("controls", controls))
+    sizes = (moments.size, law.system.num_states), (moments.size, law.system.num_controls)
+    courses = [
+        _course(name, given, size)
+        for name, given, size in zip(("states", "controls"), (states, controls), sizes, strict=True)
+    ]
     values = law.system.parameter_vector(parameters)
     matrix = law.system.trace("control matrix", {"B": law.structure.control_matrix}, often=False)
     rates = np.gradient(courses[1], moments, axis=0, edge_order=2)
@@ -184,12 +199,26 @@ def _delay(delay: float) -> float:
     return found
 
 
-def _courses(count: int, *given: tuple[str, ArrayLike]) -> Sequence[FloatArray]:
+def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
+    """Refuses what is about no equilibrium."""
+    moves = np.abs(loop.rate) / law.system.scale
+    fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
+    worst = int(np.argmax(moves))
+    if moves[worst] > RESTS * fastest:
+        signal = law.system.state_signals[worst]
+        raise ModelError(
+            f"{law.system.name}: the poles are those about an equilibrium under the law, and there "
+            f"{signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second; give a "
+            "reference at rest, and the state that it leads to"
+        )
+
+
+def _course(name: str, given: ArrayLike, shape: tuple[int, int]) -> FloatArray:
     """Rows for each time."""
-    found = [numbers(*one) for one in given]
-    for (name, _), rows in zip(given, found, strict=True):
-        if rows.ndim != 2 or len(rows) != count or not np.isfinite(rows).all():
-            raise ModelError(
-                f"{name} must be finite, with a row for each of {count} times, got {rows.shape}"
-            )
-    return found
+    rows = numbers(name, given)
+    if rows.shape != shape or not np.isfinite(rows).all():
+        raise ModelError(
+            f"{name} must be finite and of shape {shape}, with a row for each of {shape[0]} times, "
+            f"got {rows.shape}"
+        )
+    return rows

@@ -79,9 +79,9 @@ def save_film(loop: Loop, record: Record, context: Context, path: str | Path) ->
         ModelError: There is no robot, nothing of it can be seen, or the file has another suffix.
         OSError: The file cannot be written.
     """
-    kind = Path(path).suffix
+    name, kind = Path(path).name, Path(path).suffix
     if kind not in (".gif", ".png"):
-        raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{path}'")
+        raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{name}'")
     course = follow(loop, record, context, RATE)
     scene, last = _Scene(course, loop.scene_graph), len(course.times) - 1
     scene.notes = phases_at(record, course.start_time + course.times)

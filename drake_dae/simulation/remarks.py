@@ -1,4 +1,4 @@
-"""What a run should say of the surfaces that a robot touched."""
+"""What a run should say of the surfaces that a robot touched, and of how it ended."""
 
 import casadi as ca
 import numpy as np
@@ -6,6 +6,7 @@ import numpy as np
 from drake_dae.robots.contact import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.record import Record
+from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -41,3 +42,16 @@ def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
         f"{constraint.name}: the robot is beyond the edge of the data by up to "
         f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there a plane goes on"
     )
+
+
+def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]:
+    """That a task has ended its run, where it has; no failure and no signal did.
+
+    Args:
+        statistics: What the run took; None where it failed.
+        duration: How long it should have lasted, in s.
+    """
+    if statistics is None or statistics.interrupted:
+        return []
+    left = duration - statistics.simulated_time
+    return [f"The task stops the run there, {left:.4g} s early."] if left > 1e-9 * duration else []

@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, NonFiniteError, WiringError
 from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
 
 _SAME = 1e-9
@@ -77,6 +77,9 @@ class ControlHold(LeafSystem):
     Args:
         size: The number of controls, p.
         sampling: Period and delay.
+
+    Raises:
+        WiringError: When a run begins: the first control depends on itself.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -102,7 +105,15 @@ class ControlHold(LeafSystem):
         rows = self._rows(context)
         if not np.isnan(rows).any():
             return EventStatus.DidNothing()  # A run that goes on.
-        rows[:] = self._port.Eval(context)
+        try:
+            rows[:] = self._port.Eval(context)
+        except NonFiniteError as error:
+            raise WiringError(
+                "the first control cannot be found, as where a law reads the force that its own "
+                "control makes: put a ForceSensor with a sample_period between, which has a force "
+                "at the start, or set what control_hold holds before the first sample by "
+                "SetDiscreteState"
+            ) from error
         return self._set(state, rows)
 
     def _read_and_act(self, context: Context, state: State) -> EventStatus:

@@ -142,10 +142,21 @@ def test_laws_with_a_state_of_their_own_are_refused():
         sampled_poles(chosen, np.zeros(3), T)
     with pytest.raises(ModelError, match="delay must be 0 s or more"):
         sampled_poles(TrackingLaw(system, poles(-4.0)), np.zeros(3), T, -1.0)
-    with pytest.raises(ModelError, match="a row for each of 3 times"):
-        sampling_error(
-            TrackingLaw(system, poles(-4.0)), [0, 1, 2], np.zeros((2, 2)), np.zeros((3, 1)), T
-        )
+    plain = TrackingLaw(system, poles(-4.0))
+    for sizes in ((2, 1), (3, 2)):
+        rows = np.zeros((sizes[0], 2)), np.zeros((3, sizes[1]))
+        with pytest.raises(ModelError, match=r"of shape \(3, .\), with a row for each of 3 times"):
+            sampling_error(plain, [0, 1, 2], *rows, T)
+
+
+def test_poles_are_those_about_a_rest_that_few_periods_reach():
+    plain = TrackingLaw(mass_on_a_spring(0.0), poles(-4.0))
+    with pytest.raises(
+        ModelError, match=r"about an equilibrium under the law, and there .* changes"
+    ):
+        sampled_poles(plain, [0.1, 0.0, 0.0], T)
+    with pytest.raises(ModelError, match=r"a delay of 10 s is 10000000 periods of 1e-06 s"):
+        sampled_poles(plain, np.zeros(3), 1e-6, 10.0)
 
 
 def test_it_needs_no_drake_and_no_sampling():

@@ -230,6 +230,14 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     terms = (tmp_path / "two_link_wall_c99" / "LICENSE.txt").read_text()
     assert "CasADi" in terms
     assert "BSD 3-Clause" in terms
+    assert "not among them" not in printed
     (tmp_path / "file").touch()
     assert main(["export", "two_link_wall", "--out", "file"]) == 1
     assert "file: File exists" in capsys.readouterr().err
+
+
+def test_the_command_tells_what_a_loop_of_ones_own_lacks(tmp_path, capsys):
+    words = ["export", "wall_bounce", "--set", "saturation=true", "--out", str(tmp_path)]
+    assert main(words) == 0
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert told.startswith("not among them: the limits of the drives; how contacts open")

@@ -320,6 +320,7 @@ def test_packages_of_a_robot(tmp_path):
         ("references.tool=0.3", lambda s: list(s.references) == ["tool.z", "wall.force", "tool"]),
         ("start.errors.tool.z=0.01", lambda s: s.start.errors == {"tool.z": 0.01}),
         ("gains={outputs: {tool.z: [-3]}}", lambda s: s.gains.outputs == {"tool.z": [-3]}),
+        ("tolerances.outputs.tool.z=2", lambda s: s.tolerances.outputs == {"tool.z": 2.0}),
         ("plant_parameters.link2.mass=[5]", lambda s: s.plant_parameters == {"link2.mass": [5]}),
         ("description=a b", lambda s: s.description == "a b"),
         ("description=", None),
@@ -331,6 +332,12 @@ def test_settings(setting, read):
             two_link(setting)
     else:
         assert read(two_link(setting))
+
+
+def test_settings_reach_names_with_dots_in_lists():
+    task = "task={phases: [!Move {references: {tool.z: 0.3}, duration: 1}]}"
+    (phase,) = two_link(task, "task.phases.0.references.tool.z=0.4").task.phases
+    assert phase.references == {"tool.z": 0.4}
 
 
 def test_later_settings_see_earlier_ones():
@@ -768,6 +775,10 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("outputs.0.frame=tol", ["outputs.0: ", "'tol'", "did you mean 'tool'?"]),
         ("outputs.0=!JointPositions {joints: [joint9]}", ["outputs.0: ", "'joint9'", "joint1"]),
         ("outputs.0=!SurfaceCoordinates {constraint: wal}", ["outputs.0: ", "'wal'", "'wall'?"]),
+        (
+            "plant_parameters={wall.position: [[1, 0, 0]]}",
+            ["plant_parameters.wall.position: expected a number or a list, got [[1, 0, 0]]"],
+        ),
         # Gains.
         ("gains.all=[1]", ["gains: ", "not Hurwitz", "real parts must be negative"]),
         ("gains.all=[0]", ["gains: ", "not Hurwitz"]),

@@ -124,5 +124,50 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
 
 
 def test_what_knows_no_tasks_says_so(file):
-    with pytest.raises(ScenarioError, match="task: what is done here knows references alone"):
+    with pytest.raises(ScenarioError, match="task: sweeps and exports know `references` alone"):
         build_loop(load_scenario(file))
+
+
+def test_a_rollout_of_a_task_is_refused_in_its_words(file, tmp_path, capsys):
+    assert main(["simulate", str(file), "--rollout", "--out", str(tmp_path / "run")]) == 1
+    assert "a rollout does not know tasks" in capsys.readouterr().err
+
+
+def test_a_task_that_begins_in_contact_starts_on_it(file):
+    """The positions of the file are 20 mm before the wall."""
+    change = ["task.phases=[!Press {force: 10}]", "start.positions.joint1=1.2"]
+    loop, context = build_scenario(load_scenario(file, change))
+    own = loop.plant.GetMyContextFromRoot(context)
+    assert abs(loop.plant.GetOutputPort("gap").Eval(own).item()) < 1e-12
+
+
+def test_a_link_is_heavier_in_either_plant(file):
+    """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
+    sagged = []
+    for plant in ("!Unilateral {}", "!MultibodyPlant {time_step: 1.0e-4}"):
+        change = [f"plant={plant}", "plant_parameters={link2.mass: 13}", "duration=0.05"]
+        found = load_scenario(file, change)
+        loop, context = build_scenario(found)
+        simulate(loop.diagram, context, found.duration, found.integrator)
+        sagged.append(loop.record(context)["tracking_error"][-1, 0])
+    assert abs(sagged[0]) > 1e-3
+    assert sagged[1] == pytest.approx(sagged[0], rel=5e-3)
+
+
+def test_a_phase_takes_a_file_beside_the_scenario(file):
+    (file.parent / "path.csv").write_text("time,z\n0,0.30\n0.1,0.31\n0.2,0.32\n")
+    rows = "!Csv {file: path.csv, columns: [z]}"
+    loop, _ = build_scenario(load_scenario(file, [f"task.phases.2.references.tool.z={rows}"]))
+    reference = loop.controller.task.phases[2].references["tool.z"]
+    assert reference.file == str(file.parent / "path.csv")
+
+
+def test_a_summary_tells_that_a_task_stops_its_run(file, tmp_path, capsys):
+    words = ["--set", "task.phases.0.within=0.1", "--set", "task.phases.0.if_late=stop"]
+    words += ["--set", "write={plots: false, animation: false}", "--out", str(tmp_path / "run")]
+    assert main(["simulate", str(file), *words]) == 0
+    told = capsys.readouterr().out
+    assert "\n0.1 s: held, Approach has waited 0.1 s for a force of 0.5 N;" in told
+    assert "\nThe task stops the run there, 0.9 s early.\n" in told
+    assert main(["simulate", str(file), *words, "--set", "duration=0.05"]) == 0
+    assert "early" not in capsys.readouterr().out

@@ -23,6 +23,7 @@ from drake_dae import (
     Record,
     RobotModel,
     RobotPlant,
+    Sampling,
     SinusoidReference,
     TrackingLaw,
     UnilateralRobotPlant,
@@ -280,6 +281,41 @@ def test_where_nothing_opens_a_loop_goes_as_with_an_ideal_plant(slider):
     assert hybrid.events == ideal.events == ()
     assert_allclose(hybrid["state"][-1], ideal["state"][-1], atol=1e-9)
     assert_allclose(hybrid["constraint_force"][-1], ideal["constraint_force"][-1], atol=1e-9)
+
+
+def test_a_sampled_law_begins_in_contact_and_leaves_at_its_first_sample_that_pulls(slider):
+    """The mass rests across the wall, so that the force is what is wanted, held; to 1e-11 s."""
+    tracking, period = TrackingLaw(slider.dae, poles(-5.0)), 0.03
+    plant = UnilateralRobotPlant(slider, {"wall": BOUNCE}, structure=tracking.structure)
+    references = [ConstantReference(0.2), SinusoidReference(PUSH, SWING, RATE)]
+    loop = make_closed_loop(plant, tracking, references, sampling=Sampling(period))
+    context = loop.diagram.CreateDefaultContext()
+    plant.set_consistent_state(plant.GetMyMutableContextFromRoot(context), [0.0, 0.2, 0.0, 0.0])
+    simulate(loop.diagram, context, 2.2, error_controlled(1e-9))
+    record = loop.record(context)
+    leaves = period * np.ceil(by_hand()[0] / period)
+    assert record.events[0].kind is ContactChange.OPENING
+    assert record.events[0].time == pytest.approx(leaves, abs=2e-11)
+    before = record.time < leaves
+    assert_array_equal(record["mode"][before], 1.0)
+    # A row at a sample is of what was held before.
+    held = period * np.maximum(np.ceil(record.time[before] / period - 1e-9) - 1.0, 0.0)
+    assert_allclose(
+        record["constraint_force"][before, 0], PUSH + SWING * np.sin(RATE * held), atol=1e-9
+    )
+
+
+def test_a_control_that_pulls_for_a_part_of_a_step_opens_a_contact():
+    """Held from 2.086 s on it pulls for 0.2 ms: steps of a sample see that as ten in each do."""
+    settings = ["wall_bounce", "sampling={period: 0.001}", "integrator.start_time=2.0"]
+    found = []
+    for step in (1e-3, 1e-4):
+        chosen = scenario(*settings, "duration=0.1", f"integrator.max_step_size={step}")
+        found.append(run_scenario(chosen)[2].events)
+    assert [event.kind for event in found[0]] == [event.kind for event in found[1]]
+    times = [[event.time for event in events] for events in found]
+    assert_allclose(times[0], times[1], atol=1e-8)
+    assert times[0][0] == pytest.approx(2.086, abs=1e-9)
 
 
 @pytest.mark.parametrize("limits", [None, [100.0, 100.0]])

@@ -138,7 +138,13 @@ def test_push_grows_and_fades_smoothly():
             "plant_payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]",
             "plant_payloads.1: a payload needs a name of its own",
         ),
+        (
+            "plant_payloads=[{frame: world, mass: 1}]",
+            "plant_payloads.0: 'world' is a frame of the world",
+        ),
+        ("plant_pushes=[{frame: world, force: [0, 0, 1]}]", "plant_pushes.0: a push on the world"),
         ("plant_parameters={wall.rpy: [0, 0, 0]}", "no parameter 'wall.rpy'"),
+        ("sampling={period: 0.001}", r"sampling: the plant steps by 0\.001 s .* got 0 s"),
     ],
 )
 def test_what_is_not_there_is_refused(settings, message):

@@ -183,6 +183,45 @@ def test_a_wedged_body_bounces_less_or_not_at_all():
     assert_allclose(before + J @ J.T @ impulses, 0.0, atol=1e-9)
 
 
+def test_one_contact_in_space_always_finds_its_impulse():
+    """Masses differ by up to 1e4, so that directions of sliding lie close to each other."""
+    random, slid = np.random.default_rng(0), 0
+    for _ in range(300):
+        J = random.standard_normal((3, 5)) * 10.0 ** random.uniform(-1.0, 1.0, (3, 1))
+        A = J * 10.0 ** random.uniform(-2.0, 2.0, 5) @ J.T
+        before, mu = J @ random.standard_normal(5), random.choice([0.1, 0.5, 1.0, 3.0])
+        before[0] = -abs(before[0])
+        impulses = impact(A, before, rows(), [Rubbing(0, rows(1, 2), mu, 0.0)])
+        assert impulses is not None
+        after, most = before + A @ impulses, mu * impulses[0]
+        assert abs(after[0]) < 1e-10 * np.abs(before).max()
+        if np.linalg.norm(impulses[1:]) < most * (1.0 - 1e-10):
+            assert_allclose(after, 0.0, atol=1e-8 * np.abs(before).max())
+            continue
+        slid += 1
+        way = after[1:] / np.linalg.norm(after[1:])
+        assert_allclose(impulses[1:], -most * way, atol=1e-6 * most)
+    assert slid > 100
+
+
+@pytest.mark.parametrize("bounce", [0.0, 0.5])
+@pytest.mark.parametrize("slope", [0.2, -3.0, 3.0])
+def test_a_lever_of_one_freedom_rubs(slope, bounce):
+    """Its tip moves along (1, slope) alone; with slope > 1 / mu sliding on would lock it.
+
+    At rest it may be held by many pairs of impulses, each with the same sum: the motion is one.
+    """
+    mu, J = 0.5, np.array([1.0, slope])
+    A, before = np.outer(J, J), -2.0 * J
+    impulses = impact(A, before, rows(), [Rubbing(0, rows(1), mu, bounce)])
+    after = before + A @ impulses
+    assert impulses[0] > 0.0
+    assert abs(impulses[1]) <= mu * impulses[0] * (1.0 + 1e-12)
+    # Leaving, the tip slides along slope, where it rubs by -mu sign(slope).
+    locks = 1.0 - mu * abs(slope) <= 0.0
+    assert_allclose(after, 0.0 if locks else 2.0 * bounce * J, atol=1e-9)
+
+
 def test_a_block_that_lands_on_one_foot_sticks_or_slides():
     """A point mass: A is 1 / m. It sticks where |c_t| <= mu |c_n|, else it slows down."""
     contact = [Rubbing(0, rows(1, 2), 0.5, 0.0)]

@@ -237,6 +237,25 @@ def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
         )
 
 
+def test_a_law_that_reads_the_force_of_its_own_first_control_is_told():
+    """A sensor that samples has a force at the start."""
+    arms = arm("two_link")
+    more = {"structure": arms.structure, "measured_force": True, "force_gain": 0.4}
+    tracking = TrackingLaw(arms.model.dae, poles(-4.0), **more)
+    wanted, sampling = [ConstantReference(0.3), ConstantReference(20.0)], Sampling(0.01)
+
+    def pressed(sensor):
+        plant = RobotPlant(arms.model, structure=arms.structure)
+        loop = make_closed_loop(plant, tracking, wanted, sensor=sensor, sampling=sampling)
+        context = loop.diagram.CreateDefaultContext()
+        simulate(loop.diagram, context, 0.3, error_controlled(1e-6))
+        return loop.record(context)["constraint_force"][-1]
+
+    with pytest.raises(WiringError, match="the first control cannot be found, as where a law"):
+        pressed(None)
+    assert pressed(ForceSensor(1, sample_period=0.01)) == pytest.approx(20.0, abs=0.5)
+
+
 def test_hold_of_a_source_shows_it_late():
     """Any block may stand before it, also one of Drake."""
     builder = DiagramBuilder()

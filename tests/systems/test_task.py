@@ -209,6 +209,31 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
         assert_allclose(record["distance"][-1, 1], 0.0, atol=3e-3)
 
 
+def test_patience_goes_on_from_phase_to_phase():
+    """Two phases of 15 ms each are shorter than it; a hand pulls in the first one."""
+    short = [Dwell(0.015, over=0.01), Dwell(0.015, over=0.01, if_lost="hold")]
+    loop = task_loop([HOLDING, Press(10.0, over=0.1), *short], patience=0.02)
+    context = started(loop, distance=0.01)
+    run_on(loop, context, 0.255)
+    assert loop.changes(context)[-1].phase == "Dwell"
+    push(loop, context, -40.0)
+    run_on(loop, context, 0.4)
+    last = loop.changes(context)[-1]
+    assert (last.phase, last.reason) == ("held", "the contact of Dwell is lost")
+    assert_allclose(last.time, 0.275, atol=1e-6)
+
+
+def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
+    """A reference below zero pulls it off, and it has gone when the last phase ends."""
+    pulled = Move({"wall.force": -5.0}, 0.05, over=0.01)
+    loop = task_loop([HOLDING, Press(10.0, over=0.1), pulled])
+    context = started(loop, distance=0.01)
+    run_on(loop, context, 1.5)
+    last = loop.changes(context)[-1]
+    assert (last.phase, last.in_contact) == ("done", False)
+    assert_allclose(loop.record(context)["distance"][-1, 1], 0.0, atol=1e-3)
+
+
 @pytest.mark.parametrize("reaction", ["hold", "fail"])
 def test_guard_that_never_fires_is_told(reaction):
     """The wall is 20 mm away, and 0.2 s are not enough."""

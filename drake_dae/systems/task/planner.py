@@ -94,11 +94,11 @@ class Planner:
             reason: Why.
         """
         was, known = before.change.in_contact, before.reference(now.time)
-        if place is None:  # The robot rests as it is: it touches, or is free.
-            contact = was and moment.force >= self._task.contact_force
-            name, place = HELD, len(self._task.phases)
-        else:
-            contact, name = self._task.contacts[place], self._name(place)
+        end = len(self._task.phases)
+        name = HELD if place is None else self._name(place)
+        contact = was if place is None else self._task.contacts[place]
+        if place is None or place == end:  # The robot rests as it is: it touches, or is free.
+            contact, place = contact and moment.force >= self._task.contact_force, end
         if contact != was:
             old, known = known, self._met(now, contact, moment)
             for i, first in enumerate(self._laws[contact].layout.lowest):

@@ -156,7 +156,7 @@ class TaskSupervisor(LeafSystem):
         phase = task.phases[place]
         lost = np.inf
         if phase.if_lost and segment.change.in_contact and moment.force < task.contact_force:
-            lost = task.patience - (context.get_time() - max(progress.felt, segment.change.time))
+            lost = task.patience - (context.get_time() - progress.felt)
         end = phase.margin(moment, task.contact_force)
         return moment, np.array([end, lost, phase.within - moment.time])
 

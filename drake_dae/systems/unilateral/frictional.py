@@ -65,7 +65,7 @@ def impact(
         return found
     least, most = 0.0, 1.0
     best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
-    for _ in range(HALVINGS):
+    for _ in range(HALVINGS if best is not None else 0):
         middle = 0.5 * (least + most)
         tried = _impulses(matrix, before, kept, _bouncing(contacts, middle))
         if tried is not None and _gained(matrix, before, tried) <= 0.0:

@@ -21,6 +21,9 @@ class Log:
         time: When the step began that is being made, in s.
         gaps, rates: Those of all contacts then, in m and m/s; empty before a run.
         before: Time and state before the last reset.
+        held: Whether the step began in the mode of that before, with all its contacts pushing.
+        pulled: The places of contacts that pull since then, by a control that jumped.
+        waits: Whether the first step is to choose the mode, with the control that there is then.
     """
 
     events: list[ContactEvent] = field(default_factory=list)
@@ -28,6 +31,9 @@ class Log:
     gaps: FloatArray = field(default_factory=lambda: np.zeros(0))
     rates: FloatArray = field(default_factory=lambda: np.zeros(0))
     before: tuple[float, bytes] = (np.nan, b"")
+    held: bool = False
+    pulled: set[int] = field(default_factory=set)
+    waits: bool = False
 
 
 def clearance(log: Log, time: float, gaps: FloatArray, rates: FloatArray) -> FloatArray:

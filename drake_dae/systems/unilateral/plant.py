@@ -153,13 +153,15 @@ class UnilateralRobotPlant(ModalPorts):
 
     def _guard(self, place: int, context: Context) -> float:
         """Positive while a contact stays as it is: Drake seeks where that ends."""
-        margin = float(self._margins(context)[place])
+        margin, log = float(self._margins(context)[place]), self._log(context)
         closed = context.get_discrete_state_vector().value()[place] > 0.5
+        if not closed or context.get_time() != log.time:
+            return -1.0 if place in log.pulled else margin
         # A control that jumped, as where it is sampled, pulls from the start of a step on. That is
-        # seen only if it was not so at the start.
-        if closed and margin <= 0.0 and context.get_time() == self._log(context).time:
-            return 1.0
-        return margin
+        # seen only if it was not so at the start; it may have ceased at the end of the step.
+        if margin <= 0.0 and log.held:
+            log.pulled.add(place)
+        return margin if margin > 0.0 else 1.0
 
     def _margins(self, context: Context) -> FloatArray:
         """For each contact: its force if it is closed; else positive until it would be pierced."""
@@ -212,14 +214,25 @@ class UnilateralRobotPlant(ModalPorts):
                 f"'{self.contacts[deepest]}'; start outside",
                 gaps,
             )
-        status, log = self._reset(context, state), self._log(context)
+        log = self._log(context)
+        if np.isnan(self._control(context)).any():
+            # What is held between samples comes with this event: the first step begins with it.
+            log.waits = True
+            closed = self._resets.resting(x, values)
+            state.get_mutable_discrete_state().set_value(numbers_of(closed))
+            self._begin_step(context, x, values)
+            return EventStatus.Succeeded()
+        status = self._reset(context, state)
         # To begin closed is no event.
         log.events = [event for event in log.events if event.kind is not ContactChange.CLOSING]
         return status
 
     def _advance(self, context: Context, state: State) -> EventStatus:
-        self._log(context).time = context.get_time()
-        if (self._margins(context) <= 0.0).any():
+        log = self._log(context)
+        log.time, waits, log.waits = context.get_time(), log.waits, False
+        log.held = not (waits or (self._margins(context) <= 0.0).any())
+        log.pulled.clear()
+        if not log.held:
             return self._reset(context, state)
         x, values = self.state(context), self._values(context)
         try:

@@ -16,6 +16,7 @@ from drake_dae.systems.unilateral.impacts import (
     Fit,
     Touch,
     complementary,
+    rows_of,
     stopping,
 )
 from drake_dae.systems.unilateral.modes import Closed, Modes
@@ -135,6 +136,19 @@ class Resets:
         x = self._modes(closed, x).structure.manifold.projected(x, parameters)
         events += self._changes(time, before, closed, events)
         return After(x, closed, tuple(self._told(events, closed)))
+
+    def resting(self, state: FloatArray, parameters: FloatArray) -> Closed:
+        """The contacts that touch at rest, as many as can be closed together, whatever pushes."""
+        contacts = self._contacts
+        control = np.zeros(contacts.dae.num_controls)
+        matrix = contacts.terms(state, control, parameters).impulse_matrix
+        gaps, rates = (value.copy() for value in contacts.gaps.evaluate(state, parameters))
+        found: list[int] = []
+        for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
+            trial = [contacts.touches[j] for j in (*found, i)]
+            if rows_of(matrix, contacts.kept, trial) is not None:
+                found.append(i)
+        return tuple(i in found for i in range(len(contacts.touches)))
 
     def _impact(
         self,
