@@ -1,4 +1,4 @@
-"""Impulses of contacts in their cones of friction, all at once; numbers alone.
+"""Impulses of several contacts in their cones of friction, all at once; numbers alone.
 
 With u = W y + q, y the impulses and u what becomes of the rates, each contact has its normal first:
 
