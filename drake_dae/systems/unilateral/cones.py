@@ -23,6 +23,9 @@ STEPS = 1000
 LOOK = 20
 """After so many steps each the ways of the contacts are tried."""
 
+LARGEST = 1e8
+"""Impulses that grow beyond this, relative to those that are wanted, balance nothing."""
+
 MARGINS = (1e-8, 1e-5, 1e-3, 1e-2)
 """How near to an edge of its cone an impulse is on it."""
 
@@ -104,6 +107,8 @@ def _searched(W: FloatArray, q: FloatArray, cones: Sequence[Cone]) -> FloatArray
         multiplier = multiplier + penalty * (y - z)
         if step % LOOK:
             continue
+        if not np.abs(z).max() < LARGEST:
+            return None
         found = _polished(W, q, cones, z)
         if found is not None:
             return found
