@@ -21,7 +21,7 @@ from drake_dae.systems.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
 _SHARP = 10.0
-"""So many times faster than it is a motion rubs here: friction is full from v_s / 10 on."""
+"""Friction here is that of a motion so many times as fast: full from v_s / 10 on."""
 
 
 @checked(ModelError)
@@ -34,8 +34,9 @@ class DisturbanceObserver(ParameterizedSystem):
 
     of which r is low-passed with the rate k_o, r_k = e^(-k_o T) r_(k-1) + (1 - e^(-k_o T)) d_k: a
     constant d is found as 1 - e^(-k_o t), and noise n of the velocities, with M the mass, leaves
-    about k_o M n of noise in r. That part of d which the constraints answer, d - Q d, is found with
-    the rate k_n = `force_rate`: it makes no motion, but its noise makes force.
+    about k_o M n of noise in r. That part of d which the constraints answer, d - Q d with Q of
+    `Observation`, is found with the rate k_n = `force_rate`: it makes no motion, but its noise
+    makes force.
 
     Behind springs, motors or valves a law needs n derivatives of d, of which the differences of
     d_k would be noise. There r is what n + 1 such lags leave, one behind the other, r =
@@ -57,17 +58,18 @@ class DisturbanceObserver(ParameterizedSystem):
     Below `least_speed` a contact may stick, and its friction is a reaction like the constraint's:
     no motion tells it, nor its coefficient. Then mu stands still, and so does r in the directions
     in which the contact slides; in the others it goes on. Else r would take up what holds a tool
-    that turns, 2 mu lambda within a sample or two, and give it back for 1 / k_o.
+    that turns, 2 mu lambda within a sample or two, and give it back for 1 / k_o. The integrals of
+    the law go on, so that what friction holds off its place comes there in the end.
 
     Friction acts against the motion that the reference wants, c_w = c(x_w), where x_w is x with the
     velocities that follow from the reference and the constraints: where a motion turns or begins
     the contact sticks, and its own velocity tells no direction. It is that motion at the time at
-    which the control acts, tau = `control_delay` later: r' + tau r''. What wants has no noise and
-    does not creep, so c_w, and c in d where it slides, are those of ten times the velocity: full
-    from v_s / 10 on. Since the law's model has mu c(x), what it is told to cancel is
-    r + mu (c_w - c(x)), of one and the same x. Where outputs and constraints do not determine the
-    velocities, or `reference` has no wire, x_w = x. The speed of sliding is that by the power of
-    friction, for surfaces that stand still.
+    which the control acts, tau = `control_delay` later: r' + tau r''. A reference has no noise, and
+    what slides slowly is not believed; so c_w, and c where d is observed, are those of ten times
+    the velocity: full from v_s / 10 on. Since the law's model has mu c(x), what it is told to
+    cancel is r + mu (c_w - c(x)), of one and the same x. Where outputs and constraints do not
+    determine the velocities, or `reference` has no wire, x_w = x. The speed of sliding is that by
+    the power of friction, for surfaces that stand still.
 
     Input ports:
         estimated_state: x, shape (n,).
