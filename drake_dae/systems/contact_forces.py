@@ -26,7 +26,7 @@ class ContactForces(LeafSystem):
     points and patches, exert on the robot. A contact that is open has lambda = 0 and phi > 0.
 
     Input ports:
-        state: x = (q, v) of the links, shape (n,).
+        state: x, shape (n,).
         contact_results: Those of the MultibodyPlant.
 
     Output ports:
@@ -37,7 +37,7 @@ class ContactForces(LeafSystem):
         controlled_output: z = l(x) + m(x) lambda.
 
     Args:
-        model: The robot, with rigid joints; each constraint is a contact with one force.
+        model: The robot; each constraint is a contact with one force.
         structure: The structure of its system.
         pairs: For each constraint, the geometry of the robot and that of what it touches.
         parameters: Values of all parameters.
