@@ -182,7 +182,7 @@ def shares(forces: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
     Args:
         forces: The forces as columns, shape (k, c).
         metric: W, shape (k, k).
-        d: What is shared, shape (k,), or as columns.
+        d: What is shared, shape (k,).
     """
     matched = metric @ forces
     return np.asarray(d @ matched / np.maximum(np.sum(forces * matched, axis=0), _TINY))

@@ -154,16 +154,15 @@ def test_force_tends_to_that_of_the_ideal_constraint():
 
 @pytest.mark.slow
 def test_flexible_joints_are_tracked_by_a_law_that_does_not_know_the_friction():
-    """The same circle and force behind springs: measured 0.0003 mm and 0.005 N rms from 2 to 3 s.
+    """The same circle and force behind springs: measured 0.001 mm and 0.01 N rms from 2 to 3 s.
 
-    What it identifies is 0.3 sqrt(1 + (0.02 / 0.1)^2): its model is smooth by 0.02 m/s, and the
-    contact slides by 0.1 m/s.
+    The model is smooth by 0.02 m/s, so that it has less than all of the friction at 0.1 m/s.
     """
     _, _, record = run_scenario(scenario("wall_flexible_contact", "duration=3.0"))
     late = record["tracking_error"][record.time > 2.0]
     assert np.sqrt(np.mean(np.sum(late[:, :2] ** 2, axis=1))) < 2e-6
     assert np.sqrt(np.mean(late[:, -1] ** 2)) < 0.02
-    assert_allclose(record["friction"][[0, -1], 0], [0.0, 0.3 * np.sqrt(1.04)], atol=2e-3)
+    assert_allclose(record["friction"][[0, -1], 0], [0.0, 0.3], atol=2e-3)
     assert record["state"].shape[1] == 28
 
 
