@@ -137,6 +137,22 @@ def test_impacts_that_rub_are_in_their_cones_and_gain_no_energy(tangents, count,
     assert less > 0 or count == 1
 
 
+def test_contacts_of_a_mechanism_of_one_freedom_find_impulses():
+    """Each moves along its own slope: impulses pierce nothing, rub in their cones, gain no energy."""
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        J = random.standard_normal(4)
+        J[::2] = -np.abs(J[::2])
+        contacts = [Rubbing(i, rows(i + 1), random.uniform(0.0, 1.0), 0.5) for i in (0, 2)]
+        impulses = impact(np.outer(J, J), J, rows(), contacts)
+        after = J * (1.0 + J @ impulses)
+        assert impulses @ (J + after) <= 1e-12
+        for one, push, along in zip(contacts, impulses[::2], impulses[1::2], strict=True):
+            assert push >= 0.0
+            assert abs(along) <= one.friction * push * (1.0 + 1e-10)
+            assert after[one.normal] >= -1e-9
+
+
 def test_a_box_that_lands_on_four_feet():
     """Twelve rows on six freedoms: impulses are in their cones, and rub as Coulomb says."""
     for seed in range(30):
