@@ -138,7 +138,7 @@ def test_impacts_that_rub_are_in_their_cones_and_gain_no_energy(tangents, count,
 
 
 def test_contacts_of_a_mechanism_of_one_freedom_find_impulses():
-    """Each moves along its own slope: impulses pierce nothing, rub in their cones, gain no energy."""
+    """Each moves along its own slope; impulses pierce nothing, and rub in their cones."""
     for seed in range(6):
         random = np.random.default_rng(seed)
         J = random.standard_normal(4)
