@@ -13,6 +13,7 @@ from runs import run_scenario, scenario
 
 from drake_dae import Record
 from drake_dae.cli import main
+from drake_dae.diagrams.rollout.course import Course
 from drake_dae.simulation.interruption import ENDING_SIGNALS
 from drake_dae.simulation.run_folder import FILES, PART
 
@@ -133,3 +134,24 @@ def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
     chosen = [(sent, moments.uniform(0.1, 2.2 * SECONDS)) for sent in 3 * signals]
     counts = [check(*found, undisturbed) for found in interrupted(chosen, tmp_path)]
     assert len(set(counts)) > 3
+
+
+def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys):
+    """Ctrl-C after some steps of the integrator: the record goes up to there."""
+    accept = Course.accept
+
+    def and_interrupt(self, *arguments):
+        accept(self, *arguments)
+        if self.steps == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    words = ["simulate", "two_link_wall", "--rollout", "--compiled", "false", "--set=duration=10"]
+    words += [f"--set={setting}" for setting in BARE]
+    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+    monkeypatch.setattr(Course, "accept", and_interrupt)
+    assert main([*words, "--out", str(tmp_path / "part")]) == 128 + signal.SIGINT
+    assert "interrupted" in capsys.readouterr().out
+    whole, part = (Record.load(tmp_path / name / "record.npz") for name in ("whole", "part"))
+    assert 1 < part.time.size < whole.time.size
+    for name in whole.signals:
+        np.testing.assert_allclose(part[name], whole[name][: part.time.size], rtol=0.0, atol=1e-12)

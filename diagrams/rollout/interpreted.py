@@ -27,7 +27,7 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
     """
     steps = None
     if settings.tableau is not None:
-        steps = _Steps(fused, settings.tableau, settings.longest)
+        steps = _Steps(fused, settings.tableau, settings)
 
     def run(problem: Problem) -> Run:
         start = float(problem.times[0])
@@ -53,6 +53,8 @@ def _control(course: Course, settings: Settings) -> None:
     rate: FloatArray | None = None
     course.write(course.time, course.state)
     while course.time < moments[-1]:
+        if settings.stop():
+            raise Ended(Ending.PAUSED)
         if course.update(is_on=rate is not None):
             rate = None
         if rate is None:
@@ -141,8 +143,8 @@ def _first_step(course: Course, rate: FloatArray, settings: Settings) -> float:
 class _Steps:
     """Fixed steps, many in one call of CasADi."""
 
-    def __init__(self, fused: Fused, tableau: Tableau, longest: float) -> None:
-        self._tableau, self._longest = tableau, longest
+    def __init__(self, fused: Fused, tableau: Tableau, settings: Settings) -> None:
+        self._tableau, self._longest, self._stop = tableau, settings.longest, settings.stop
         self._one, self._many = fused.steps(tableau)
 
     def run(self, course: Course) -> None:
@@ -153,6 +155,8 @@ class _Steps:
             course.update()
             done = 0
             while done < len(block):
+                if self._stop():
+                    raise Ended(Ending.PAUSED)
                 done += self._advance(course, block[done : done + CHUNK])
         course.rows[-1] = course.rows[-1].without_last()
         course.update()

@@ -77,7 +77,7 @@ def run(code: Library, functions: LoopFunctions, problem: Problem, settings: Set
     given += [problem.events.size, problem.events, problem.noise, *tables]
     arguments = [_argument(value) for value in given]
     ending = Ending.PAUSED
-    while ending is Ending.PAUSED:
+    while ending is Ending.PAUSED and not settings.stop():
         ending = Ending(step(ctypes.byref(own), *arguments, _argument(BUDGET)))
         if ending is Ending.OFF_MANIFOLD:
             try:

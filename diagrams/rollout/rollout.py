@@ -113,13 +113,15 @@ def run_loop(
     compiled: Compiled | None = None,
     seeds: Sequence[int] | None = None,
     lasting: float | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> list[Rollout]:
-    """`rollout`, where these runs may be some of many.
+    """`rollout`, where these runs may be some of many, and may be stopped.
 
     Args:
         lasting: How long all of them last together, in s. Then this alone decides on machine code,
             not what the cache has: the numbers are the same whenever they are computed. None if
             these are all.
+        stop: Whether to stop where a run is, looked at now and then; its record goes up to there.
     """
     config = config or SimulatorConfig()
     check_config(config)
@@ -129,7 +131,7 @@ def run_loop(
     functions = functions_of(loop)
     scale = np.ones(functions.size)
     scale[: loop.plant.dae.num_states] = loop.plant.dae.scale
-    settings = Settings.of(config, scale)
+    settings = Settings.of(config, scale, stop)
     problems = problems_of(functions, starts, parameters, moments, seeds)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
     kinds = [_is_model(loop, problem) for problem in problems]
@@ -235,6 +237,6 @@ def _machine_code(
 
 def _result(functions: LoopFunctions, problem: Problem, run: Run) -> Rollout:
     failure = None
-    if run.ending is not Ending.DONE:
+    if run.ending not in (Ending.DONE, Ending.PAUSED):
         failure = failure_of(functions, problem, run)
     return Rollout(run.steps, failure, functions, problem.times, run.rows)

@@ -72,20 +72,23 @@ class Settings:
         tableau: The method of fixed steps; None for error control, by DOP853.
         absolute: The error that a step may make, for each state, shape (n,).
         relative: The same relative to the state.
+        stop: Whether to stop where the run is, looked at now and then.
     """
 
     longest: float
     tableau: Tableau | None
     absolute: FloatArray
     relative: float
+    stop: Callable[[], bool]
 
     @classmethod
-    def of(cls, config: SimulatorConfig, scale: FloatArray) -> Self:
+    def of(cls, config: SimulatorConfig, scale: FloatArray, stop: Callable[[], bool]) -> Self:
         """The settings of a scenario.
 
         Args:
             config: Drake's settings.
             scale: How large the states are, shape (n,).
+            stop: As the attribute.
 
         Raises:
             ModelError: Its scheme has fixed steps, and is implicit.
@@ -99,7 +102,7 @@ class Settings:
                 )
             tableau = FIXED[scheme]
         relative = max(SHARE * config.accuracy, SMALLEST)
-        return cls(config.max_step_size, tableau, relative * scale, relative)
+        return cls(config.max_step_size, tableau, relative * scale, relative, stop)
 
 
 @dataclass(frozen=True, eq=False)

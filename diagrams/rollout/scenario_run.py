@@ -1,5 +1,6 @@
 """The run of a scenario by `rollout`, as the command and studies make it."""
 
+from collections.abc import Callable
 from math import ceil
 
 import numpy as np
@@ -25,7 +26,11 @@ def rollout_times(scenario: Scenario) -> FloatArray:
 
 
 def roll_scenario(
-    scenario: Scenario, loop: ClosedLoop, context: Context, lasting: float | None = None
+    scenario: Scenario,
+    loop: ClosedLoop,
+    context: Context,
+    lasting: float | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Rollout:
     """Runs a scenario by `rollout`.
 
@@ -35,6 +40,7 @@ def roll_scenario(
         context: The start, by `start_scenario`.
         lasting: How long this loop will be run altogether, in s, which decides on machine code
             alone; None if this run is all, and what is in the cache is welcome.
+        stop: Whether to stop where the run is, looked at now and then.
 
     Raises:
         ModelError: The loop has what no rollout has.
@@ -42,6 +48,14 @@ def roll_scenario(
     """
     start, parameters = start_values(loop, context)
     seeds = [scenario.force.seed] if scenario.force.is_measured else None
-    times, config = rollout_times(scenario), scenario.integrator
-    (found,) = run_loop(loop, start, parameters, times, config=config, seeds=seeds, lasting=lasting)
+    (found,) = run_loop(
+        loop,
+        start,
+        parameters,
+        rollout_times(scenario),
+        config=scenario.integrator,
+        seeds=seeds,
+        lasting=lasting,
+        stop=stop,
+    )
     return found

@@ -145,11 +145,16 @@ def _roll(run: _Run) -> RunStatistics:
     if isinstance(run.loop, TaskLoop):
         raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
-    found = roll_scenario(run.scenario, run.loop, run.context)
+    with ending_signals(ending := Ending()):
+        found = roll_scenario(
+            run.scenario, run.loop, run.context, stop=lambda: ending.signal is not None
+        )
     run.record = found.record
     if found.failure is not None:
         raise found.failure
-    return RunStatistics(run.scenario.duration, time.perf_counter() - began, found.steps, None)
+    times, wall = run.record.time, time.perf_counter() - began
+    simulated = float(times[-1] - times[0]) if times.size else 0.0
+    return RunStatistics(simulated, wall, found.steps, ending.signal)
 
 
 def _run(

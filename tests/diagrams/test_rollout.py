@@ -21,6 +21,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
+from drake_dae.diagrams.rollout.rollout import run_loop
 from drake_dae.diagrams.rollout.scenario_run import roll_scenario
 from drake_dae.errors import (
     InconsistentStateError,
@@ -382,3 +383,22 @@ def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
         (found,) = rollout(*arguments, config=chosen.integrator, compiled=compiled, seeds=seeds)
         assert found.failure is None
         assert_equal_records(found.record, wanted, 1e-10)
+
+
+@both
+def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
+    """Fixed steps of 1e-4 s; machine code looks after 20,000 steps, CasADi's after each call."""
+    fixed = ["use_error_control=false", "integration_scheme=runge_kutta3", "max_step_size=1e-4"]
+    chosen = scenario("two_link_wall", "duration=3", *(f"integrator.{each}" for each in fixed))
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    times, looks = np.linspace(0.0, 3.0, 31), iter([False] * (1 if compiled else 40))
+    settings = {"config": chosen.integrator, "compiled": compiled}
+    (whole,) = run_loop(loop, start, parameters, times, **settings)
+    (part,) = run_loop(loop, start, parameters, times, stop=lambda: next(looks, True), **settings)
+    assert part.failure is None
+    assert 1 < part.record.time.size < 31
+    for name in whole.record.signals:
+        np.testing.assert_array_equal(
+            part.record[name], whole.record[name][: part.record.time.size]
+        )
