@@ -17,7 +17,8 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.advice import advised
-from drake_dae.diagrams.closed_loop import ClosedLoop, can_be_fed_back, make_closed_loop
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.closed_loop_wiring import can_be_fed_back, make_closed_loop
 from drake_dae.diagrams.completion.completion import Completed
 from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant

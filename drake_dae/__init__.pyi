@@ -47,7 +47,7 @@ from .dae.tracking import TrackingLaw as TrackingLaw
 from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.build import build_scenario as build_scenario
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
-from .diagrams.closed_loop import make_closed_loop as make_closed_loop
+from .diagrams.closed_loop_wiring import make_closed_loop as make_closed_loop
 from .diagrams.contact_material import ContactMaterial as ContactMaterial
 from .diagrams.contact_plant import ContactPlant as ContactPlant
 from .diagrams.export.export import export_code as export_code
