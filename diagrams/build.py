@@ -1,8 +1,6 @@
 """The closed loop that a scenario describes."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import cast
 
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
@@ -15,7 +13,6 @@ from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.advice import advised
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.closed_loop_wiring import can_be_fed_back, make_closed_loop
@@ -24,15 +21,14 @@ from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at, violated
 from drake_dae.diagrams.observing import observed_structure
-from drake_dae.diagrams.own_model import check_pushes, own_model
+from drake_dae.diagrams.own_model import own_model
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import (
-    add_robot,
     completed_model,
-    index_of,
     scenario_structure,
-    start_guess,
 )
+from drake_dae.diagrams.scenario_plant import contact_plant
+from drake_dae.diagrams.scenario_start import start_closed_loop
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.task_build import check_task, start_task, wire_task
 from drake_dae.diagrams.task_loop import TaskLoop
@@ -40,7 +36,6 @@ from drake_dae.diagrams.unilateral import Unilateral
 from drake_dae.diagrams.wiring import hold_before
 from drake_dae.errors import (
     AssumptionError,
-    InconsistentStateError,
     ModelError,
     ScenarioError,
 )
@@ -114,14 +109,7 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop | TaskLoop) -> Context:
     """
     if isinstance(loop, TaskLoop):
         return start_task(scenario, loop)
-    context = loop.diagram.CreateDefaultContext()
-    context.SetTime(scenario.integrator.start_time)
-    if scenario.gains is not None:  # Those that were advised are in the law.
-        with at("gains"):
-            own = loop.controller.GetMyMutableContextFromRoot(context)
-            loop.controller.set_gains(own, scenario.gains.design())
-    _start(scenario, cast(RobotPlant, loop.plant).model, loop, context)
-    return context
+    return start_closed_loop(scenario, loop)
 
 
 def wire_scenario(
@@ -242,30 +230,6 @@ def _plant(
     return contact_plant(scenario, model, structure)
 
 
-@at("plant or plant_parameters")
-def contact_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> ContactPlant:
-    """The plant of a scenario in Drake's contact.
-
-    Args:
-        scenario: A scenario with `plant: !MultibodyPlant`.
-        model: The scenario's robot, by `scenario_model`.
-        structure: The structure of the model's system.
-
-    Raises:
-        ScenarioError: The robot cannot touch in this way.
-    """
-    check_pushes(scenario.plant_pushes, model.links)
-    assert isinstance(scenario.plant, ContactMaterial)
-    return ContactPlant(
-        model,
-        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
-        scenario.plant,
-        structure=structure,
-        parameters=scenario.plant_parameters,
-        pushes=scenario.plant_pushes,
-    )
-
-
 @at("saturation")
 def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
     """The largest controls, if the scenario wants drives that give no more."""
@@ -318,75 +282,3 @@ def exogenous_references(
             del degrees[: reference.size]
         moving += references
     return moving
-
-
-def _start(scenario: Scenario, model: RobotModel, loop: ClosedLoop, context: Context) -> None:
-    """Sets parameters, state and sensor: at rest, where the references begin, plus the errors."""
-    plant = loop.plant
-    own = plant.GetMyMutableContextFromRoot(context)
-    if not isinstance(plant, ContactPlant):
-        with at("plant_parameters"):
-            for name, numbers in scenario.plant_parameters.items():
-                plant.set_parameter(own, name, numbers)
-    parameters = plant.current_parameters(own)
-    wanted = _wanted(scenario.start.errors, loop, context.get_time())
-    positions, forces = np.split(wanted, [len(model.position_signals)])
-    with at("start"):
-        guess = start_guess(scenario.start.positions, model.links)
-        q = _configuration(model, positions, guess, parameters)
-        state = model.rest_state(q, forces, parameters)
-        if scenario.exogenous:
-            state = _in_motion(loop, context, wanted, state)
-        plant.set_consistent_state(own, state)
-    if loop.sensor is not None:
-        force = model.rest_forces(q, forces, parameters)
-        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
-        loop.set_seed(context, scenario.force.seed)
-    if loop.encoders is not None and scenario.encoders is not None:
-        loop.encoders.set_seed(context, scenario.encoders.seed)
-
-
-def _in_motion(
-    loop: ClosedLoop, context: Context, wanted: FloatArray, guess: FloatArray
-) -> FloatArray:
-    """The state whose outputs move as their references do, but for their errors.
-
-    Where something moves, nothing that touches it is at rest.
-    """
-    law, controller = loop.controller.law, loop.controller
-    goal = loop.reference.reference(context.get_time())
-    goal[law.layout.lowest] = wanted
-    parameters = controller.current_parameters(controller.GetMyContextFromRoot(context))
-    return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, parameters)
-
-
-@at("start.errors")
-def _wanted(errors: dict[str, float], loop: ClosedLoop, time: float) -> FloatArray:
-    """z at the start: the references plus the errors, shape (p,)."""
-    degrees = loop.controller.law.degrees
-    wanted = loop.controller.law.layout.values(loop.reference.reference(time))
-    for name, error in errors.items():
-        index = index_of(name, loop.plant.dae.output_signals, "output")
-        if degrees[index] == 0:
-            raise ModelError(
-                f"'{name}' has degree 0: the law meets it at once and it has no start error"
-            )
-        wanted[index] += error
-    return wanted
-
-
-def _configuration(
-    model: RobotModel, positions: FloatArray, guess: FloatArray, parameters: FloatArray
-) -> FloatArray:
-    """q with given position outputs, on the constraints."""
-    try:
-        return model.configuration(positions, guess, parameters)
-    except InconsistentStateError as error:
-        goal = ", ".join(
-            f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
-            for signal, value in zip(model.position_signals, positions, strict=True)
-        )
-        raise ModelError(
-            f"found no configuration near start.positions with {goal} (the references and "
-            f"start.errors at the start) on the constraints: {error}"
-        ) from error

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from pydrake.common import RandomGenerator
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import (
     Context,
@@ -17,6 +16,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.diagrams.force_feedback import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.diagrams.unilateral import with_events
 from drake_dae.errors import DrakeDaeError, WiringError
@@ -28,6 +28,8 @@ from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator
 from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
+
+Plant = DaePlant | ContactPlant | UnilateralRobotPlant
 
 
 @checked(WiringError)
@@ -54,7 +56,7 @@ class ClosedLoop:
     """
 
     diagram: Diagram
-    plant: DaePlant | ContactPlant | UnilateralRobotPlant
+    plant: Plant
     controller: TrackingController
     reference: ReferenceGenerator
     loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]]
@@ -85,9 +87,7 @@ class ClosedLoop:
             context: The diagram's context.
             seed: The seed of the random numbers.
         """
-        if self.noise is not None:
-            own = self.noise.GetMyMutableContextFromRoot(context)
-            self.noise.SetRandomContext(own, RandomGenerator(seed))
+        seed_noise(self.noise, context, seed)
 
     def record(self, context: Context, after: float | None = None) -> Record:
         """What was logged up to now, and what follows from it.

@@ -15,7 +15,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference, references_by_name
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.closed_loop import ClosedLoop, Plant
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.observing import add_observer
@@ -38,14 +38,11 @@ from drake_dae.systems.encoders import Encoders
 from drake_dae.systems.limits import ControlLimits
 from drake_dae.systems.observer import DisturbanceObserver
 from drake_dae.systems.observer_rates import Observing
-from drake_dae.systems.plant import DaePlant
 from drake_dae.systems.references import ReferenceGenerator, SystemReference
 from drake_dae.systems.sampling import Sampling
 from drake_dae.systems.sensors import ForceSensor
 from drake_dae.systems.tolerances import Tolerances
 from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
-
-Plant = DaePlant | ContactPlant | UnilateralRobotPlant
 
 
 def can_be_fed_back(

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.common import RandomDistribution
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.diagrams.contact_plant import ContactPlant
@@ -111,3 +111,15 @@ def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> floa
     polynomial[1] -= a
     polynomial[-1] += (1.0 - a) * gain
     return float(np.max(np.abs(np.roots(polynomial)), initial=0.0))
+
+
+def seed_noise(noise: RandomSource | None, context: Context, seed: int) -> None:
+    """Chooses the noise of a sensor, if it has any.
+
+    Args:
+        noise: Its source.
+        context: The diagram's context.
+        seed: The seed of the random numbers.
+    """
+    if noise is not None:
+        noise.SetRandomContext(noise.GetMyMutableContextFromRoot(context), RandomGenerator(seed))

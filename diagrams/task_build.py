@@ -1,7 +1,5 @@
 """The loop of a scenario with a task."""
 
-from functools import partial
-
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
@@ -12,7 +10,9 @@ from drake_dae.diagrams.contact_material import ContactMaterial
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.scenario import Scenario
-from drake_dae.diagrams.scenario_model import add_robot, start_guess
+from drake_dae.diagrams.scenario_model import start_guess
+from drake_dae.diagrams.scenario_plant import contact_plant
+from drake_dae.diagrams.scenario_start import new_context
 from drake_dae.diagrams.task_loop import TaskLoop, make_task_loop
 from drake_dae.diagrams.unilateral import Unilateral
 from drake_dae.diagrams.wiring import hold_before
@@ -67,16 +67,10 @@ def wire_task(
         free_law = TrackingLaw(free_system, (task.gains or gains).design())
 
     plant: ContactPlant | UnilateralRobotPlant
-    with at("plant or plant_parameters"):
-        if isinstance(scenario.plant, ContactMaterial):
-            plant = ContactPlant(
-                model,
-                partial(add_robot, scenario.robot),
-                scenario.plant,
-                structure=structure,
-                parameters=scenario.plant_parameters,
-            )
-        else:
+    if isinstance(scenario.plant, ContactMaterial):
+        plant = contact_plant(scenario, model, structure)
+    else:
+        with at("plant or plant_parameters"):
             given = scenario.plant
             made = given if isinstance(given, Unilateral) else Unilateral({contact.name: 0.0})
             plant = made.plant(model, structure)
@@ -104,14 +98,8 @@ def start_task(scenario: Scenario, loop: TaskLoop) -> Context:
 
     The arguments and errors are those of `start_scenario`.
     """
-    context = loop.diagram.CreateDefaultContext()
-    context.SetTime(scenario.integrator.start_time)
-    plant, model = loop.plant, loop.plant.model
+    context, plant, model = new_context(scenario, loop), loop.plant, loop.plant.model
     own = plant.GetMyMutableContextFromRoot(context)
-    if not isinstance(plant, ContactPlant):
-        with at("plant_parameters"):
-            for name, numbers in scenario.plant_parameters.items():
-                plant.set_parameter(own, name, numbers)
     controller, values = loop.controller, plant.current_parameters(own)
     law = controller.law if controller.task.contacts[0] else controller.free_law
     with at("start"):

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource, VectorLogSink
@@ -14,9 +13,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Signal
 from drake_dae.diagrams.contact_plant import ContactPlant
-from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.force_feedback import add_force_feedback, seed_noise
 from drake_dae.diagrams.unilateral import with_events
-from drake_dae.diagrams.wiring import add_block, hold_before, log_steps
+from drake_dae.diagrams.wiring import add_block, check_system, hold_before, log_steps
 from drake_dae.errors import WiringError
 from drake_dae.simulation.record import Record, Recorded
 from drake_dae.simulation.view import RobotBlock, add_live_view
@@ -63,9 +62,7 @@ class TaskLoop:
             context: The diagram's context.
             seed: The seed of the random numbers.
         """
-        if self.noise is not None:
-            own = self.noise.GetMyMutableContextFromRoot(context)
-            self.noise.SetRandomContext(own, RandomGenerator(seed))
+        seed_noise(self.noise, context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Starts the robot at a state, shape (n,), in contact or not.
@@ -226,13 +223,7 @@ def _signals(
 
 def _check(plant: Plant, controller: TaskController) -> None:
     own, other = plant.dae, controller.law.system
-    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
-    if sizes[0] != sizes[1]:
-        has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
-        raise WiringError(
-            f"the task is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. Make "
-            "the laws for the plant's robot"
-        )
+    check_system(own, other, "task", "the laws for the plant's robot")
     if plant.time_step and not controller.sample_period:
         raise WiringError(
             f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "

@@ -10,6 +10,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, VectorLogSink
 
 from drake_dae.dae.references import Reference
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.errors import ModelError, WiringError
@@ -59,17 +60,28 @@ def add_exogenous(
     return generator
 
 
-def check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
-    """Refuses wrong sizes: Drake would name the ports, but not what is wrong with them."""
-    own, other = plant.dae, law.system
+def check_system(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
+    """Refuses what is for a system of another size than the plant's.
+
+    Args:
+        own: The plant's system.
+        other: What it is for.
+        what: What is wired to the plant.
+        remedy: What to make instead.
+    """
     sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
     if sizes[0] != sizes[1]:
         has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
         raise WiringError(
-            f"the law is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. Make "
-            "the law for the plant's system, TrackingLaw(plant.dae, ...), or for a model of the "
-            "same structure"
+            f"the {what} is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. "
+            f"Make {remedy}"
         )
+
+
+def check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
+    """Refuses wrong sizes: Drake would name the ports, but not what is wrong with them."""
+    own, remedy = plant.dae, "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
+    check_system(own, law.system, "law", f"{remedy} a model of the same structure")
     if sensor is not None:
         size = sensor.GetInputPort("force").size()
         if size != own.num_constraints:

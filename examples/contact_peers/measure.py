@@ -23,10 +23,11 @@ from contact_peers.robot import Goals, Robot
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.diagrams.advice import advised
-from drake_dae.diagrams.build import contact_plant, start_scenario, wire_loop
+from drake_dae.diagrams.build import start_scenario, wire_loop
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import scenario_model, scenario_structure
+from drake_dae.diagrams.scenario_plant import contact_plant
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.simulate import simulate

@@ -401,13 +401,28 @@ def test_push_behind_a_spring_is_found_with_its_derivatives_and_cancelled():
         sampling=Sampling(T),
         observer=Observing(RATE),
     )
-    context = loop.diagram.CreateDefaultContext()
-    loop.plant.set_parameter(loop.plant.GetMyMutableContextFromRoot(context), "disturbance", 4.0)
-    simulate(loop.diagram, context, 6.0, STEPS)
-    record = loop.record(context)
+
+    def pushed_for(duration):
+        context = loop.diagram.CreateDefaultContext()
+        own = loop.plant.GetMyMutableContextFromRoot(context)
+        loop.plant.set_parameter(own, "disturbance", 4.0)
+        simulate(loop.diagram, context, duration, STEPS)
+        return context
+
+    record = loop.record(pushed_for(6.0))
     times, found = at_samples(record, "disturbance")
     seen = RATE * np.maximum(times - T, 0.0)
     wanted = 4.0 * (1.0 - np.exp(-seen) * (1.0 + seen + seen**2 / 2.0))
     assert_allclose(found[:, 0], wanted, atol=4e-3)
     assert np.abs(record["tracking_error"]).max() > 5e-3
     assert abs(record["tracking_error"][-1, 0]) < 1e-6
+    # d k (k t)^2 / 2 e^(-k t), and its derivative, are told as r' and r''.
+    context, seen = pushed_for(0.2), RATE * 0.2
+    port = loop.observer.GetOutputPort("exogenous")
+    told = port.Eval(loop.observer.GetMyContextFromRoot(context))
+    rates = [
+        1.0 - np.exp(-seen) * (1.0 + seen + seen**2 / 2.0),
+        RATE * np.exp(-seen) * seen**2 / 2.0,
+    ]
+    rates.append(RATE**2 * np.exp(-seen) * (seen - seen**2 / 2.0))
+    assert_allclose(told, 4.0 * np.array(rates), rtol=1e-3)

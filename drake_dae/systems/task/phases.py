@@ -178,9 +178,25 @@ class Press(Phase):
         return f"a force within {self.tolerance:g} N of its reference"
 
 
+class _Lasting(Phase):
+    """A phase that ends after its `duration`, a field of the phases of this kind."""
+
+    duration: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(f"{self.name}: duration", self.duration)
+
+    def margin(self, now: Moment, contact_force: float) -> float:
+        return self.duration - now.time
+
+    def awaited(self, contact_force: float) -> str:
+        return f"the end of {self.duration:g} s"
+
+
 @checked(ModelError)
 @dataclass(frozen=True)
-class Move(Phase):
+class Move(_Lasting):
     """Outputs follow references for some time, in contact or not, as the phase before.
 
     Attributes:
@@ -195,23 +211,13 @@ class Move(Phase):
     duration: float
     if_lost: Reaction = field(default="hold", kw_only=True)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("Move: duration", self.duration)
-
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return self.references
-
-    def margin(self, now: Moment, contact_force: float) -> float:
-        return self.duration - now.time
-
-    def awaited(self, contact_force: float) -> str:
-        return f"the end of {self.duration:g} s"
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class Dwell(Phase):
+class Dwell(_Lasting):
     """All outputs come to rest where they are, the force too, for some time.
 
     Attributes:
@@ -222,16 +228,6 @@ class Dwell(Phase):
 
     duration: float
     if_lost: Reaction = field(default="hold", kw_only=True)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("Dwell: duration", self.duration)
-
-    def margin(self, now: Moment, contact_force: float) -> float:
-        return self.duration - now.time
-
-    def awaited(self, contact_force: float) -> str:
-        return f"the end of {self.duration:g} s"
 
 
 @checked(ModelError)
