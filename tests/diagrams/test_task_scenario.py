@@ -141,6 +141,16 @@ def test_a_task_that_begins_in_contact_starts_on_it(file):
     assert abs(loop.plant.GetOutputPort("gap").Eval(own).item()) < 1e-12
 
 
+def test_a_task_has_the_noise_of_its_seed(file):
+    noisy = "force=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
+    found = []
+    for seed in (1, 2, 1):
+        loop, context = build_scenario(load_scenario(file, [noisy, f"force.seed={seed}"]))
+        own = loop.noise.GetMyContextFromRoot(context)
+        found.append(loop.noise.get_output_port().Eval(own).item())
+    assert found[0] == found[2] != found[1]
+
+
 def test_a_link_is_heavier_in_either_plant(file):
     """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
     sagged = []

@@ -199,6 +199,12 @@ def test_friction_stays_between_zero_and_its_limit():
     assert record["friction"].min() >= 0.0
 
 
+def test_friction_stands_still_where_the_contact_is_taken_for_lost():
+    _, record = slide(SWAY, 0.1, Observing(20.0, friction_rate=10.0, least_force=100.0))
+    assert np.all(record["friction"] == 0.0)
+    assert np.abs(record["disturbance"][-1]).max() > 0.5
+
+
 def test_friction_stands_still_where_nothing_slides():
     """A reaction holds the arm still then; what is found is what the wall answers, at its own rate.
 
