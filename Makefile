@@ -60,7 +60,7 @@ campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
 	$(PYTEST) -m thorough
-	$(BIN)/python tests/woodpecker.py
+	$(BIN)/python tests/support/woodpecker.py
 	$(BIN)/python tests/campaign/polish.py
 
 # Friction, stiffness, place and tilt of the wall; masses, a push, sensors. A law that does not track
@@ -86,7 +86,7 @@ peers: $(VENV)/installed
 	PYTHONPATH=examples $(BIN)/python -m contact_peers $(ARGS)
 
 house: $(VENV)/installed-dev
-	$(BIN)/python tests/draw_house.py $(HOUSE)
+	$(BIN)/python tests/support/draw_house.py $(HOUSE)
 
 pictures: $(VENV)/installed
 	$(BIN)/drake-dae simulate wall_polish --out runs/polish

@@ -14,20 +14,20 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.force_feedback import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.diagrams.unilateral import with_events
 from drake_dae.errors import DrakeDaeError, WiringError
-from drake_dae.simulation.record import Record, Recorded
-from drake_dae.systems.along import function_along
-from drake_dae.systems.controller import TrackingController
-from drake_dae.systems.observer import DisturbanceObserver
-from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.references import ReferenceGenerator
-from drake_dae.systems.sensors import ForceSensor
-from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
+from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.systems.blocks.along import function_along
+from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.observer import DisturbanceObserver
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 Plant = DaePlant | ContactPlant | UnilateralRobotPlant
 

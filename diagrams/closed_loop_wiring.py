@@ -13,10 +13,9 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference, references_by_name
-from drake_dae.dae.signals import Signal
-from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop, Plant
-from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.observing import add_observer
 from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
@@ -32,17 +31,18 @@ from drake_dae.diagrams.wiring import (
     log_steps,
 )
 from drake_dae.errors import DrakeDaeError, WiringError
-from drake_dae.simulation.view import RobotBlock, add_live_view
-from drake_dae.systems.controller import TrackingController
-from drake_dae.systems.encoders import Encoders
-from drake_dae.systems.limits import ControlLimits
-from drake_dae.systems.observer import DisturbanceObserver
-from drake_dae.systems.observer_rates import Observing
-from drake_dae.systems.references import ReferenceGenerator, SystemReference
-from drake_dae.systems.sampling import Sampling
-from drake_dae.systems.sensors import ForceSensor
-from drake_dae.systems.tolerances import Tolerances
-from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
+from drake_dae.pictures.view import RobotBlock, add_live_view
+from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.observer import DisturbanceObserver
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.control.references import ReferenceGenerator, SystemReference
+from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.systems.sensing.encoders import Encoders
+from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.sensing.tolerances import Tolerances
 
 
 def can_be_fed_back(

@@ -7,13 +7,13 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
-from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.errors import WiringError
-from drake_dae.systems.controller import TrackingController
-from drake_dae.systems.observer import DisturbanceObserver
-from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.sampling import Sampling
-from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.observer import DisturbanceObserver
+from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.controller import TaskController
 
 

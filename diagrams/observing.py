@@ -2,19 +2,14 @@
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from drake_dae.dae.disturbance import with_disturbance
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.diagrams.contact_plant import ContactPlant
-from drake_dae.diagrams.keys import at
-from drake_dae.diagrams.scenario import Scenario
-from drake_dae.errors import ModelError, WiringError
-from drake_dae.robots.model import RobotModel
-from drake_dae.systems.controller import TrackingController
-from drake_dae.systems.limits import ControlLimits
-from drake_dae.systems.observer import DisturbanceObserver
-from drake_dae.systems.observer_rates import Observing
-from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.sampling import Sampling
+from drake_dae.errors import WiringError
+from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.observer import DisturbanceObserver
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.dae_plant import DaePlant
 
 
 def add_observer(
@@ -69,27 +64,3 @@ def add_observer(
     if limits is not None:
         builder.Connect(limits.GetOutputPort("is_limited"), observer.GetInputPort("hold"))
     return observer
-
-
-def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
-    """The structure of what a scenario's law is for: with a disturbance, where it is observed.
-
-    Raises:
-        ScenarioError: The observer does not fit; the message names its key.
-    """
-    observer = scenario.observer
-    if observer is None:
-        return structure
-    with at("observer"):
-        if scenario.exogenous:
-            raise ModelError("not beside exogenous signals, whose port it feeds")
-        rubbing = {c.name: c.friction_parameter for c in model.constraints if c.friction_parameter}
-        for name in observer.friction:
-            if name not in rubbing:
-                raise ModelError(
-                    f"friction: '{name}' is no constraint with friction; give it friction: 0.0 "
-                    f"where it is not known. With friction: {', '.join(rubbing) or 'none'}"
-                )
-        velocities = [signal.name for signal in model.links.velocity_signals]
-        frictions = [rubbing[name] for name in observer.friction]
-        return find_structure(with_disturbance(model.dae, velocities, frictions))

@@ -7,11 +7,11 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
-from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.simulation.view import RobotBlock
-from drake_dae.systems.encoders import Encoders, StateSensor
-from drake_dae.systems.plant import DaePlant
+from drake_dae.pictures.view import RobotBlock
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,22 +11,22 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Signal
-from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.force_feedback import add_force_feedback, seed_noise
 from drake_dae.diagrams.unilateral import with_events
 from drake_dae.diagrams.wiring import add_block, check_system, hold_before, log_steps
 from drake_dae.errors import WiringError
-from drake_dae.simulation.record import Record, Recorded
-from drake_dae.simulation.view import RobotBlock, add_live_view
-from drake_dae.systems.along import function_along
-from drake_dae.systems.robot_plant import RobotPlant
-from drake_dae.systems.sampling import ControlHold, Sampling
-from drake_dae.systems.sensors import ForceSensor
+from drake_dae.pictures.view import RobotBlock, add_live_view
+from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.systems.blocks.along import function_along
+from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.robot_plant import RobotPlant
+from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.controller import TaskController
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import PhaseChange
-from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 Plant = UnilateralRobotPlant | ContactPlant | RobotPlant
 

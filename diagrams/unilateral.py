@@ -9,12 +9,12 @@ from pydrake.systems.primitives import AffineSystem
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.simulation.record import Record
-from drake_dae.systems.unilateral.contacts import coefficient
-from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
+from drake_dae.simulation.records.record import Record
+from drake_dae.systems.plants.unilateral.contacts import coefficient
+from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
 
 
 @checked(ModelError)

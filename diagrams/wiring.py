@@ -10,19 +10,19 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, VectorLogSink
 
 from drake_dae.dae.references import Reference
-from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.tracking import TrackingLaw
-from drake_dae.diagrams.contact_plant import ContactPlant
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.block import ParameterizedSystem
-from drake_dae.systems.controller import TrackingController
-from drake_dae.systems.limits import ControlLimits
-from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.references import ReferenceGenerator
-from drake_dae.systems.sampling import ControlHold, Sampling
-from drake_dae.systems.sensors import ForceSensor
-from drake_dae.systems.tolerances import Tolerances, ToleranceWatch
-from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
 Block = TypeVar("Block", DaePlant, ForceSensor)
 

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import drake_dae
-from drake_dae.diagrams.shipped import DEFAULT_SCENARIO, description, shipped_scenarios
 from drake_dae.errors import (
     DrakeDaeError,
     NonMinimumPhaseWarning,
     ScenarioError,
     describe_os_error,
 )
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO, description, shipped_scenarios
 
 YOUNG = 50_000
 """So many new objects are there before garbage is looked for: what a command loads and builds

@@ -6,7 +6,7 @@
 
 # %% A scenario is a robot, what it touches, what it shall do, and how to simulate it.
 from drake_dae import analyze, build_scenario, load_scenario, make_animation, simulate
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 scenario = load_scenario(find_scenario("two_link_wall"), ["duration=3"])
 scenario

@@ -40,22 +40,22 @@ from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.diagrams.scenario import Scenario
-from drake_dae.diagrams.scenario_model import add_robot
-from drake_dae.diagrams.shipped import find_scenario
-from drake_dae.diagrams.sweep.runs import Outcome, RunResult
 from drake_dae.errors import DrakeDaeError
+from drake_dae.pictures.course import Loop
 from drake_dae.robots.actuation.stage import Stage
-from drake_dae.robots.contact.constraint import Constraint
-from drake_dae.robots.contact.surface import Surface
+from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
-from drake_dae.simulation.course import Loop
-from drake_dae.simulation.record import Recorded
+from drake_dae.robots.surfaces.surface import Surface
+from drake_dae.scenario.model import add_robot
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.simulation.records.record import Recorded
+from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.systems.plants.unilateral.events import ContactChange
 from drake_dae.systems.task.phases import Phase
-from drake_dae.systems.unilateral.events import ContactChange
 from drake_dae.trace.functions import TracedFunction
 
 FOLDER = Path(__file__).parent / "made"
@@ -342,7 +342,9 @@ PLACES: dict[str, Callable[[], Any]] = {
     "times of WaypointsReference": lambda: [0.0, 1.0],
     "limits of WaypointsReference": lambda: None,
     "order of WaypointsReference": lambda: 2,
-    "file of CsvReference": lambda: str(Path(__file__).parent / "systems" / "steps.csv"),
+    "file of CsvReference": lambda: str(
+        Path(__file__).parent / "systems" / "control" / "steps.csv"
+    ),
     "columns of CsvReference": lambda: ["x"],
     "origin of TextReference": lambda: [0.0, 0.0],
     "outputs of references_by_name": lambda: ["a"],
@@ -358,7 +360,9 @@ PLACES: dict[str, Callable[[], Any]] = {
     "size of MeshSurface": lambda: None,
     "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
-    "file of MeshSurface": lambda: FOLDER.parents[1] / "diagrams" / "manual" / "ridge.obj",
+    "file of MeshSurface": lambda: (
+        FOLDER.parents[1] / "drake_dae" / "scenario" / "manual" / "ridge.obj"
+    ),
     "middle": lambda: None,
     "ranges": lambda: {"duration": (1.0, 2.0)},
     "variations of Study": lambda: ({"duration": 1.0},),

@@ -34,7 +34,7 @@ from drake_dae.dae.structure.structure import (
     examine_outputs,
     why_no_law,
 )
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Stability
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError

@@ -5,13 +5,13 @@ from enum import StrEnum
 
 from drake_dae.analysis.tables import named_values
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.layout import Layout
 from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.along import StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import Stability, Verdict

@@ -9,10 +9,10 @@ import numpy as np
 from drake_dae.analysis.contact_text import contact_margin_as_dict, contact_margin_in_words
 from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
-from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR, Margin
 from drake_dae.dae.structure.structure import why_no_law
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 

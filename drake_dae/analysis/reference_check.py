@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.layout import Layout
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 
 

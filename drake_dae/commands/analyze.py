@@ -3,9 +3,9 @@
 import argparse
 import json
 
-from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario import load_scenario
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:

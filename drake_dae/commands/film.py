@@ -2,12 +2,12 @@
 
 import argparse
 
-from drake_dae.diagrams.build import build_scenario
-from drake_dae.diagrams.scenario import load_scenario
+from drake_dae.commands.run_folder import FILM, PART, SCENARIO, stage
 from drake_dae.errors import ModelError
-from drake_dae.simulation.film import save_film
-from drake_dae.simulation.record import Record
-from drake_dae.simulation.run_folder import FILM, PART, SCENARIO, stage
+from drake_dae.pictures.film import save_film
+from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.scenario import load_scenario
+from drake_dae.simulation.records.record import Record
 
 
 def run_command(options: argparse.Namespace) -> int:

@@ -3,8 +3,8 @@
 import argparse
 import json
 
-from drake_dae.diagrams.manual.page import keys_page
-from drake_dae.diagrams.manual.schema import editor_schema
+from drake_dae.scenario.manual.page import keys_page
+from drake_dae.scenario.manual.schema import editor_schema
 
 
 def run_command(options: argparse.Namespace) -> int:

@@ -6,9 +6,9 @@ import re
 import warnings
 from pathlib import Path
 
-from drake_dae.diagrams.new_scenario.new_scenario import new_scenario
 from drake_dae.errors import GeometryWarning, ScenarioError
-from drake_dae.robots.contact.surface import Vector
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.new.new_scenario import new_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:

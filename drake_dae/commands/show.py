@@ -2,8 +2,8 @@
 
 import argparse
 
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.shipped import find_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:

@@ -16,25 +16,7 @@ from typing import TextIO
 from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.commands.view import show
-from drake_dae.diagrams.build import build_completed, start_scenario
-from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.completion.completion import Completed
-from drake_dae.diagrams.contact_material import ContactMaterial
-from drake_dae.diagrams.scenario import Scenario, load_scenario, save_scenario
-from drake_dae.diagrams.shipped import find_scenario
-from drake_dae.diagrams.task_loop import TaskLoop
-from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
-from drake_dae.simulation.animation import animate
-from drake_dae.simulation.course import Course, contact_paths, follow
-from drake_dae.simulation.interruption import Ending, end_at_once, ending_signals
-from drake_dae.simulation.phases import phase_spans
-from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
-from drake_dae.simulation.real_time import attainable_rate
-from drake_dae.simulation.record import Record
-from drake_dae.simulation.record_writer import RecordWriter
-from drake_dae.simulation.remarks import stop_remarks, surface_remarks
-from drake_dae.simulation.run_folder import (
+from drake_dae.commands.run_folder import (
     ANIMATION,
     FILES,
     MARK,
@@ -43,9 +25,27 @@ from drake_dae.simulation.run_folder import (
     run_folder,
     stage,
 )
+from drake_dae.commands.view import show
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.task_loop import TaskLoop
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
+from drake_dae.pictures.animation import animate
+from drake_dae.pictures.course import Course, contact_paths, follow
+from drake_dae.pictures.phases import phase_spans
+from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
+from drake_dae.pictures.view import RobotBlock, start_meshcat
+from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.simulation.real_time import attainable_rate
+from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.record_writer import RecordWriter
+from drake_dae.simulation.remarks import stop_remarks, surface_remarks
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
-from drake_dae.simulation.view import RobotBlock, start_meshcat
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -140,7 +140,7 @@ def _roll(run: _Run) -> RunStatistics:
     Raises:
         SimulationError: The run cannot go on.
     """
-    from drake_dae.diagrams.rollout.scenario_run import roll_scenario
+    from drake_dae.scenario.rolled import roll_scenario
 
     if isinstance(run.loop, TaskLoop):
         raise ModelError("a rollout does not know tasks; leave --rollout out")

@@ -4,12 +4,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from drake_dae.diagrams.scenario import load_scenario
-from drake_dae.diagrams.shipped import find_scenario
-from drake_dae.diagrams.sweep.study import FILES
-from drake_dae.diagrams.sweep.sweep import sweep
-from drake_dae.diagrams.sweep.variations import parse_variations
 from drake_dae.errors import ModelError
+from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.studies.study import FILES
+from drake_dae.studies.sweep import sweep
+from drake_dae.studies.variations import parse_variations
 
 
 def run_command(options: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import (
     Factorization,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.layout import Indices, Layout
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.layout import Indices, Layout
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import nonzeros, smallest_sine
 from drake_dae.trace.functions import TracedFunction

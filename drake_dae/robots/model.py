@@ -12,15 +12,15 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
-from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.dae.structure.shared_forces import share_forces
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import ActuationChain, chain
 from drake_dae.robots.actuation.stage import Stage
-from drake_dae.robots.contact.constraint import Constraint
-from drake_dae.robots.contact.constraint_set import ConstraintSet
-from drake_dae.robots.contact.plant_constraints import plant_constraints
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links

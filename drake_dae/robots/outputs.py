@@ -8,13 +8,13 @@ import casadi as ca
 
 from drake_dae.arguments import checked, numpy_told, result_of
 from drake_dae.arrays import check_axes
-from drake_dae.dae.expressions import as_expression
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.system.expressions import as_expression
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.constraint import Constraint
-from drake_dae.robots.contact.surface import Vector
+from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import position_index
 from drake_dae.robots.links.links import Links
+from drake_dae.robots.surfaces.surface import Vector
 
 
 class PositionOutput(ABC):

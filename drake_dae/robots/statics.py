@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Signal
-from drake_dae.simulation.record import Record
+from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import SLACK, Limits
 
 

@@ -1,20 +1,9 @@
-"""What a record tells of contacts that open and close: in words, and as marks in pictures."""
-
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+"""What a record tells of contacts that open and close, in words and as spans of time."""
 
 import numpy as np
 
-from drake_dae.simulation.events import impacts
-from drake_dae.simulation.record import Record
-
-if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
-    from matplotlib.axes import Axes
-
-IMPACT, OPEN = "impact", "contact open"
-"""What marks in a picture mean."""
+from drake_dae.simulation.records.events import impacts
+from drake_dae.simulation.records.record import Record
 
 
 def contact_notes(record: Record) -> list[tuple[str, str]]:
@@ -62,20 +51,3 @@ def open_spans(record: Record) -> list[tuple[float, float]]:
     edges = np.flatnonzero(is_open[1:] != is_open[:-1])
     times = record.time[edges]
     return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
-
-
-def mark_labels(record: Record) -> tuple[str, ...]:
-    """What stands in the legend for the marks of a record, in any order."""
-    found = [OPEN] if open_spans(record) else []
-    return (*found, IMPACT) if impacts(record.events) else tuple(found)
-
-
-def mark_events(axes: Sequence[Axes], record: Record) -> None:
-    """Marks in axes over time where contacts were open, and impacts."""
-    for axis in axes:
-        for number, span in enumerate(open_spans(record)):
-            label = "" if number else OPEN
-            axis.axvspan(*span, color="0.9", linewidth=0.0, zorder=0.4, label=label)
-        for number, event in enumerate(impacts(record.events)):
-            label = "" if number else IMPACT
-            axis.axvline(event.time, color="C3", linewidth=0.8, alpha=0.7, zorder=0.6, label=label)

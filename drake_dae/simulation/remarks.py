@@ -3,9 +3,9 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.robots.contact import Constraint
+from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
-from drake_dae.simulation.record import Record
+from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.trace.functions import TracedFunction
 

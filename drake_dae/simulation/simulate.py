@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from drake_dae.arguments import checked
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
-from drake_dae.simulation.interruption import Ending, ending_signals
+from drake_dae.simulation.records.interruption import Ending, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines where it has no terminal, in s."""

@@ -9,10 +9,10 @@ import numpy as np
 
 from drake_dae.analysis.tables import Table
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.open_contacts import contact_notes
-from drake_dae.simulation.record import Record
+from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 

@@ -7,8 +7,8 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Signal
-from drake_dae.simulation.record import Record
+from drake_dae.dae.system.signals import Signal
+from drake_dae.simulation.records.record import Record
 
 ROUND_OFF = 1e-13
 """Beside the size of what it is a part of, a smaller number is round-off."""

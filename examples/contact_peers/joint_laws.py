@@ -10,7 +10,7 @@ from pydrake.systems.primitives import Adder
 
 from contact_peers.robot import Goals, Robot
 from drake_dae.arrays import FloatArray
-from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
 
 class JointGoals(LeafSystem):

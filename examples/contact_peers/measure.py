@@ -22,18 +22,18 @@ from contact_peers.plants import (
 from contact_peers.robot import Goals, Robot
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.diagrams.advice import advised
-from drake_dae.diagrams.build import start_scenario, wire_loop
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.scenario import Scenario
-from drake_dae.diagrams.scenario_model import scenario_model, scenario_structure
-from drake_dae.diagrams.scenario_plant import contact_plant
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.advice import advised
+from drake_dae.scenario.build import start_scenario, wire_loop
+from drake_dae.scenario.model import scenario_model, scenario_structure
+from drake_dae.scenario.plant import contact_plant
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.simulate import simulate
-from drake_dae.systems.references import ReferenceGenerator
-from drake_dae.systems.sampling import ControlHold
-from drake_dae.systems.sensors import ForceSensor
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.sampling import ControlHold
+from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 STEPS = SimulatorConfig(
     integration_scheme="explicit_euler", max_step_size=PERIOD, use_error_control=False

@@ -11,9 +11,9 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
 
-from drake_dae.diagrams.contact_plant import ContactPlant
-from drake_dae.diagrams.scenario import Scenario, load_scenario
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.scenario.scenario import Scenario, load_scenario
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 
 FRICTION = 0.3
 """The coefficient of the plant; a law knows it, or believes that there is none."""

@@ -14,7 +14,7 @@ from scipy.linalg import eigh
 from contact_peers.plants import PERIOD
 from contact_peers.robot import NORMAL, Goal, Goals, Robot, RobotState
 from drake_dae.arrays import FloatArray
-from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
 
 class TaskLaw(LeafSystem):

@@ -29,11 +29,11 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
 
 import drake_dae as dd
-from drake_dae.diagrams.build import build_completed, start_scenario
-from drake_dae.diagrams.scenario import Scenario
-from drake_dae.diagrams.scenario_model import add_robot
-from drake_dae.diagrams.scenario_parts import IdealConstraints
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.scenario.model import add_robot
+from drake_dae.scenario.parts import IdealConstraints
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.shipped import find_scenario
 
 SETTLED, DURATION = 2.0, 6.0
 ROUGHNESS = 0.4  # N m from one sample to the next.

@@ -22,7 +22,7 @@ from drake_dae.analysis.report import Analysis
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.errors import InconsistentStateError, ModelError
 

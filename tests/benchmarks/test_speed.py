@@ -18,7 +18,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_dae import build_scenario, load_scenario, simulate
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 SCENARIOS = ["two_link_wall", "seven_joint_wall"]
 TARGETS = {"two_link_wall": 20.0, "seven_joint_wall": 60.0}

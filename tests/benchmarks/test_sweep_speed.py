@@ -8,7 +8,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import grid_variations, sweep
-from drake_dae.diagrams.sweep.processes import cores
+from drake_dae.studies.processes import cores
 
 
 def starts(count):

@@ -11,7 +11,7 @@ from pathlib import Path
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import RobotPlant, build_scenario, load_scenario, make_closed_loop, simulate
-from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 BOUND = 100.0
 """kB per closed loop."""

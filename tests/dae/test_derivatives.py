@@ -4,9 +4,9 @@ import pytest
 from problems import PROBLEMS, changed
 
 from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative

@@ -7,7 +7,7 @@ from problems import PROBLEMS, Problem, double_integrator, pendulum
 
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import are_dependent, newton, shortest_steps
 

@@ -8,7 +8,7 @@ from problems import PROBLEMS, Problem, hidden_normal_form
 from runs import some
 
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 

@@ -15,9 +15,9 @@ from drake_dae import (
     build_scenario,
     poles,
 )
-from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.model import scenario_model
 
 NAME = "boom"
 HINGE, FOOT, LUG, DAMPING = np.array([0.0, 0.8]), np.array([0.3, 0.0]), 0.7, 40.0

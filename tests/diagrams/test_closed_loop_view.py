@@ -34,14 +34,15 @@ from drake_dae import (
     simulate,
     start_meshcat,
 )
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact import surfaces
-from drake_dae.robots.contact.surface import tangents
-from drake_dae.simulation.constraint_forces import ConstraintLoads, ForceArrows, GrowingPaths
-from drake_dae.simulation.course import contact_paths, follow, frame_times
-from drake_dae.simulation.record import Recorded
-from drake_dae.simulation.view import FRAME_RATE, draw_scene, scene_extent
+from drake_dae.pictures.arrows import ForceArrows, GrowingPaths
+from drake_dae.pictures.course import contact_paths, follow, frame_times
+from drake_dae.pictures.view import FRAME_RATE, draw_scene, scene_extent
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots.surfaces import surfaces
+from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.simulation.records.record import Recorded
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 
@@ -130,7 +131,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     head = things[f"{path}/arrow/head"]["geometries"][0]
     nominal = loop.plant.structure.manifold.project(loop.plant.dae.nominal_state)
     model = loop.plant.model
-    _, size = scene_extent(model, ConstraintLoads(model), nominal)
+    _, size = scene_extent(model, ConstraintWrenches(model), nominal)
     assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
     assert middle - shaft["height"] / 2 == pytest.approx(0.0, abs=1e-9)
@@ -395,7 +396,7 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     model = arm("two_link").model
     meshcat = start_meshcat()
     arrows = ForceArrows(meshcat, model, length=0.3)
-    loads = ConstraintLoads(model)
+    loads = ConstraintWrenches(model)
     state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
     seen = {}
     for force in (0.0, 10.0, -20.0):
@@ -419,7 +420,7 @@ def shown_at_rest(model, forces):
     plant = RobotPlant(model)
     state = plant.structure.manifold.project(model.dae.nominal_state)
     arrows = draw_scene(plant, meshcat)
-    loads = ConstraintLoads(model)(state, forces)
+    loads = ConstraintWrenches(model)(state, forces)
     meshcat.StartRecording()
     arrows.draw(loads, 0.0)
     meshcat.StopRecording()

@@ -15,8 +15,8 @@ from recordings import animation
 from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, make_animation
-from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.model import scenario_model
 
 HOURS = 120.0 * np.pi / 180.0 * np.arange(3)
 CORNERS = 0.035 * np.column_stack([np.cos(HOURS), np.sin(HOURS), np.zeros(3)])

@@ -7,9 +7,9 @@ from pydrake.math import RollPitchYaw
 from recordings import animation
 
 from drake_dae import build_scenario, load_scenario, make_animation, simulate
-from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.shipped import find_scenario
 
 NAME = "seven_joint_moving_plate"
 

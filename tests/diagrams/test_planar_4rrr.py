@@ -9,8 +9,8 @@ from test_planar_3rrr import DISK, DISTAL, PROXIMAL, about_centre, across, along
 from drake_dae import FlexibleJoints, RobotModel, TrackingLaw, ZeroDynamics, build_scenario, poles
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.model import scenario_model
 
 NAME = "planar_4rrr"
 BASE, CORNER = 0.5, 0.12  # m from the middle

@@ -5,9 +5,9 @@ import pytest
 from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, load_scenario
-from drake_dae.diagrams.feasibility import find_feasibility
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.shipped import find_scenario
 
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
 LINE = "!Sinusoids {offset: 0.3, amplitudes: [0.3], frequencies: [1.5]}"

@@ -19,7 +19,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.arrays import FloatArray
-from drake_dae.diagrams.shipped import FOLDER
+from drake_dae.scenario.shipped import FOLDER
 
 GRAVITY = 9.81
 CRANK, FLYWHEEL = 0.12, 4.0 * 0.16**2 / 2  # m, kg m^2

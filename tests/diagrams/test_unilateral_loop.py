@@ -34,13 +34,13 @@ from drake_dae import (
     rollout,
     simulate,
 )
-from drake_dae.diagrams.feasibility import find_feasibility
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.simulation.events import flashes
+from drake_dae.pictures.plots import plot_controls, plot_outputs
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.simulation.open_contacts import contact_notes, open_spans
-from drake_dae.simulation.plots import plot_controls, plot_outputs
+from drake_dae.simulation.records.events import flashes
 from drake_dae.simulation.summary import Limits, summary
-from drake_dae.systems.unilateral.events import ContactChange
+from drake_dae.systems.plants.unilateral.events import ContactChange
 
 MASS, BOUNCE = 2.0, 0.2
 PUSH, SWING, RATE = 6.0, 8.0, 2.0

@@ -8,8 +8,8 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
 from drake_dae import Push, build_scenario, rollout, start_values
-from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.model import scenario_model
 
 W = 25.0
 STILL = (

@@ -14,11 +14,11 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_dae.dae.references import ExpressionReference
-from drake_dae.dae.signals import Parameter
 from drake_dae.dae.structure.constrained import find_constraint_structure
-from drake_dae.dae.system import DaeSystem
-from drake_dae.systems.plant import DaePlant
-from drake_dae.systems.references import ReferenceGenerator
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.plants.dae_plant import DaePlant
 
 M2, M3, L1, L2, J1, J2 = 0.151104, 0.075552, 0.15, 0.30, 0.002727, 0.0045339259
 ELASTIC, WIDTH, DENSITY, SPEED, PI = 0.2e12, 0.008, 7870.0, 150.0, 3.1415927

@@ -1,6 +1,7 @@
 """Glocker's woodpecker toy: impacts with friction, sticking and sliding, by two methods.
 
-Its limit cycle takes longer: `python tests/woodpecker.py`, a part of `make campaign`, prints it.
+Its limit cycle takes longer: `python tests/support/woodpecker.py`, a part of `make campaign`,
+prints it.
 """
 
 import pytest

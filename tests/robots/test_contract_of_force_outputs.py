@@ -19,10 +19,10 @@ from drake_dae import (
     Signal,
     Squeeze,
 )
-from drake_dae.diagrams.scenario_model import scenario_model
 from drake_dae.errors import ModelError
-from drake_dae.robots.contact.constraint_set import ConstraintSet
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.force_outputs import force_outputs, force_rows
+from drake_dae.scenario.model import scenario_model
 from drake_dae.trace.functions import TracedFunction
 
 MEMBERS = {

@@ -20,9 +20,9 @@ from drake_dae import (
     make_closed_loop,
     poles,
 )
-from drake_dae.diagrams.build import build_scenario
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.shipped import find_scenario
 
 
 def pushed(exogenous=(), frame="tool", actuation=()):

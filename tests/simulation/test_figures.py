@@ -5,7 +5,7 @@ import pytest
 
 from drake_dae import Record, Signal
 from drake_dae.simulation.figures import exceeded, margins, run_figures
-from drake_dae.simulation.record import Recorded
+from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.summary import Limits
 
 

@@ -16,10 +16,10 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation import simulate as module
-from drake_dae.simulation.interruption import ENDING_SIGNALS
+from drake_dae.simulation.records.interruption import ENDING_SIGNALS
 from drake_dae.simulation.simulate import check_config, check_duration, simulate
 
 

@@ -9,10 +9,10 @@ from arms import arm
 from two_arms import two_arms
 
 from drake_dae import ExpressionOutput, Record, RobotModel
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.textbook import LinkExpressions
-from drake_dae.simulation.record import Recorded
+from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import Limits, summary
 from drake_dae.simulation.verdict import Tracking, judge

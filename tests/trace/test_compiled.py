@@ -16,9 +16,9 @@ import pytest
 from runs import each_scenario
 
 from drake_dae import DaeSystem, build_scenario
-from drake_dae.diagrams.scenario import load_scenario
-from drake_dae.diagrams.shipped import find_scenario
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
+from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiled import LIMIT, LOOK, Compiler, attempts, find_compiler
 from drake_dae.trace.functions import TracedFunction

@@ -27,12 +27,12 @@ from drake_dae.dae.extension.extension import (
     refuse_metric,
 )
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import SINGULAR
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import eliminated_at
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.lie import lie_derivative

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.layout import Layout
 from drake_dae.dae.linearization.models import Linearization, LinearModel
-from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.tangents import coordinates
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.layout import Indices
-from drake_dae.dae.signals import Signal
+from drake_dae.dae.system.layout import Indices
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.round_off import equilibration
 

@@ -6,10 +6,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.smoothness import find_flaw
 

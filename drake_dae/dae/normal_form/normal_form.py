@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.normal_form.completion import check_completion, choose_completion
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import ROUND_OFF, Linearization, newton
 

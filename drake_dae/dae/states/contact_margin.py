@@ -7,11 +7,11 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.contacts import critical_factor
 from drake_dae.dae.states.margins import surroundings
 from drake_dae.dae.states.region import ConsistentRegion
 from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.contacts import critical_factor
+from drake_dae.dae.system.system import DaeSystem
 
 MEANINGLESS = 1e6
 """No coefficient of friction is so large: what slides but by round-off has such a critical one."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray, brief, numbers, show
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import are_dependent
 from drake_dae.trace.round_off import Sized, multiply

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.layout import Indices
+from drake_dae.dae.system.layout import Indices
 from drake_dae.trace.round_off import positive
 
 

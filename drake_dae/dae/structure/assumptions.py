@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.dependence import Combination
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import AssumptionError
 
 

@@ -18,7 +18,7 @@ from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence
 from drake_dae.dae.structure.redundancy import find_redundant
 from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
 

@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.dependence import Combination, redundant_constraints
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF
 from drake_dae.trace.round_off import equilibration, positive

@@ -17,7 +17,7 @@ from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.dae.structure.dependence import redundant_constraints
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized

@@ -9,7 +9,6 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, unknown_name
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.sharing import Sharing
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.redundancy import (
     check_same_motion,
@@ -18,7 +17,8 @@ from drake_dae.dae.structure.redundancy import (
     independent_constraints,
     with_constraints,
 )
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.sharing import Sharing
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.round_off import without_round_off

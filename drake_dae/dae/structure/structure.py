@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, show
-from drake_dae.dae.layout import Layout
 from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
@@ -21,7 +20,8 @@ from drake_dae.dae.structure.constrained import (
     guesses,
 )
 from drake_dae.dae.structure.relative_degrees import output_chains
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
 

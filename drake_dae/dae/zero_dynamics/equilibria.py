@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.dae.zero_dynamics.stability import balanced_norm, linearized_eigenvalues

@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.layout import Indices
 from drake_dae.dae.manifold import CONSISTENT
 from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction

@@ -14,7 +14,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, show, vector
 from drake_dae.dae import references
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.along import StabilityAlong, judge_along
 from drake_dae.dae.zero_dynamics.disturbances import Flow
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria

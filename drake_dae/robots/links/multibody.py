@@ -10,7 +10,7 @@ from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.comparison import compare_with_plant
 from drake_dae.robots.links.force_elements import Springs, check_force_elements

@@ -8,11 +8,11 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError
-from drake_dae.systems.controller import TrackingController
-from drake_dae.systems.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.task.open_contact import output_of_force
 from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.progress import PhaseChange, Segment, places_at

@@ -7,7 +7,7 @@ import casadi as ca
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed, unknown_name
 from drake_dae.dae.structure.redundancy import with_constraints
-from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 
 

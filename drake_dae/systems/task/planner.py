@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import ConstantReference, stack_references
 from drake_dae.dae.references.by_name import assigned, in_order
-from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.progress import DONE, HELD, PhaseChange, Segment

@@ -8,9 +8,9 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.layout import Indices, Layout
+from drake_dae.dae.system.layout import Indices, Layout
 from drake_dae.errors import ModelError
-from drake_dae.systems.feedback import Immutable
+from drake_dae.systems.blocks.feedback import Immutable
 from drake_dae.systems.task.fade import fade
 
 DONE, HELD = "done", "held"

@@ -17,9 +17,9 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.tracking import TrackingLaw
+from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
-from drake_dae.systems.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment

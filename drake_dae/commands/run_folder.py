@@ -1,0 +1,137 @@
+"""The folder that a run leaves its files in."""
+
+import errno
+import fcntl
+import os
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from drake_dae.arrays import brief
+from drake_dae.errors import ModelError
+from drake_dae.pictures.plots import PLOTS
+
+SCENARIO = "scenario.yaml"
+PART = "record.part"
+"""The record while the run goes on, and what is left of it where the run was killed."""
+
+ANIMATION = "animation.html"
+
+FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, ANIMATION)
+"""What a run leaves in its folder."""
+
+FILM = "film.gif"
+"""What `drake-dae film` adds to them."""
+
+MARK = "# Scenario as run by drake-dae"
+"""Begins the scenario in a run's folder: only such a folder is written to again."""
+
+_STAGE = ".unfinished-"
+
+
+@contextmanager
+def run_folder(folder: Path) -> Iterator[None]:
+    """Makes the folder of a run, and keeps other runs out of it as long as the block lasts.
+
+    The files of an earlier run are removed, others never. The scenario is there, empty, and holds
+    the lock; no file is written through a symbolic link.
+
+    Warns:
+        UserWarning: The earlier run was killed and its record is removed, or the file system has
+            no locks.
+
+    Raises:
+        ModelError: The folder cannot be used; why.
+    """
+    if "\0" in str(folder):
+        raise ModelError(f"no path holds a null byte, got {brief(str(folder))}")
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise ModelError(f"'{folder}' is a file; name a folder")
+        lock = _prepare(folder)
+    except ModelError:
+        raise
+    except (OSError, ValueError) as error:  # The latter for text of another encoding.
+        reason, path = getattr(error, "strerror", None) or error, getattr(error, "filename", None)
+        where = f" ({path})" if path and Path(path) != folder else ""
+        raise ModelError(f"cannot write to '{folder}': {reason}{where}") from None
+    try:
+        yield
+    finally:
+        os.close(lock)
+
+
+def _prepare(folder: Path) -> int:
+    """The open file with the lock."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _check(folder, None)
+    lock = os.open(folder / SCENARIO, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    try:
+        _lock(lock, folder)
+        _check(folder, (folder / SCENARIO).read_text("utf-8"))
+        if os.path.lexists(folder / PART):
+            warnings.warn(f"{folder / PART} of a run that did not end is removed", stacklevel=5)
+        for file in _present(folder)[1:]:
+            file.unlink()
+        for stale in folder.glob(f"{_STAGE}*"):
+            if stale.is_dir() and not stale.is_symlink():
+                shutil.rmtree(stale)
+        os.truncate(lock, 0)
+    except BaseException:
+        os.close(lock)
+        raise
+    return lock
+
+
+def _present(folder: Path) -> list[Path]:
+    return [folder / name for name in (*FILES, PART, FILM) if os.path.lexists(folder / name)]
+
+
+def _check(folder: Path, text: str | None) -> None:
+    """Refuses the files of others; the text is that of the scenario, None if not yet read."""
+    present, scenario = _present(folder), folder / SCENARIO
+    # Empty: just made, or by a run that was killed in its first moment.
+    own = text is None or text.startswith(MARK) or (not text and len(present) == 1)
+    if present and (present[0] != scenario or scenario.is_symlink() or not own):
+        found = ", ".join(file.name for file in present)
+        raise ModelError(
+            f"'{folder}' holds {found}, not from an earlier run; choose another folder"
+        )
+
+
+def _lock(file: int, folder: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            raise ModelError(
+                f"another run writes to '{folder}'; wait for its end or choose another folder"
+            ) from None
+        warnings.warn(
+            f"'{folder}' cannot be locked ({error.strerror}): start no other run into it",
+            stacklevel=5,
+        )
+
+
+@contextmanager
+def stage(folder: Path, *names: str) -> Iterator[Path]:
+    """A place to write files, which appear in the folder when they are complete.
+
+    Raises:
+        OSError: Some file cannot be written; with the path of the first of the names if the error
+            has none.
+    """
+    place = None
+    try:
+        with TemporaryDirectory(prefix=_STAGE, dir=folder) as place:
+            yield Path(place)
+            for name in names:
+                Path(place, name).replace(folder / name)
+    except OSError as error:
+        # What NumPy, zipfile and Pillow raise has no path, or one in a place that is gone.
+        if place is None or str(error.filename or place).startswith(place):
+            error.filename, error.filename2 = str(folder / names[0]), None
+        raise

@@ -1,0 +1,255 @@
+"""What a model lacks, as an exogenous signal of its law, and how it is observed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+
+DISTURBANCE = "disturbance"
+"""The name of the parameter."""
+
+_TINY = 1e-200
+"""What is divided by where nothing slides or pushes, and the quotient is of no use."""
+
+_FLAT = 1e-9
+"""Directions are one where the least of their squares is this part of the largest."""
+
+
+@checked(ModelError)
+def with_disturbance(
+    system: DaeSystem, states: Sequence[str], frictions: Sequence[str] = ()
+) -> DaeSystem:
+    """The same system with what its model lacks, d(t), as an exogenous signal:
+
+        E x' = f + S d + g v + h u,
+
+    where S holds the rows of some states: for a robot its velocities, so that d is a generalized
+    force. A law for this system cancels d, and the coefficients of friction that are named, as
+    they come through the port `exogenous` of its controller; see `DisturbanceObserver`. Where d is
+    zero, it is the law of the system.
+
+    Args:
+        system: The system, as a robot's `RobotModel.dae`.
+        states: The names of the states whose rates d enters, for a robot those of v.
+        frictions: The names of parameters that are observed, too, such as "wall.friction": they
+            become exogenous signals.
+
+    Raises:
+        ModelError: A name is that of no state or of no parameter, or stands twice; or the system
+            has a parameter "disturbance".
+    """
+    known = [signal.name for signal in system.state_signals]
+    for name in states:
+        if name not in known:
+            raise ModelError(f"{system.name}: {unknown_name('state', name, known)}")
+    rows = [known.index(name) for name in states]
+    if not rows or len(set(rows)) != len(rows):
+        raise ModelError(
+            f"{system.name}: with_disturbance needs names of states, each once, got "
+            f"{', '.join(states) or 'none'}"
+        )
+    if DISTURBANCE in [p.name for p in system.parameters]:
+        raise ModelError(f"{system.name} has a parameter '{DISTURBANCE}' already")
+    parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
+    force = ca.SX(system.num_states, 1)
+    force[rows] = parameter.symbol
+    inner = system.implicit
+
+    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
+        assert inner is not None
+        balance, constraint_rate = inner(rate, constraint_input)
+        return balance - force, constraint_rate
+
+    return replace(
+        system,
+        f=system.f + force,
+        parameters=(*system.parameters, parameter),
+        implicit=None if inner is None else implicit,
+        state_scale=system.scale,
+    ).with_exogenous(frictions)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What an observer of d computes of a system that `with_disturbance` made.
+
+    With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
+    derivative of a measurement is needed.
+
+    Where a contact slides, friction is S^T dg/dmu v mu. Where it sticks, it is a reaction, any
+    force T y in the directions of sliding, the slopes of S^T dg/dmu v by the velocities at rest;
+    and no momentum tells it from d.
+
+    Attributes:
+        momentum: (x, u, v, parameters) -> p, its rate without inputs and without d, and what the
+            inputs add to that, S^T (h u + g v); shape (k,) each.
+        friction: (x, v, parameters) -> of each coefficient of friction the force that one of 1
+            makes, C = S^T dg/dmu v, shape (k, c), and the speed of sliding by the power of
+            friction, in m/s, shape (c,).
+        directions: (x, v, parameters) -> W = Q^T E^-1 Q and Q = 1 + S^T g dalpha/dd, shape (k, k),
+            where Q d is d with what the constraint answers, and d^T W d the square of the
+            acceleration that d makes, in the metric of kinetic energy; and T of each contact, side
+            by side, shape (k, c k).
+        wanted: (x, R, t, parameters) -> x with those velocities with which the outputs move as the
+            reference does t later, r' + t r'', and the constraints stay, shape (n,); None where
+            outputs and constraints do not determine them.
+        rows: The states whose rates d enters.
+        frictions: The names of the coefficients of friction, and which constraint input each is
+            for.
+    """
+
+    momentum: TracedFunction
+    friction: TracedFunction
+    directions: TracedFunction
+    wanted: TracedFunction | None
+    rows: tuple[int, ...]
+    frictions: dict[str, int]
+
+    @classmethod
+    def of(cls, structure: Structure) -> "Observation":
+        """What is observed of a system, by its structure.
+
+        Raises:
+            ModelError: The system has no disturbance, or a mass that depends on what d moves.
+        """
+        system = structure.system
+        named = {p.name: p for p in system.exogenous.moving}
+        if DISTURBANCE not in named:
+            raise ModelError(
+                f"{system.name} has no disturbance to observe; make the law for "
+                "with_disturbance(system, states)"
+            )
+        d = named[DISTURBANCE].symbol
+        entry = ca.DM(ca.jacobian(system.f, d).sparsity()).full()
+        rows = [int(np.flatnonzero(column)[0]) for column in entry.T]
+        frictions = _frictions(system, tuple(named))
+        x, v = system.state, ca.SX.sym("v", system.num_constraints)
+        u = ca.SX.sym("u", system.num_controls)
+        mass, action = system.mass_matrix[rows, :], ca.mtimes(system.g, v)
+        momentum = ca.mtimes(mass, x)
+        still = ca.SX.sym("still", x.numel())
+        moved = ca.jtimes(ca.mtimes(mass, still), x, _known_rate(system, mass, rows))
+        drift = ca.substitute(system.f[rows], d, 0 * d) + ca.substitute(moved, still, x)
+        inputs = action[rows] + ca.mtimes(system.h[rows, :], u)
+        outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
+        function = system.trace("momentum", outputs, {"control": u, "constraint_input": v})
+
+        # What a coefficient of friction of one does; it takes the power mu lambda |v_t|.
+        columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
+        forces = ca.horzcat(ca.SX(len(rows), 0), *columns)
+        power = ca.mtimes(forces.T, x[rows])
+        speeds = [
+            ca.fabs(power[j]) / ca.fmax(ca.fabs(v[i]), _TINY)
+            for j, i in enumerate(frictions.values())
+        ]
+        pressed = {"constraint_input": v}
+        rubbing = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
+        friction = system.trace("friction", rubbing, pressed)
+
+        reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
+        projector = ca.SX.eye(len(rows)) + reaction
+        right = ca.SX(x.numel(), len(rows))
+        right[rows, :] = projector
+        moves = PositiveDefiniteFactorization(system.mass_matrix).solve(right)[rows, :]
+        slopes = [ca.jacobian(column, x[rows]) for column in columns]
+        planes = ca.horzcat(ca.SX(len(rows), 0), *slopes)
+        found = {
+            "metric": ca.mtimes(projector.T, moves),
+            "free": projector,
+            "planes": ca.substitute(planes, x[rows], 0 * x[rows]),
+        }
+        directions = system.trace("directions of friction", found, pressed)
+        wanted = _wanted(structure, rows)
+        return cls(function, friction, directions, wanted, tuple(rows), frictions)
+
+
+def shares(forces: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
+    """How much of each force c is in d, by the accelerations that they make, shape (c,):
+
+        (c^T W d) / (c^T W c).
+
+    Args:
+        forces: The forces as columns, shape (k, c).
+        metric: W, shape (k, k).
+        d: What is shared, shape (k,).
+    """
+    matched = metric @ forces
+    return np.asarray(d @ matched / np.maximum(np.sum(forces * matched, axis=0), _TINY))
+
+
+def beside(planes: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
+    """What is left of d beside all T y, by the accelerations that they make, in its shape.
+
+    Args:
+        planes: T, shape (k, j), of any rank.
+        metric: W, shape (k, k).
+        d: What is shared, shape (k,), or as columns.
+    """
+    matched = metric @ planes
+    found = np.linalg.lstsq(planes.T @ matched, matched.T @ d, rcond=_FLAT)[0]
+    return np.asarray(d - planes @ found)
+
+
+def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
+    """x with the velocities that the reference wants then; None where it does not tell them."""
+    system, layout = structure.system, Layout(structure.output_degrees)
+    # Behind springs forces have a degree, too.
+    steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
+    if any(structure.output_degrees[i] < 2 for i in steered):
+        return None
+    reference = ca.SX.sym("R", layout.reference_size)
+    kept = Layout(structure.constraint_degrees).ends.tolist()
+    ahead, starts = ca.SX.sym("t"), {i: int(layout.lowest[i]) for i in steered}
+    goals = {i: reference[j + 1] + ahead * reference[j + 2] for i, j in starts.items()}
+    rates = [structure.output_chains[i][1] - goals[i] for i in steered]
+    left = ca.vertcat(ca.SX(0, 1), *rates, structure.manifold.residual_expression[kept, :])
+    slope = ca.jacobian(left, system.state[list(rows), :])
+    if slope.shape[0] != slope.shape[1]:
+        return None
+    factors = Factorization(slope)
+    state = ca.SX(system.state)
+    state[list(rows), :] -= factors.solve(left)
+    inputs = {"reference": reference, "ahead": ahead}
+    return system.trace("wanted velocities", {"state": state}, inputs, factors.pivot)
+
+
+def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
+    """The exogenous coefficients of friction, and which constraint input each is for."""
+    forces = [signal.name for signal in system.constraint_input_signals]
+    found = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
+    for name in names:
+        if name not in (*found, DISTURBANCE):
+            raise ModelError(
+                f"{system.name}: '{name}' moves and is no coefficient of friction of one contact; "
+                "an observer tells a disturbance and coefficients of friction"
+            )
+    return {name: found[name] for name in names if name in found}
+
+
+def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
+    """x' as far as a mass depends on x, which no input and no disturbance must enter."""
+    rate = ca.SX(system.num_states, 1)
+    pattern = ca.DM(ca.jacobian(ca.vec(mass), system.state).sparsity()).full()
+    others = ca.horzcat(system.g, system.h)
+    identity = ca.SX.eye(system.num_states)
+    for i in np.flatnonzero(pattern.any(axis=0)).tolist():
+        own = ca.is_equal(ca.sparsify(system.mass_matrix[i, :]), ca.sparsify(identity[i, :]), 2)
+        if i in rows or not own or ca.sparsify(others[i, :]).nnz():
+            name = system.state_signals[i].name
+            raise ModelError(
+                f"{system.name}: the mass of what a disturbance moves depends on '{name}', whose "
+                "rate is no function of the state alone"
+            )
+        rate[i] = system.f[i]
+    return rate

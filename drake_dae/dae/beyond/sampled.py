@@ -1,0 +1,224 @@
+"""What becomes of the law (28) where a computer runs it: late, and held between samples."""
+
+from math import floor
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, number, numbers, positive, vector
+from drake_dae.dae.linearization.linearization import linearize, linearize_loop
+from drake_dae.dae.linearization.models import ComplexArray, Linearization
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError
+
+_SAME = 1e-9
+"""Times that differ by less than this, in periods, are one."""
+
+RESTS = 1e-4
+"""A state is an equilibrium if nothing in it changes by more, relative to its scale, in the time of
+the fastest pole."""
+
+MOST_STATES = 2000
+"""Of more states, late ones included, poles would take minutes."""
+
+
+@checked(ModelError)
+def sampled_poles(
+    law: TrackingLaw,
+    reference: ArrayLike,
+    period: float,
+    delay: float = 0.0,
+    *,
+    state: ArrayLike | None = None,
+    parameters: ArrayLike | None = None,
+) -> ComplexArray:
+    """By what one period multiplies small deviations of a robot under a sampled law, exactly.
+
+    The law reads at t_k = k T, and what it computes acts from t_k + d until t_(k+1) + d. About an
+    equilibrium a deviation x of the minimal states on N* has x' = A x without the law and
+    x' = (A + G) x with it. With d = n T + c, 0 <= c < T, and Gamma(t) = int_0^t exp(A s) ds,
+
+        x_(k+1) = exp(A T) x_k + Gamma(T - c) G x_(k-n) + exp(A (T - c)) Gamma(c) G x_(k-n-1).
+
+    The loop is stable where all of these poles are within the unit circle, that is
+    abs(sampled_poles(...)).max() < 1; where T and d tend to 0 they tend to exp(p T) for the poles
+    p of the continuous loop, and to 0. A constraint that gives way has poles of its own: see
+    `contact_damping`.
+
+    Args:
+        law: The law, without integrals, whose control takes no measured force.
+        reference: R, shape (sum (mu_i + 1),), at rest.
+        period: T in s.
+        delay: d in s.
+        state: x on N*, shape (n,), an equilibrium under the law; the nominal consistent state if
+            None.
+        parameters: Values of the plant's parameters; the defaults if None.
+
+    Returns:
+        The poles, shape ((n + 2) k,) for k minimal states, largest first.
+
+    Raises:
+        InconsistentStateError: The state is not on N*.
+        ModelError: The law is another one, the state is no equilibrium, or a number makes no sense.
+    """
+    _check(law)
+    period, delay = positive("period", period), _delay(delay)
+    loop = linearize_loop(law, reference, state, parameters=parameters)
+    plant = linearize(
+        law.system, loop.state, loop.control, structure=law.structure, parameters=parameters
+    )
+    A = plant.minimal.A
+    G = loop.minimal.A - A
+    _check_rest(law, loop, A + G)
+    size, late = len(A), floor(delay / period + _SAME)
+    if (late + 2) * size > MOST_STATES:
+        raise ModelError(
+            f"a delay of {delay:g} s is {late} periods of {period:g} s, each with {size} states, "
+            f"and there may be {MOST_STATES}; take a longer period"
+        )
+    rest = max(delay - late * period, 0.0)
+    begin, end = (_held(A, G, length) for length in (rest, period - rest))
+    matrix = np.eye((late + 2) * size, k=-size)
+    matrix[:size] = 0.0
+    matrix[:size, :size] = end[0] @ begin[0]
+    matrix[:size, late * size : (late + 1) * size] += end[1]
+    matrix[:size, (late + 1) * size :] += end[0] @ begin[1]
+    found = np.linalg.eigvals(matrix).astype(complex)
+    return found[np.argsort(-np.abs(found), kind="stable")]
+
+
+def _held(A: FloatArray, G: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """exp(A t) and Gamma(t) G."""
+    size = len(A)
+    both = np.block([[A, G], [np.zeros((size, 2 * size))]])
+    found = scipy.linalg.expm(both * length)
+    return found[:size, :size], found[:size, size:]
+
+
+@checked(ModelError)
+def sampling_error(
+    law: TrackingLaw,
+    times: ArrayLike,
+    states: ArrayLike,
+    controls: ArrayLike,
+    period: float,
+    delay: float = 0.0,
+    *,
+    parameters: ArrayLike | None = None,
+) -> FloatArray:
+    """What sampling adds to the error (30), (31), to first order in period and delay.
+
+    Whatever the plant and the reference, z_i^(mu_i) = a_i + B_i u gives without approximation
+
+        e_i^(mu_i) + sum_j K_ij e_i^(j-1) = (B(x) (u - u_law(x, R)))_i,
+
+    where u_law is what the law would do now, and u what it did d + (t - t_k) before: to first order
+    u - u_law = -(d + t - t_k) u', which is -(d + T / 2) u' on average. That drives the errors of
+    mu_i >= 1 through their gains, from zero at the start. An output of mu_i = 0 follows u at once:
+    its error is a saw, told where it is largest, at a sample before the new control acts,
+    -(d + T) (B u')_i.
+
+    So a run of the loop without sampling tells the error of a sampled one beforehand. Half the
+    period leaves half of it, and of what the next order adds a quarter. Whether the sampled loop
+    is stable is another question: see `sampled_poles`.
+
+    Args:
+        law: The law, without integrals, whose control takes no measured force.
+        times: Times in s, shape (k,), increasing, so dense that the control is smooth between.
+        states: x of a run under the continuous law, shape (k, n).
+        controls: u of that run, shape (k, p).
+        period: T in s.
+        delay: d in s.
+        parameters: Values of all parameters; the defaults if None.
+
+    Returns:
+        The error of each output, shape (k, p).
+
+    Raises:
+        ModelError: The law is another one, a shape is wrong, or a number makes no sense.
+    """
+    _check(law)
+    period, delay = positive("period", period), _delay(delay)
+    moments = vector("times", times, None)
+    if moments.size < 3 or np.any(np.diff(moments) <= 0.0):
+        raise ModelError("times must be three or more, and increase")
+    sizes = (moments.size, law.system.num_states), (moments.size, law.system.num_controls)
+    courses = [
+        _course(name, given, size)
+        for name, given, size in zip(("states", "controls"), (states, controls), sizes, strict=True)
+    ]
+    values = law.system.parameter_vector(parameters)
+    matrix = law.system.trace("control matrix", {"B": law.structure.control_matrix}, often=False)
+    rates = np.gradient(courses[1], moments, axis=0, edge_order=2)
+    driven = np.array(
+        [
+            matrix(state, values)[0].reshape(len(law.degrees), -1) @ rate
+            for state, rate in zip(courses[0], rates, strict=True)
+        ]
+    )
+    found = -(delay + period) * driven
+    layout = law.layout
+    push = np.zeros((layout.chain_size, moments.size))
+    push[layout.ends] = -(delay + 0.5 * period) * driven[:, layout.dynamic].T
+    chains = _response(law.gains.error_matrix, moments, push.T)
+    found[:, layout.dynamic] = chains[:, layout.heads]
+    return found
+
+
+def _response(matrix: FloatArray, times: FloatArray, push: FloatArray) -> FloatArray:
+    """e' = E e + push from zero, where push is straight between its times, shape (k, N)."""
+    size, lengths = len(matrix), np.diff(times)
+    # e, 1 and the time since the step began are one linear system.
+    both = np.zeros((lengths.size, size + 2, size + 2))
+    both[:, :size, :size] = matrix
+    both[:, :size, size] = push[:-1]
+    both[:, :size, size + 1] = np.diff(push, axis=0) / lengths[:, None]
+    both[:, size + 1, size] = 1.0
+    steps = scipy.linalg.expm(both * lengths[:, None, None])
+    found = np.zeros((times.size, size))
+    for index, step in enumerate(steps):
+        found[index + 1] = step[:size, :size] @ found[index] + step[:size, size]
+    return found
+
+
+def _check(law: TrackingLaw) -> None:
+    if law.integral.outputs or law.control_takes_force:
+        what = "integrals" if law.integral.outputs else "a measured force in its control"
+        raise ModelError(
+            f"{law.system.name}: a law with {what} has a state of its own in the loop, of which "
+            "nothing is predicted here; take the law without, or run it"
+        )
+
+
+def _delay(delay: float) -> float:
+    found = number("delay", delay)
+    if found < 0.0:
+        raise ModelError(f"delay must be 0 s or more, got {delay:g}")
+    return found
+
+
+def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
+    """Refuses what is about no equilibrium."""
+    moves = np.abs(loop.rate) / law.system.scale
+    fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
+    worst = int(np.argmax(moves))
+    if moves[worst] > RESTS * fastest:
+        signal = law.system.state_signals[worst]
+        raise ModelError(
+            f"{law.system.name}: the poles are those about an equilibrium under the law, and there "
+            f"{signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second; give a "
+            "reference at rest, and the state that it leads to"
+        )
+
+
+def _course(name: str, given: ArrayLike, shape: tuple[int, int]) -> FloatArray:
+    """Rows for each time."""
+    rows = numbers(name, given)
+    if rows.shape != shape or not np.isfinite(rows).all():
+        raise ModelError(
+            f"{name} must be finite and of shape {shape}, with a row for each of {shape[0]} times, "
+            f"got {rows.shape}"
+        )
+    return rows

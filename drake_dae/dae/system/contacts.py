@@ -1,0 +1,225 @@
+"""Contacts that rub: when their forces are sure to push, and what becomes of the motion if not.
+
+A contact that can only push keeps phi >= 0 with lambda >= 0 and phi'' lambda = 0, where
+
+    phi'' = A(x) lambda + b(x, u).
+
+Without friction A = J M^-1 J^T is positive definite, and exactly one lambda fits. With friction it
+is A = J M^-1 (J^T - mu J_t^T s), not symmetric; one lambda fits for every b exactly where
+all principal minors of A are positive (a P-matrix: Samelson, Thrall and Wesler 1958). A minor that
+comes to zero is Painleve's paradox (1895): there the contact jams.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from itertools import chain, combinations
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.errors import ModelError
+
+FAR = 1e9
+"""Forces that are so much larger than what they balance are infinite but for round-off."""
+
+MOST = 8
+"""The most forces that can only push of a robot that rubs: every set of them is examined."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A constraint input that can only push.
+
+    Attributes:
+        force: The name of the constraint input, which acts on the constraint in the same place.
+        friction: The name of the parameter that is its coefficient of friction; None without one.
+    """
+
+    force: str
+    friction: str | None = None
+
+
+class Jam(Enum):
+    """How many motions fit where a contact jams; the value says it."""
+
+    INCONSISTENT = (
+        "inconsistent: no force that pushes keeps the contact, and without a force it would be "
+        "pierced"
+    )
+    INDETERMINATE = "indeterminate: the contact can be kept by a force, and it can open as well"
+    OPENING = "opening: without a force the contact opens, and no force that pushes keeps it"
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """The contacts of a system, where friction acts on one of them.
+
+    Args:
+        owner: The name of the system, for messages.
+        inputs: The constraint inputs of the system.
+        parameters: Its parameters.
+        contacts: Its contacts.
+
+    Attributes:
+        rows: Where the contacts stand among the constraint inputs; those of inputs that the system
+            has no more are left out.
+        frictions: The coefficients of friction, in the order of the rows; None without one.
+
+    Raises:
+        ModelError: There are too many contacts.
+    """
+
+    owner: str
+    inputs: Sequence[Signal]
+    parameters: Sequence[Parameter]
+    contacts: Sequence[Contact]
+
+    def __post_init__(self) -> None:
+        if len(self.rows) > MOST:
+            raise ModelError(
+                f"{self.owner}: {len(self.rows)} forces can only push, and one of them rubs; with "
+                f"friction there may be {MOST}, since all sets of them are examined. Take the "
+                "friction away, or some contacts"
+            )
+
+    def __bool__(self) -> bool:
+        return any(self.frictions)
+
+    @property
+    def rows(self) -> list[int]:
+        return list(self._found)
+
+    @property
+    def frictions(self) -> list[Parameter | None]:
+        return list(self._found.values())
+
+    @property
+    def _found(self) -> dict[int, Parameter | None]:
+        names = [signal.name for signal in self.inputs]
+        known = {parameter.name: parameter for parameter in self.parameters}
+        return {
+            names.index(contact.force): known[contact.friction] if contact.friction else None
+            for contact in self.contacts
+            if contact.force in names
+        }
+
+    def without_friction(self, matrix: ca.SX) -> ca.SX:
+        """An expression with all coefficients of friction zero."""
+        if not self:
+            return matrix
+        own = {p.name: p.symbol for p in self.frictions if p}  # Contacts may share one.
+        symbols = ca.vertcat(*own.values())
+        return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
+
+    def reserve(self, matrix: ca.SX) -> ca.SX:
+        """The smallest principal minor of A(x), each divided by what it is without friction.
+
+        Minors are those of sets of contacts with all other constraints, of which none can open. It
+        is 1 without friction, positive exactly where all minors are, and does not depend on units.
+
+        Args:
+            matrix: A(x), shape (m, m).
+
+        Returns:
+            A scalar; where it is not positive its value has no meaning but that.
+        """
+        smallest = ca.SX(1)
+        kept = [i for i in range(matrix.shape[0]) if i not in self.rows]
+        both = [matrix, self.without_friction(matrix)]
+        for i in kept:  # Positive without friction, of which these constraints have none.
+            both = [_eliminated(part, i) for part in both]
+        for pivot, without in zip(*(_pivots(part, self.rows) for part in both), strict=True):
+            smallest = ca.fmin(smallest, pivot / without)
+        return smallest
+
+
+def _eliminated(matrix: ca.SX, i: int) -> ca.SX:
+    """The Schur complement after row and column i, which stay where they are."""
+    return matrix - ca.mtimes(matrix[:, i], matrix[i, :]) / matrix[i, i]
+
+
+def _pivots(matrix: ca.SX, rows: Sequence[int]) -> Iterator[ca.SX]:
+    """Ratios of principal minors, positive exactly where all principal minors of some rows are.
+
+    A is a P-matrix if a_11 > 0 and both A without its first row and column and the Schur complement
+    of a_11 are (Tsatsomeros and Li, 2000).
+    """
+    if rows:
+        first, *others = rows
+        yield matrix[first, first]
+        yield from _pivots(matrix, others)
+        if others:
+            yield from _pivots(_eliminated(matrix, first), others)
+
+
+def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:
+    """The smallest s > 0 for which a principal minor of A_0 - s D is zero, infinite if none is.
+
+    Args:
+        without: A_0, A(x) without friction, shape (m, m).
+        per_unit: D, how much a unit of friction takes from it, shape (m, m).
+        rows: The contacts; minors hold all other rows.
+    """
+    largest = 0.0
+    for used in _sets(len(without), rows):
+        part = np.ix_(used, used)
+        values = np.linalg.eigvals(np.linalg.solve(without[part], per_unit[part]))
+        real = values.real[np.abs(values.imag) <= 1e-9 * np.abs(values).max(initial=0.0)]
+        largest = max(largest, float(real.max(initial=0.0)))
+    return 1.0 / largest if largest > 0.0 else np.inf
+
+
+def jam(
+    matrix: FloatArray,
+    without: FloatArray,
+    force: FloatArray,
+    size: FloatArray,
+    rows: Sequence[int],
+) -> Jam | None:
+    """What becomes of contacts that jam, by the linear complementarity problem of all sets.
+
+    Args:
+        matrix: A(x), shape (m, m).
+        without: A(x) without friction, shape (m, m).
+        force: v = -A^-1 b, which keeps all constraints whether or not it pushes, shape (m,).
+        size: How large the terms are that b is the sum of, shape (m,).
+        rows: The contacts; all other constraints are kept.
+
+    Returns:
+        None where one set of forces fits that keeps a contact, or where that cannot be told.
+    """
+    if not np.all(np.isfinite(force)):
+        return Jam.INCONSISTENT
+    edge = np.abs(without) @ np.abs(force)
+    if not np.all(edge <= FAR * size):
+        return Jam.INCONSISTENT  # A is singular, and b not among what forces can balance.
+    if np.all(np.abs(matrix @ force) <= edge / FAR):
+        return Jam.INDETERMINATE  # It is, and b is: forces that differ fit.
+    free = -matrix @ force
+    fitting = []
+    for used in _sets(len(matrix), rows, with_none=True):
+        force = np.zeros(len(matrix))
+        try:
+            force[used] = np.linalg.solve(matrix[np.ix_(used, used)], -free[used])
+        except np.linalg.LinAlgError:
+            return None
+        kept = np.isin(rows, used)
+        rate = (matrix @ force + free)[rows]
+        if np.all(force[rows][kept] >= 0.0) and np.all(rate[~kept] >= 0.0):
+            fitting.append(kept)
+    if not fitting:
+        return Jam.INCONSISTENT
+    if len(fitting) > 1:
+        return Jam.INDETERMINATE
+    return None if fitting[0].any() else Jam.OPENING
+
+
+def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
+    """Every set of contacts, each with all constraints that are none."""
+    kept = [i for i in range(size) if i not in rows]
+    counts = range(0 if with_none else 1, len(rows) + 1)
+    for chosen in chain.from_iterable(combinations(rows, count) for count in counts):
+        yield [*kept, *chosen]

@@ -1,0 +1,80 @@
+"""Signals w(t) that nobody here steers, and how they enter time derivatives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.errors import ModelError
+
+
+@dataclass(frozen=True, eq=False)
+class Exogenous:
+    """The parameters of a system that move, w, with symbols for their derivatives.
+
+    Attributes:
+        owner: The name of the system, for messages.
+        parameters: All parameters of the system.
+    """
+
+    owner: str
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def moving(self) -> tuple[Parameter, ...]:
+        """Those that move."""
+        return tuple(p for p in self.parameters if p.exogenous)
+
+    def __bool__(self) -> bool:
+        return bool(self.moving)
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of the entries of w."""
+        return tuple(signal for p in self.moving for signal in p.signals)
+
+    def rate(self, expression: ca.SX) -> ca.SX:
+        """The part sum_j (d/dw^(j)) w^(j+1) of the time derivative of an expression, shape (k, 1).
+
+        Raises:
+            ModelError: The expression needs more derivatives of w than there are.
+        """
+        rate = ca.SX(expression.numel(), 1)
+        for p in self.moving:
+            known = (p.symbol, *p.derivatives)
+            if ca.depends_on(expression, known[-1]):
+                raise ModelError(
+                    f"{self.owner}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
+                    "needed"
+                )
+            rate += ca.jtimes(expression, ca.vertcat(*known[:-1]), ca.vertcat(*known[1:]))
+        return rate
+
+    def degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
+        """How many derivatives of each entry of w some expressions depend on."""
+        every = ca.veccat(*expressions)
+        degrees: list[int] = []
+        for p in self.moving:
+            for i in range(p.value.size):
+                orders = [k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])]
+                degrees.append(max(orders, default=0))
+        return tuple(degrees)
+
+    def places(self, degrees: Sequence[int]) -> list[int]:
+        """Where W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) stands in `DaeSystem.parameter_symbol`.
+
+        Args:
+            degrees: d_1, d_2, ..., one for each entry of w.
+        """
+        start, following = 0, sum(p.value.size for p in self.parameters)
+        places, left = [], iter(degrees)
+        for p in self.parameters:
+            size = p.value.size
+            if p.exogenous:
+                for i in range(size):
+                    rates = range(next(left))
+                    places += [start + i, *(following + order * size + i for order in rates)]
+                following += size * len(p.derivatives)
+            start += size
+        return places

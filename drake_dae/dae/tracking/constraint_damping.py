@@ -1,0 +1,170 @@
+"""Damping of the constraint by the law, for contacts that give way."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm
+
+from drake_dae.arguments import checked, result_of
+from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.elimination import eliminate
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
+from drake_dae.errors import GainError, ModelError
+
+STEPS = 200
+"""Into how many steps an interval is divided in which the best damping is sought, twice."""
+
+
+def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structure:
+    """The structure of a law's model that demands, instead of y_i^(r_i) = 0,
+
+        y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
+
+    with no term in y_i itself, which would hold the place of a surface and not its force. On N* all
+    y_i^(j) vanish, so that nothing changes there: alpha (13) becomes
+    alpha - A^-1 (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
+
+    Where a force is an output of degree mu >= 1, behind springs or motors, the law differentiates
+    alpha. There it takes what is added as constant: a contact that gives way does not move as the
+    model demands, so that derivatives by the model drive it (with poles of the force at -p and a
+    contact of frequency w = sqrt(A k) unstable for c > p, at mu = 1 already). Then for mu = 1 the
+    contact is damped for all p, and for mu = 2 and c from w to 2 w from about p = 2.5 w on, best
+    near 5 w: the poles of a force must be faster than the contact.
+
+    Args:
+        structure: The structure of the system.
+        damping: A design such as `poles(-200.0)`, for y_i' in place of an error: r_i - 1 poles.
+
+    Raises:
+        GainError: The gains do not fit, or are not Hurwitz.
+    """
+    system, manifold = structure.system, structure.manifold
+    layout = Layout(structure.constraint_degrees)
+    residual = manifold.residual_expression
+    names = tuple(signal.name for signal in system.constraint_output_signals)
+    degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
+    found = damping
+    if not isinstance(found, FeedbackGains):
+        found = result_of("constraint_damping", found, names, degrees, error=GainError)
+    if not isinstance(found, FeedbackGains) or (found.names, found.degrees) != (names, degrees):
+        raise GainError(
+            f"constraint_damping must be a design such as poles(-200.0) for the constraints "
+            f"{', '.join(names) or 'none'} with r_i - 1 = {degrees} poles each"
+        )
+    rates = residual[np.flatnonzero(layout.orders).tolist(), :]
+    force = ca.mtimes(ca.sparsify(ca.DM(found.matrix)), rates)
+    derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
+    return _along(replace(structure, derivatives=derivatives), derivatives)
+
+
+def _along(structure: Structure, derivatives: Derivatives) -> Structure:
+    """The output chains of known degrees along other derivatives."""
+    system, degrees = structure.system, structure.output_degrees
+    chains: list[list[ca.SX]] = [[] for _ in degrees]
+    highest = ca.SX(len(degrees), 1)
+    rows = list(range(len(degrees)))
+    moving = system.l + ca.mtimes(system.m, derivatives.constraint_input)
+    for order in range(max(degrees, default=0) + 1):
+        values, _ = derivatives.by_control(moving)
+        for place, i in enumerate(rows):
+            if degrees[i] == order:
+                highest[i] = moving[place]
+            else:
+                chains[i].append(values[place])
+        still = [place for place, i in enumerate(rows) if degrees[i] > order]
+        rows = [rows[place] for place in still]
+        if rows:
+            moving = derivatives.derivative(moving[still])
+    drift, control_matrix = derivatives.by_control(highest)
+    elimination = eliminate(derivatives)
+    return replace(
+        structure,
+        elimination=replace(elimination, n_star=structure.elimination.n_star),
+        output_chains=tuple(tuple(chain) for chain in chains),
+        highest_derivatives=highest,
+        drift=drift,
+        control_matrix=control_matrix,
+    )
+
+
+@checked(ModelError)
+def contact_damping(
+    stiffness: float, mobility: float, sample_time: float = 0.0, delay: int = 1
+) -> float:
+    """The damping c that brings a contact of some stiffness to rest soonest.
+
+    On a contact that gives way, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
+
+        phi'' + c phi' = A (F - lambda_d),    so    phi'' + c phi' + A k phi = -A lambda_d,
+
+    which is critically damped at c = 2 sqrt(A k). A force that changes is followed with an error of
+    about c lambda_d' / (A k).
+
+    A sampled law holds -c phi' for a sample time T, and what it holds was measured `delay` samples
+    before. Between samples the contact swings freely; so (phi, phi', what is held) of one sample
+    follow from those before by a matrix, and c is that for which its spectral radius is least: the
+    contact comes to rest soonest. For a contact that is slow beside the samples that is 2 w, with
+    w = sqrt(A k). Without a contact a delay of one sample gives z^2 - z + c T = 0, which bears
+    c = 1 / (4 T) without a swing and c = 1 / T at all; so c stays of that size. Where w T comes to
+    about 1, what is held is late by a quarter of a swing: it damps no more, and c is 0. Then the
+    contact's own damping, or a shorter sample time, must help.
+
+    Args:
+        stiffness: k in N/m, positive.
+        mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive: see
+            `ConstraintStructure.constraint_matrix`. The largest one of those on the way.
+        sample_time: T in s; 0 for a law that runs continuously.
+        delay: How many samples a control is late.
+
+    Returns:
+        c in 1/s, from 0 to 2 sqrt(A k).
+
+    Raises:
+        ModelError: A number is not positive, or is negative.
+    """
+    for name, value, least in (
+        ("stiffness", stiffness, "positive"),
+        ("mobility", mobility, "positive"),
+        ("sample_time", sample_time, "0 or more"),
+    ):
+        if not (value > 0.0 or (value == 0.0 and least != "positive")):
+            raise ModelError(f"{name} must be {least}, got {value:g}")
+    check_whole_number("delay", delay, 0)
+    frequency = float(np.sqrt(mobility * stiffness))
+    critical = 2.0 * frequency
+    if sample_time == 0.0:
+        return critical
+    # phi'' = -frequency^2 phi + held, with phi in units of 1 / frequency.
+    swing = np.zeros((3, 3))
+    swing[0, 1], swing[1, 0], swing[1, 2] = frequency, -frequency, 1.0
+    step = expm(swing * sample_time)[:2]
+    low, high = 0.0, critical
+    for _ in range(2):
+        tried = np.linspace(low, high, STEPS + 1)
+        best = int(np.argmin([_radius(step, c, delay) for c in tried]))
+        low, high = tried[max(best - 1, 0)], tried[min(best + 1, STEPS)]
+    return float(tried[best])
+
+
+def _radius(step: FloatArray, damping: float, delay: int) -> float:
+    """The spectral radius of a contact whose damping is sampled, held and late.
+
+    Args:
+        step: What (phi, phi', what is held) become within a sample, shape (2, 3).
+        damping: c.
+        delay: How many samples later c phi' acts.
+    """
+    # (phi, phi', what is held next, ..., what is held last).
+    matrix = np.zeros((2 + delay, 2 + delay))
+    matrix[:2, :2] = step[:, :2]
+    if delay == 0:
+        matrix[:, 1] -= damping * step[:, 2]
+    else:
+        matrix[:2, 2] = step[:, 2]
+        matrix[2:-1, 3:] = np.eye(delay - 1)
+        matrix[-1, 1] = -damping
+    return float(np.abs(np.linalg.eigvals(matrix)).max())

@@ -1,0 +1,108 @@
+"""Integral action: errors that the law (28) integrates."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.measured_force import MeasuredForce
+from drake_dae.errors import GainError
+
+
+@dataclass(frozen=True, eq=False)
+class IntegralAction:
+    """sigma_i' = z_i - r_i of some outputs, which stands before their errors in (30):
+
+        e_i^(mu_i) = -K_i0 sigma_i - K_i1 e_i - ... - K_i mu_i e_i^(mu_i - 1),
+
+    so that an output has mu_i + 1 poles in place of mu_i. Where mu_i = 0 it is the integral of a
+    measured force: u_i = r_i - K_i0 int (v_j - r_i) dt. Against a model error delta that is
+    constant, e_i tends to zero.
+
+    Attributes:
+        outputs: Which outputs, by their place.
+        degrees: mu_1, ..., mu_p.
+        signals: Names and units of sigma.
+        symbol: The symbols of sigma, shape (k, 1).
+    """
+
+    outputs: tuple[int, ...]
+    degrees: tuple[int, ...]
+    signals: tuple[Signal, ...]
+    symbol: ca.SX
+
+    @classmethod
+    def of(
+        cls,
+        system: DaeSystem,
+        degrees: Sequence[int],
+        names: Sequence[str],
+        measured: MeasuredForce | None,
+    ) -> "IntegralAction":
+        """Integral action on outputs by their names.
+
+        Raises:
+            GainError: A name is that of no output, stands twice, or is that of a force that the
+                law meets at once and does not measure.
+        """
+        known = [signal.name for signal in system.output_signals]
+        found = []
+        for name in names:
+            if name not in known:
+                raise GainError(f"integral: {unknown_name('output', name, known)}")
+            i = known.index(name)
+            if i in found:
+                raise GainError(f"integral: '{name}' stands twice")
+            if degrees[i] == 0 and (measured is None or i not in measured.inputs):
+                raise GainError(
+                    f"integral: by the model the law meets '{name}' at once, and there is no error "
+                    "to integrate; make it with measured_force=True, and integrate what is a "
+                    "constraint input"
+                )
+            found.append(i)
+        chosen = tuple(sorted(found))
+        signals = tuple(
+            Signal(f"integral of {known[i]}", f"{system.output_signals[i].unit or '1'} s")
+            for i in chosen
+        )
+        return cls(chosen, tuple(degrees), signals, ca.SX.sym("integral", len(chosen)))
+
+    @property
+    def all_degrees(self) -> tuple[int, ...]:
+        """How many poles each output has."""
+        return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
+
+    def coordinates(self, errors: ca.SX, integral: ca.SX | None = None) -> ca.SX:
+        """The error coordinates with the integrals among them.
+
+        Args:
+            errors: (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i, 1).
+            integral: sigma, shape (k, 1); its symbols if None.
+        """
+        values = self.symbol if integral is None else integral
+        starts, rows = Layout(self.degrees).starts.tolist(), []
+        for i, degree in enumerate(self.degrees):
+            if i in self.outputs:
+                rows.append(values[self.outputs.index(i)])
+            rows.append(errors[starts[i] : starts[i] + degree, :])
+        return ca.vertcat(ca.SX(0, 1), *rows)
+
+    def rate(self, chain: ca.SX, values: ca.SX, measured: MeasuredForce | None) -> ca.SX:
+        """sigma' = z - r of these outputs, shape (k, 1).
+
+        Args:
+            chain: The output chains, with measured forces where the law takes them.
+            values: r_1, ..., r_p, shape (p, 1).
+            measured: How the law takes them.
+        """
+        starts, rows = Layout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
+        for i in self.outputs:
+            if self.degrees[i]:
+                rows.append(chain[starts[i]] - values[i])
+            elif measured is not None:
+                rows.append(measured.symbol[measured.inputs[i]] - values[i])
+        return ca.vertcat(*rows)

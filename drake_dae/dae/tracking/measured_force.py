@@ -1,0 +1,130 @@
+"""Measured constraint inputs in the tracking law.                       (59), (71), (81)"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import GainError, ModelError
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredForce:
+    """How a measurement of v enters the law (28), for the outputs z_i = v_j:
+
+        mu_i = 0:  ubar_i = r_i - Gbar_j (v - r), the term J^T Gbar (lambda - r_2) of (59). The
+            force error of a wrong model shrinks to 1 / (1 + Gbar).
+        mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
+
+    Attributes:
+        layout: How references and chains are stacked.
+        inputs: Output index i -> constraint input index j.
+        gain: Gbar, shape (m, m), positive semidefinite.
+        symbol: The symbols v of the measurement, shape (m, 1).
+    """
+
+    layout: Layout
+    inputs: dict[int, int]
+    gain: FloatArray
+    symbol: ca.SX
+
+    @classmethod
+    def of(cls, system: DaeSystem, layout: Layout, gain: ArrayLike) -> "MeasuredForce":
+        """The measurement of all constraint inputs of a system.
+
+        Args:
+            system: The system (1)-(3).
+            layout: How its references and chains are stacked.
+            gain: Gbar, a number or shape (m, m).
+
+        Raises:
+            GainError: The gain is not positive semidefinite, or is for an output with mu_i >= 1.
+            ModelError: No output is a constraint input, or constraints share their forces.
+        """
+        if system.sharing is not None:
+            raise ModelError(
+                f"{system.name}: measured_force does not know how redundant constraints share "
+                "their forces; leave them out with `drop_constraints`, or use the law's own force"
+            )
+        inputs = _force_outputs(system)
+        matrix = force_gain(gain, system.num_constraints)
+        for i, j in inputs.items():
+            if layout.degrees[i] and matrix[j].any():
+                raise GainError(
+                    f"force_gain is for outputs that the law meets at once; "
+                    f"'{system.output_signals[i].name}' has degree {layout.degrees[i]} and takes "
+                    "the measured force itself. Leave it 0"
+                )
+        return cls(layout, inputs, matrix, ca.SX.sym("v", system.num_constraints))
+
+    def chain(self, chain: ca.SX) -> ca.SX:
+        """The output chains with the measurement in place of the model's l*_i.
+
+        Args:
+            chain: The output chains by the model, shape (sum mu_i, 1).
+        """
+        result = ca.SX(chain)
+        for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
+            if output in self.inputs:
+                result[int(head)] = self.symbol[self.inputs[int(output)]]
+        return result
+
+    def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
+        """The highest derivatives of the reference, less Gbar (v - r) where mu_i = 0.
+
+        Args:
+            highest: r_i^(mu_i), shape (p, 1).
+            values: r_i, shape (p, 1).
+        """
+        excess = ca.SX(self.symbol.numel(), 1)
+        for i, j in self.inputs.items():
+            excess[j] = self.symbol[j] - values[i]
+        result = ca.SX(highest)
+        for i in map(int, self.layout.direct):
+            if i in self.inputs:
+                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)
+        return result
+
+
+def force_gain(value: ArrayLike, size: int) -> FloatArray:
+    """Gbar of (59) as a matrix of shape (m, m).
+
+    Args:
+        value: A number for all forces, or the matrix.
+        size: The number of forces, m.
+
+    Raises:
+        GainError: The shape is wrong, or the matrix is not positive semidefinite.
+    """
+    gain = numbers("force_gain", value, GainError)
+    if gain.ndim == 0:
+        gain = gain * np.eye(size)
+    if gain.shape != (size, size) or not np.all(np.isfinite(gain)):
+        raise GainError(f"force_gain must be a number or shape ({size}, {size}), got {value!r}")
+    smallest = float(np.min(np.linalg.eigvalsh((gain + gain.T) / 2.0), initial=0.0))
+    if smallest < -1e-12:
+        raise GainError(
+            "force_gain, Gbar of (59), must be positive semidefinite: a negative one feeds the "
+            f"force error back with the wrong sign. Smallest eigenvalue {smallest:.3g}"
+        )
+    return gain
+
+
+def _force_outputs(system: DaeSystem) -> dict[int, int]:
+    """The outputs that are constraint inputs, z_i = v_j, as output index i -> input index j."""
+    found = {}
+    for i in range(system.num_outputs):
+        row = ca.sparsify(system.m[i, :])
+        if row.nnz() == 1 and system.l[i].is_zero():
+            j = row.sparsity().get_triplet()[1][0]
+            if row[j].is_one():
+                found[i] = j
+    if not found:
+        raise ModelError(
+            f"{system.name}: measured_force needs an output that is a constraint input, z_i = v_j"
+        )
+    return found

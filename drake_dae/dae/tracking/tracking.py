@@ -1,0 +1,308 @@
+"""The tracking law.                                                        (28), (29)"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked, result_of
+from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
+from drake_dae.dae.structure.structure import Structure, structure_of
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.constraint_damping import damped
+from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
+from drake_dae.dae.tracking.integral import IntegralAction
+from drake_dae.dae.tracking.measured_force import MeasuredForce
+from drake_dae.errors import GainError, ModelError
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class TrackingLaw:
+    """The law (28), which makes the controlled outputs follow a reference:
+
+        u(x, R) = B(x)^-1 (-a(x) + ubar),
+        ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
+
+    with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
+    exactly. Where controls outnumber outputs, it is the u that the system's `control_metric`
+    chooses, next to its `free_control`. The law needs the state x; it needs no measurement of the
+    constraint inputs, but takes one with `measured_force`; see `MeasuredForce`.
+
+    The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
+    numbers.
+
+    Args:
+        system: The system (1)-(3).
+        gains: A design such as `poles(-4.0)`, or finished gains.
+        structure: The structure of the system; found if None.
+        measured_force: Whether the law takes a measurement of v. In a diagram it needs a sensor
+            with state where mu_i = 0; see `ForceSensor`.
+        force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
+            semidefinite; only with measured_force.
+        constraint_damping: What the law's own model demands of the constraints that its plant may
+            break, as a contact that gives way does: a design such as `poles(-200.0)`, with r_i - 1
+            poles of phi'; see `dae.constraint_damping`. On N* it changes nothing. None for none.
+        integral: The names of the outputs whose errors are integrated as well, positions or
+            measured forces; see `IntegralAction`. They take a pole more.
+
+    Attributes:
+        layout: How references and chains are stacked.
+        reference_signals: Names and units of R.
+        function: The law as (state, reference, measured_force, parameters) -> control and
+            tracking_error, with `all_parameters`; without measured force there is no such input.
+        measured_force: How the measurement enters; None without one.
+        exogenous_degrees: How many derivatives of each entry of w the law needs.
+        integral: What is integrated; then `function` takes "integral" before the parameters, and
+            returns "integral_rate" as well.
+        control_takes_force: Whether the measured force enters the control in the same instant.
+
+    Raises:
+        AssumptionError: The system violates an assumption of the theory.
+        GainError: The gains do not fit, or are not Hurwitz.
+        ModelError: This is no DaeSystem, or the structure is that of another system; or force is
+            measured, and no output is a constraint input.
+    """
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        gains: GainDesign | FeedbackGains,
+        *,
+        structure: Structure | None = None,
+        measured_force: bool = False,
+        force_gain: ArrayLike = 0.0,
+        constraint_damping: GainDesign | FeedbackGains | None = None,
+        integral: Sequence[str] = (),
+    ) -> None:
+        self.structure = structure_of("TrackingLaw", system, structure)
+        self._model = self.structure
+        if constraint_damping is not None:
+            self._model = damped(self.structure, constraint_damping)
+        self.system = system
+        self.layout = Layout(self.structure.output_degrees)
+        self.reference_signals = self.layout.reference_signals(system.output_signals)
+        self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
+        self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
+        self.gains = self.design(gains)
+        self._error_coordinates = self._trace_error_coordinates()
+        self.function = self._trace()
+
+    def __repr__(self) -> str:
+        outputs = listed(signal.name for signal in self.system.output_signals)
+        force = ", measured_force" if self.measured_force else ""
+        return (
+            f"TrackingLaw('{self.system.name}', outputs={outputs}, "
+            f"degrees={list(self.degrees)}{force})"
+        )
+
+    def _trace(self) -> TracedFunction:
+        """The law (28) and the tracking error (29) as one function."""
+        structure, layout, measured = self._model, self.layout, self.measured_force
+        reference = ca.SX.sym("R", layout.reference_size)
+        # Symbols where K is not zero: the errors of most outputs are not coupled.
+        gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
+        values = reference[layout.lowest.tolist(), :]
+        highest = reference[layout.highest.tolist(), :]
+        chain = structure.chain
+        inputs = {"reference": reference}
+        if measured:
+            chain, highest = measured.chain(chain), measured.highest(highest, values)
+            inputs["measured_force"] = measured.symbol
+        errors = chain - reference[layout.chained.tolist(), :]
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))
+        control, pivot = structure.control_for(ubar)
+        # By the model; what the control reaches at once is as wanted.
+        output = ca.SX(ubar)
+        output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
+        self.exogenous_degrees = self.system.exogenous.degrees(control, output)
+        outputs = {"control": control, "tracking_error": output - values}
+        if self.integral.outputs:
+            inputs["integral"] = self.integral.symbol
+            outputs["integral_rate"] = self.integral.rate(chain, values, measured)
+        self.control_takes_force = measured is not None and bool(
+            ca.depends_on(ca.vertcat(control, output), measured.symbol)
+        )
+        numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
+        self._wanted = ubar
+        self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
+        return TracedFunction(
+            f"{self.system.name} tracking law",
+            self._inputs,
+            outputs,
+            pivot,
+            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
+            compiled=self.system.compiled,
+        )
+
+    def trace_motion(self) -> TracedFunction | None:
+        """x' and v of a plant that is the law's own model, under the law; see `motion_for`.
+
+        Returns:
+            A function of what `function` takes; None where there is none.
+        """
+        found = self.structure.motion_for(self._wanted) if self._model is self.structure else None
+        if found is None:
+            return None
+        rate, force, pivot = found
+        outputs = {"rate": rate, "force": force}
+        name = f"{self.system.name} under its law"
+        return TracedFunction(name, self._inputs, outputs, pivot, often=False)
+
+    def _trace_error_coordinates(self) -> TracedFunction:
+        """The error coordinates as a function of state and reference: the initial value of (30)."""
+        reference = ca.SX.sym("R", self.layout.reference_size)
+        chain = self._model.chain - reference[self.layout.chained.tolist(), :]
+        inputs = {"reference": reference, "integral": self.integral.symbol}
+        outputs = {"coordinates": self.integral.coordinates(chain)}
+        return self.system.trace("error coordinates", outputs, inputs, often=False)
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """mu_1, ..., mu_p: how many derivatives of each reference the law needs."""
+        return self.layout.degrees
+
+    def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
+        """The gains for the outputs of this law.
+
+        Raises:
+            GainError: The gains are for other outputs or degrees, or are no gains.
+        """
+        names = tuple(signal.name for signal in self.system.output_signals)
+        degrees = self.integral.all_degrees
+        found = gains
+        if not isinstance(found, FeedbackGains):
+            found = result_of("gains", found, names, degrees, error=GainError)
+        if not isinstance(found, FeedbackGains):
+            raise GainError(
+                f"gains must be a design such as poles(-4.0), got one of {brief(found)}"
+            )
+        if (found.names, found.degrees) != (names, degrees):
+            raise GainError(
+                f"the gains are for the outputs {', '.join(found.names)} with degrees "
+                f"{found.degrees}, the system has {', '.join(names)} with {degrees}"
+            )
+        return found
+
+    def all_parameters(
+        self,
+        parameters: ArrayLike | None = None,
+        gains: GainDesign | FeedbackGains | None = None,
+    ) -> FloatArray:
+        """What `function` takes as parameters: the system's, then the entries of K by columns.
+
+        Args:
+            parameters: Values of the system's parameters; the defaults if None.
+            gains: Other gains than those of the law; its own if None. Of K only those entries
+                count that are not zero in the law's own gains.
+
+        Raises:
+            GainError: The gains do not fit, or couple outputs that the law does not.
+        """
+        chosen = self.gains if gains is None else self.design(gains)
+        has = self.gains.matrix != 0.0
+        if np.any(chosen.matrix[~has]):
+            i, j = np.argwhere((chosen.matrix != 0.0) & ~has)[0]
+            signals = self.coordinate_signals
+            raise GainError(
+                f"the law has no gain from the error of {signals[j].name} to "
+                f"{self.system.output_signals[i].name}; make a new law with such a gain"
+            )
+        values = self.system.parameter_vector(parameters)
+        return np.concatenate([values, chosen.matrix.T[has.T]])
+
+    @property
+    def coordinate_signals(self) -> list[Signal]:
+        """Names and units of the error coordinates."""
+        integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
+        found = []
+        for i, (signal, degree) in enumerate(
+            zip(self.system.output_signals, self.degrees, strict=True)
+        ):
+            found += [integrals[i]] if i in integrals else []
+            found += [signal.derivative(order) for order in range(degree)]
+        return found
+
+    def control(
+        self,
+        state: ArrayLike,
+        reference: ArrayLike,
+        *,
+        measured_force: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+    ) -> FloatArray:
+        """The control u(x, R) of (28).
+
+        Args:
+            state: x, shape (n,).
+            reference: R, shape (sum (mu_i + 1),), output-major.
+            measured_force: v, shape (m,); exactly where the law takes it.
+            integral: The integrals of the errors, shape (k,); zero if None.
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            u, shape (p,).
+        """
+        measured = [] if measured_force is None else [measured_force]
+        if self.integral.outputs:
+            measured.append(self._integrals(integral))
+        return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
+
+    def _integrals(self, given: ArrayLike | None) -> FloatArray:
+        size = len(self.integral.outputs)
+        return vector("integral", np.zeros(size) if given is None else given, size, GainError)
+
+    def error_coordinates(
+        self,
+        state: ArrayLike,
+        reference: ArrayLike,
+        parameters: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
+    ) -> FloatArray:
+        """(e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
+
+        The integral of an error stands before it, where the law has one. The arguments are those of
+        `control`.
+        """
+        values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
+        return self._error_coordinates(state, reference, sigma, values)[0]
+
+    def predicted_error(
+        self,
+        times: ArrayLike,
+        state: ArrayLike,
+        reference: ArrayLike,
+        parameters: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
+    ) -> FloatArray:
+        """The error that theory predicts after a start from a state, shape (k, p).
+
+        Args:
+            times: Times in s after the start, shape (k,).
+            state: The state at the start, shape (n,).
+            reference: R at the start.
+            parameters: Values of all parameters; the defaults if None.
+            integral: The integrals of the errors at the start, shape (k,); zero if None.
+        """
+        start = self.error_coordinates(state, reference, parameters, integral)
+        errors = self.gains.error_response(times, start)
+        if self.integral.outputs:  # There the first coordinate is the integral of the error.
+            rates = self.gains.error_response(times, self.gains.error_matrix @ start)
+            errors[:, self.integral.outputs] = rates[:, self.integral.outputs]
+        return errors
+
+
+def _measured_force(
+    system: DaeSystem, layout: Layout, wanted: bool, gain: ArrayLike
+) -> MeasuredForce | None:
+    if wanted:
+        return MeasuredForce.of(system, layout, gain)
+    if numbers("force_gain", gain, GainError).any():
+        raise GainError("force_gain needs measured_force=True")
+    return None

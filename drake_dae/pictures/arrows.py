@@ -1,0 +1,216 @@
+"""What constraints do to a robot, as arrows in Meshcat."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+
+_FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
+_MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
+
+PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
+
+_PIECE = 32
+"""How many points a piece of a path has that grows."""
+
+LEAST_SCALE = 1e-3
+"""How much of its length an arrow keeps where nothing acts: no transformation survives zero."""
+
+
+class ForceArrows:
+    """Draws what each constraint does to a robot: an arrow that begins where its force acts.
+
+    It points as the constraint pushes, from a surface to its free side. A moment has an arrow of
+    its own, with two heads, along its axis. An arrow is as long as its force is large beside the
+    largest one drawn so far.
+
+    Args:
+        meshcat: Where to draw.
+        model: The robot.
+        length: The length of the longest arrow, m.
+
+    Attributes:
+        largest_force, largest_moment: What gets the longest arrow, N and N m.
+    """
+
+    def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
+        self.largest_force = self.largest_moment = 1e-6
+        self._meshcat, self._model = meshcat, model
+        self._loads = ConstraintWrenches(model)
+        pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
+        for constraint, with_moment in pairs:
+            _add_arrow(meshcat, path_of(constraint, "force"), length, 1, _FORCE_COLOR)
+            if with_moment:
+                _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, _MOMENT_COLOR)
+
+    def draw(self, loads: Wrenches, time: float) -> None:
+        """Draws the arrows.
+
+        Args:
+            loads: The loads at this moment.
+            time: The time in a recording, s.
+        """
+        self.measure([loads])
+        pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
+        for row, (constraint, with_moment) in enumerate(pairs):
+            point, force, moment = loads.points[row], loads.forces[row], loads.moments[row]
+            self._draw_arrow(path_of(constraint, "force"), point, force / self.largest_force, time)
+            if with_moment:
+                turned = moment / self.largest_moment
+                self._draw_arrow(path_of(constraint, "moment"), point, turned, time)
+
+    def place(self, parameters: FloatArray, time: float) -> None:
+        """Puts what moves where it is now.
+
+        Args:
+            parameters: Values of all parameters.
+            time: The time in a recording, s.
+        """
+        dae = self._model.dae
+        moving = {p.name for p in dae.exogenous.moving}
+        for constraint in self._model.constraints:
+            if not moving.isdisjoint(p.name for p in constraint.parameters):
+                stands = constraint.placement(own_values(constraint, dae, parameters))
+                self._meshcat.SetTransform(path_of(constraint, "surface"), stands, time)
+
+    def measure(self, course: Sequence[Wrenches]) -> None:
+        """Makes the arrows so short that none of these loads has one that is too long."""
+        for loads in course:
+            force, moment = (
+                float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
+                for rows in (loads.forces, loads.moments)
+            )
+            self.largest_force = max(self.largest_force, force)
+            self.largest_moment = max(self.largest_moment, moment)
+
+    def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
+        size = float(np.linalg.norm(arrow))
+        direction = arrow / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+        pose = RigidTransform(RotationMatrix(axes_along(direction)), point)
+        self._meshcat.SetTransform(path, pose, time)
+        scale = max(size, LEAST_SCALE)
+        self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
+
+
+class GrowingPaths:
+    """Draws where constraints act, further with each moment.
+
+    Args:
+        meshcat: Where to draw.
+        constraints: The constraints that act at a point.
+    """
+
+    def __init__(self, meshcat: Meshcat, constraints: Sequence[Constraint]) -> None:
+        self._meshcat, self._constraints = meshcat, constraints
+        self._piece: list[FloatArray] = []
+        self._number, self._time = 0, -np.inf
+
+    def add(self, points: FloatArray, time: float) -> None:
+        """Goes on to where they act now; a time before the last one begins anew.
+
+        Args:
+            points: Where they act, m, shape (k, 3).
+            time: The time in s.
+        """
+        if time < self._time:
+            self._meshcat.Delete("/paths")
+            self._piece, self._number = [], 0
+        self._time = time
+        self._piece.append(points)
+        line = np.array(self._piece)
+        for row, constraint in enumerate(self._constraints):
+            path = f"/paths/{constraint.name}/actual/{self._number}"
+            self._meshcat.SetLine(path, np.asfortranarray(line[:, row].T), 4.0, PATH_COLOR)
+        # In pieces: a line is sent as a whole with each of its points.
+        if len(self._piece) > _PIECE:
+            self._piece, self._number = [points], self._number + 1
+
+
+class ConstraintForceVisualizer(LeafSystem):
+    """Draws the constraint forces of a robot while it runs, and the paths of their points.
+
+    Input ports:
+        link_state: (q, v).
+        constraint_force: lambda, shape (m,).
+        exogenous: What the plant reads at its port of that name, if there is anything that moves.
+
+    Args:
+        arrows: What draws them.
+        meshcat: Where to draw the paths.
+        model: The robot.
+        places: Where the entries of `exogenous` stand among the parameters.
+        period: Time between pictures in s.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        arrows: ForceArrows,
+        meshcat: Meshcat,
+        model: RobotModel,
+        places: Sequence[int],
+        period: float,
+    ) -> None:
+        super().__init__()
+        self.set_name("constraint_force_visualizer")
+        self._model = model
+        self._arrows, self._loads = arrows, ConstraintWrenches(model)
+        self._paths = GrowingPaths(meshcat, self._loads.constraints)
+        self._values, self._places = model.dae.parameter_values, list(places)
+        size = model.links.q.numel() + model.links.v.numel()
+        self._link_state = self.DeclareVectorInputPort("link_state", size)
+        self._force = self.DeclareVectorInputPort("constraint_force", len(model.dae.force_signals))
+        self._exogenous = self.DeclareVectorInputPort("exogenous", len(self._places))
+        self.DeclarePeriodicPublishEvent(period, 0.0, weakly(self._publish))
+        self.DeclareForcedPublishEvent(weakly(self._publish))
+
+    def _publish(self, context: Context) -> EventStatus:
+        state, force, time = (
+            self._link_state.Eval(context),
+            self._force.Eval(context),
+            context.get_time(),
+        )
+        if self._places and self._exogenous.HasValue(context):
+            self._values[self._places] = self._exogenous.Eval(context)
+            self._arrows.place(self._values, time)
+        loads = self._loads(state, force, self._values)
+        self._arrows.draw(loads, time)
+        self._paths.add(loads.points, time)
+        return EventStatus.Succeeded()
+
+
+def path_of(constraint: Constraint, what: str) -> str:
+    """Where a constraint's surface, force or moment stands in the scene."""
+    return f"/contact/{constraint.name}/{what}"
+
+
+def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
+    """An arrow along z that begins at the origin, with one head behind the other."""
+    # A MeshcatCone stands on its tip: turned over, it points along +z.
+    turned = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
+    head, names = 0.2 * length, ["head", "second_head"][:heads]
+    for number, name in enumerate(names):
+        cone = f"{path}/arrow/{name}"
+        meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
+        meshcat.SetTransform(cone, RigidTransform(turned, [0.0, 0.0, length - number * head]))
+    shaft = length - heads * head
+    meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
+    middle = np.array([0.0, 0.0, shaft / 2])
+    meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
+    # Drawn last and over everything: the force in a joint acts inside of bodies.
+    for part in (*names, "shaft"):
+        mesh = f"{path}/arrow/{part}/<object>"
+        meshcat.SetProperty(mesh, "material.depthTest", False)
+        meshcat.SetProperty(mesh, "material.transparent", True)
+        meshcat.SetProperty(mesh, "renderOrder", 1.0)

@@ -1,0 +1,181 @@
+"""How the axes of a picture stand, and what is written beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+
+if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Of a figure, in inches: the axes' height, or the side of square ones, what is left and right of
+# them for the numbers of their scale, between rows, below the last and above the first; of a
+# legend, a line, what stands before a label, and a letter of it.
+_AXES, _SQUARE, _LEFT, _RIGHT, _GAP, _BOTTOM, _TITLE = 1.4, 3.6, 0.75, 0.2, 0.5, 0.55, 0.25
+_LINE, _HANDLE, _LETTER = 0.2, 0.65, 0.075
+
+_RAISED = str.maketrans(
+    "-0123456789", "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079"
+)
+
+
+def grid(
+    titles: Sequence[str],
+    labels: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    noted: str = "",
+) -> tuple[Figure, list[Axes]]:
+    """Axes over time in two columns; a last one alone in its row fills it.
+
+    Their places are known beforehand: a layout that measures what it draws takes longer than the
+    drawing itself. Those below each other share their numbers, too.
+
+    Args:
+        titles: What stands above each of them.
+        labels: The entries of a legend above all axes, for which room is left.
+        notes: What stands in words below all axes.
+        noted: What stands before the notes.
+    """
+    from matplotlib.figure import Figure
+
+    count = len(titles)
+    columns = 1 if count <= 2 else 2
+    rows = -(-count // columns)
+    width = 6.0 * columns if count or not notes else 12.0
+    top = _TITLE + (_LINE * legend_shape(labels, width)[0] + 0.15 if labels else 0.1)
+    # An entry is not broken at the end of a line.
+    entries = ", ".join(note.replace(" ", "\u00a0") for note in notes)
+    text = fill(noted + _plain(entries), int(width / _LETTER) - 6) if notes else ""
+    below = (_BOTTOM if count else 0.1) + _LINE * len(text.splitlines())
+    height = below + rows * _AXES + max(rows - 1, 0) * _GAP + top
+    figure = Figure(figsize=(width, height))
+    if text:
+        figure.text(0.1 / width, 0.08 / height, text, fontsize=9, va="bottom")
+    if not count:
+        return figure, []
+    cells = figure.add_gridspec(
+        rows,
+        columns,
+        left=_LEFT / width,
+        right=1.0 - _RIGHT / width,
+        bottom=below / height,
+        top=1.0 - top / height,
+        wspace=(_LEFT + _RIGHT) / (width / columns - _LEFT - _RIGHT),
+        hspace=_GAP / _AXES,
+    )
+    numbered = count - count % columns  # Above a wide one stands another scale.
+    axes: list[Axes] = []
+    for i, title in enumerate(titles):
+        row, column = divmod(i, columns)
+        place = cells[row, :] if i == count - 1 and column == 0 else cells[row, column]
+        axis = figure.add_subplot(place, sharex=axes[0] if axes else None)
+        axis.set_title(title, y=1.0, fontsize=10)  # With y there is no search for room.
+        axis.tick_params(axis="x", labelbottom=row == rows - 1 or i + columns >= numbered)
+        axis.grid(True, alpha=0.3)
+        axes.append(axis)
+    figure.supxlabel("time [s]", fontsize=10, y=(below - 0.5) / height, va="bottom")
+    return figure, axes
+
+
+def squares(titles: Sequence[str], labels: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """Square axes in up to three columns.
+
+    Args:
+        titles: What stands above each of them.
+        labels: The entries of a legend above all axes, for which room is left.
+    """
+    from matplotlib.figure import Figure
+
+    columns = min(len(titles), 3)
+    rows = -(-len(titles) // columns)
+    cell = _SQUARE + _LEFT + _RIGHT
+    width = cell * columns
+    top = _TITLE + _LINE * legend_shape(labels, width)[0] + 0.15
+    height = rows * (_SQUARE + _BOTTOM) + (rows - 1) * _TITLE + top
+    figure = Figure(figsize=(width, height))
+    axes: list[Axes] = []
+    for number, title in enumerate(titles):
+        row, column = divmod(number, columns)
+        left = column * cell + _LEFT
+        bottom = height - top - (row + 1) * _SQUARE - row * (_BOTTOM + _TITLE)
+        box = (left / width, bottom / height, _SQUARE / width, _SQUARE / height)
+        axis = figure.add_axes(box)
+        axis.set_title(title, y=1.0, fontsize=10)
+        axis.locator_params(nbins=6)
+        axis.grid(True, alpha=0.3)
+        axes.append(axis)
+    return figure, axes
+
+
+def decades(axis: Axes, floor: float) -> None:
+    """Scales a logarithmic axis from the floor up, with few numbers.
+
+    They are plain text: Matplotlib's own ones are mathematics, which takes longer than the curves.
+    """
+    low, high = floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor)
+    axis.set_ylim(low, high)
+    first, last = int(np.ceil(np.log10(low))), int(np.floor(np.log10(high)))
+    powers = range(first, last + 1, max(1, -(-(last - first) // 5)))
+    axis.set_yticks([10.0**k for k in powers], [f"10{str(k).translate(_RAISED)}" for k in powers])
+    axis.set_yticks([], minor=True)
+
+
+def short(value: float, digits: int = 3) -> str:
+    """A number for a line of text, as 4e-10."""
+    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
+    return f"{mantissa}e{int(exponent)}" if exponent else mantissa
+
+
+def labelled(signal: Signal) -> str:
+    """A signal's name with its unit."""
+    name = _plain(signal.name)
+    return f"{name} [{signal.unit}]" if signal.unit else name
+
+
+def _plain(text: str) -> str:
+    """Text in which Matplotlib reads no mathematics."""
+    return text.replace("$", r"\$")
+
+
+def legend(figure: Figure, axis: Axes) -> None:
+    """One legend above all axes, where it hides nothing."""
+    handles, labels = axis.get_legend_handles_labels()
+    columns = legend_shape(labels, figure.get_figwidth())[1]
+    place = (0.5, 1.0 - 0.05 / figure.get_figheight())
+    figure.legend(
+        handles,
+        labels,
+        loc="upper center",
+        bbox_to_anchor=place,
+        borderaxespad=0.0,
+        ncols=columns,
+        fontsize=9,
+    )
+
+
+def legend_shape(labels: Sequence[str], width: float) -> tuple[int, int]:
+    """Rows and columns of a legend that is no wider than a figure."""
+    if sum(_HANDLE + _LETTER * len(label) for label in labels) <= width - 0.2:
+        return 1, len(labels)
+    entry = _HANDLE + _LETTER * max(map(len, labels))
+    columns = max(1, min(len(labels), int((width - 0.2) / entry)))
+    return -(-len(labels) // columns), columns
+
+
+def flatten(axis: Axes, values: FloatArray, noise: float, margin: float) -> None:
+    """Shows a signal that varies by less than the noise as a flat line."""
+    low, high = float(np.min(values)), float(np.max(values))
+    if high - low < noise:
+        axis.set_ylim((low + high) / 2 - margin, (low + high) / 2 + margin)
+
+
+def round_off(values: FloatArray) -> float:
+    """Where errors of a signal of this size disappear, at least 1e-16: a logarithm has no zero."""
+    return float(np.finfo(float).eps * max(np.max(np.abs(values), initial=0.0), 0.45))

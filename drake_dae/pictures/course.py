@@ -1,0 +1,202 @@
+"""Where a robot was in a run, frame by frame, and where its reference wanted it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.systems.framework import Context, System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.pictures.view import FRAME_RATE, RobotBlock
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.simulation.records.events import flashes
+from drake_dae.simulation.records.record import Record
+
+STILL = 1e-4
+"""A contact point whose path is shorter than this share of its distance has no path to draw."""
+
+
+class Loop(Protocol):
+    """A diagram with a plant and its geometry, as a `ClosedLoop`."""
+
+    @property
+    def plant(self) -> System:
+        """What was simulated."""
+
+    @property
+    def scene_graph(self) -> SceneGraph | None:
+        """The geometry of a robot, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A run of a robot at k moments, equally far apart.
+
+    Attributes:
+        plant: The robot.
+        times: The moments in s after the start, shape (k,).
+        start_time: When the run began, in s.
+        states: x, shape (k, n).
+        parameters: The values of all parameters, shape (k, number of parameters).
+        loads: What the constraints did.
+        wanted: Link states at rest with the desired outputs, as long as they are in reach,
+            shape (j, nq + nv) with j <= k.
+        acting: Where and how the constraints act, at the parameters of the start.
+        flashes: How bright each constraint flashes where an impact is shown, 0 to 1, shape
+            (k, constraints).
+    """
+
+    plant: RobotBlock
+    times: FloatArray
+    start_time: float
+    states: FloatArray
+    parameters: FloatArray
+    loads: Sequence[Wrenches]
+    wanted: FloatArray
+    acting: ConstraintWrenches
+    flashes: FloatArray
+
+    @property
+    def points(self) -> FloatArray:
+        """Where the constraints acted, m, shape (k, constraints, 3)."""
+        return np.array([load.points for load in self.loads])
+
+    @property
+    def wanted_points(self) -> FloatArray:
+        """Where they would have acted with the desired outputs, m, shape (j, constraints, 3)."""
+        none = np.zeros(len(self.plant.model.dae.force_signals))
+        pairs = zip(self.wanted, self.parameters, strict=False)
+        found = [self.acting(state, none, own).points for state, own in pairs]
+        return np.array(found).reshape(len(found), len(self.acting.constraints), 3)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPath:
+    """The path of a point on a surface, as seen along the (mean) normal.
+
+    Attributes:
+        name: The constraint's name.
+        actual: The path along two axes of the surface, m, shape (k, 2).
+        desired: The path that the reference wanted, m, shape (j, 2).
+    """
+
+    name: str
+    actual: FloatArray
+    desired: FloatArray
+
+
+def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
+    """The course of a run of a robot.
+
+    Args:
+        loop: A loop of a `RobotPlant`.
+        record: The record of a run of this loop.
+        context: The context of its diagram, for the parameters; not changed.
+        rate: Moments per second.
+
+    Raises:
+        ModelError: There is no robot.
+    """
+    plant = loop.plant
+    if not isinstance(plant, RobotBlock):
+        raise ModelError("an animation needs a closed loop of a RobotPlant")
+    parameters = plant.parameters(plant.GetMyContextFromRoot(context))
+    acting = ConstraintWrenches(plant.model, parameters)
+    times = frame_times(record.time[-1] - record.time[0], rate)
+    states = _interpolated(record, "state", times)
+    forces = _interpolated(record, "constraint_force", times)
+    desired = _interpolated(record, "desired_output", times)
+    values = np.tile(parameters, (len(times), 1))
+    if "exogenous" in record.signals:
+        values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
+    loads = [acting(*row) for row in zip(states, forces, values, strict=True)]
+    wanted = _desired_states(plant.model, states, desired, values)
+    begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
+    bright = flashes(record.events, names, begin + times)
+    return Course(plant, times, begin, states, values, loads, wanted, acting, bright)
+
+
+def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
+    """The moments to show, in s after the start; the last one is the end or the next after it."""
+    return np.arange(int(np.ceil(duration * rate - 1e-9)) + 1) / rate
+
+
+def contact_paths(course: Course) -> list[ContactPath]:
+    """The paths of the points that surfaces push at and that move, each on its surface.
+
+    They are seen along the surface's mean normal: for a plane in its own coordinates, on a surface
+    that bends as in a tangent plane, relative to its reference point.
+    """
+    dae = course.plant.model.dae
+    size = float(np.max(np.abs(course.points), initial=0.0))
+    pushes = _pushes(course)
+    found = []
+    for row, constraint in enumerate(course.acting.constraints):
+        if not any(constraint.can_only_push):
+            continue
+        stands = [constraint.placement(own_values(constraint, dae, p)) for p in course.parameters]
+        actual, desired = (
+            np.array([stand.inverse() @ p for stand, p in zip(stands, points, strict=False)])
+            for points in (course.points[:, row], course.wanted_points[:, row])
+        )
+        way = np.vstack([actual, desired.reshape(-1, 3)])
+        if np.max(np.ptp(way, axis=0)) <= STILL * size:
+            continue
+        normals = [
+            stand.rotation().inverse() @ push
+            for stand, push in zip(stands, pushes[:, row], strict=True)
+        ]
+        # Of a path all around the surface no normal is the mean.
+        normal = next(n for n in (np.mean(normals, axis=0), normals[0]) if np.linalg.norm(n) > 1e-3)
+        axes = np.column_stack(tangents(normal / np.linalg.norm(normal)))
+        found.append(ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes))
+    return found
+
+
+def _pushes(course: Course) -> FloatArray:
+    """The directions in which surfaces push, in the world, shape (k, constraints, 3).
+
+    At rest nothing rubs, so that a push is along the normal.
+    """
+    model, links = course.plant.model, course.plant.model.links
+    ones = [np.array(constraint.can_only_push, float) for constraint in model.constraints]
+    push = np.concatenate([np.zeros(0), *ones])
+    nq, nv = links.q.numel(), links.v.numel()
+    rest = np.pad(course.states[:, :nq], ((0, 0), (0, nv)))
+    pairs = zip(rest, course.parameters, strict=True)
+    return np.array([course.acting(state, push, own).forces for state, own in pairs])
+
+
+def _interpolated(record: Record, name: str, times: FloatArray) -> FloatArray:
+    """A signal at times after the start, shape (k, size): straight lines between the steps."""
+    moments = record.time - record.time[0]
+    rows = [np.interp(times, moments, column) for column in record[name].T]
+    return np.array(rows).reshape(-1, len(times)).T
+
+
+def _desired_states(
+    model: RobotModel, states: FloatArray, desired: FloatArray, values: FloatArray
+) -> FloatArray:
+    """Link states at rest with the desired outputs, as long as they are within reach.
+
+    Args:
+        model: The robot.
+        states, desired, values: x, z and the parameters at each moment, one row each.
+    """
+    nq, nv = model.links.q.numel(), model.links.v.numel()
+    q, found = states[0, :nq], []
+    # Where rolling leaves open how a robot stands, it goes as it went.
+    moves = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
+    try:
+        wanted = desired[:, : len(model.position_signals)]
+        for row, own, move in zip(wanted, values, moves, strict=True):
+            q = model.configuration(row, q + move, own)
+            found.append(np.concatenate([q, np.zeros(nv)]))
+    except InconsistentStateError:
+        pass  # The reference leaves what the robot can reach: its path ends there.
+    return np.array(found).reshape(-1, nq + nv)

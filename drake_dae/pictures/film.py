@@ -1,0 +1,264 @@
+"""A run of a robot as a film: rendered by Drake, without a screen and without a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    InMemoryMesh,
+    LightParameter,
+    MakeRenderEngineVtk,
+    Mesh,
+    PerceptionProperties,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    RenderLabel,
+    Rgba,
+    SceneGraph,
+    Shape,
+    TriangleSurfaceMesh,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+from pydrake.systems.sensors import CameraInfo
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.pictures.course import Course, Loop, follow
+from drake_dae.pictures.phases import phases_at
+from drake_dae.pictures.view import scene_extent
+from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.simulation.records.record import Record
+
+if TYPE_CHECKING:  # Loaded with the first film.
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+RATE = 10.0
+"""Pictures per second of a film."""
+
+STRIP = 4
+"""Pictures of a strip."""
+
+_WIDTH, _HEIGHT = 480, 400
+_ANGLE = 0.62  # Of view, upwards, in rad.
+_LEAST_FORCE = 0.02  # No arrow for what is less, beside the largest force of the run.
+
+ACTUAL, DESIRED, FORCE, IMPACT = "#1f3fbf", "#2e9d4a", "#d12b1f", "#ffb000"
+"""Colors of the path so far, of the one that is wanted, of forces, and of impacts."""
+
+_PLACES = 12  # So many states of a run tell how much room it takes.
+
+Pixels = NDArray[np.uint8]
+
+
+@checked(ModelError)
+def save_film(loop: Loop, record: Record, context: Context, path: str | Path) -> None:
+    """Films a record of a robot with the paths and the forces of its contacts.
+
+    The path so far is blue, the one that the reference wants green; a star is an impact.
+
+    Args:
+        loop: A loop of a `RobotPlant` whose links have geometry.
+        record: The record of a run of this loop.
+        context: The context of its diagram, for the parameters; not changed.
+        path: A .gif for the film, or a .png for four moments of it side by side.
+
+    Raises:
+        ModelError: There is no robot, nothing of it can be seen, or the file has another suffix.
+        OSError: The file cannot be written.
+    """
+    name, kind = Path(path).name, Path(path).suffix
+    if kind not in (".gif", ".png"):
+        raise ModelError(f"a film is a .gif, a strip of pictures a .png, got '{name}'")
+    course = follow(loop, record, context, RATE)
+    scene, last = _Scene(course, loop.scene_graph), len(course.times) - 1
+    scene.notes = phases_at(record, course.start_time + course.times)
+    if kind == ".gif":
+        from matplotlib.animation import PillowWriter
+
+        figure, (axis,) = _screen(1)
+        writer = PillowWriter(fps=int(RATE))
+        with writer.saving(figure, str(path), dpi=100):
+            for number in range(last + 1):
+                axis.clear()
+                scene.draw(axis, number)
+                writer.grab_frame()
+    else:
+        figure, axes = _screen(STRIP)
+        for place, axis in enumerate(axes):
+            scene.draw(axis, round(last * place / (STRIP - 1)))
+        figure.savefig(path)
+
+
+def _screen(columns: int) -> tuple[Figure, list[Axes]]:
+    """A figure with room for so many pictures side by side."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(columns * _WIDTH / 100, _HEIGHT / 100), dpi=100)
+    places = [(column / columns, 0.0, 1.0 / columns, 1.0) for column in range(columns)]
+    return figure, [figure.add_axes(place) for place in places]
+
+
+class _Camera:
+    """A pinhole that looks at a point from an eye; the picture's y axis points down."""
+
+    def __init__(self, eye: FloatArray, at: FloatArray, far: float) -> None:
+        forward = (at - eye) / np.linalg.norm(at - eye)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        axes = np.column_stack([right, np.cross(forward, right), forward])
+        self.pose = RigidTransform(RotationMatrix(axes), eye)
+        self.info = CameraInfo(_WIDTH, _HEIGHT, _ANGLE)
+        core = RenderCameraCore("film", self.info, ClippingRange(far / 100, far), RigidTransform())
+        self.color = ColorRenderCamera(core)
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Where points in the world are seen, in pixels; shape (k, 2)."""
+        x, y, depth = self.pose.inverse().multiply(np.atleast_2d(points).T)
+        info = self.info
+        return np.column_stack(
+            [
+                info.center_x() + info.focal_x() * x / depth,
+                info.center_y() + info.focal_y() * y / depth,
+            ]
+        )
+
+
+class _Scene:
+    """The links and what they touch, before a camera."""
+
+    def __init__(self, course: Course, scene_graph: SceneGraph | None) -> None:
+        model, links = course.plant.model, course.plant.model.links.plant
+        if scene_graph is None or links is None or links.get_source_id() is None:
+            raise ModelError("a film shows links with geometry; this robot has none")
+        middle, self._size = _extent(course)
+        eye = middle + self._size * np.array([-1.55, -1.1, 0.8])
+        self._camera = _Camera(eye, middle, 10.0 * self._size)
+        self.notes = [""] * len(course.times)
+        self._course, self._points, self._wanted = course, course.points, course.wanted_points
+        builder = DiagramBuilder()
+        scene = builder.AddSystem(scene_graph.Clone())
+        lights = [
+            LightParameter(type="directional", direction=direction, frame="world", intensity=power)
+            for direction, power in (([0.8, 0.6, -0.7], 1.0), ([-0.8, 0.2, -0.3], 0.4))
+        ]
+        parameters = RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=lights)
+        scene.AddRenderer("film", MakeRenderEngineVtk(parameters))
+        pose = builder.AddSystem(MultibodyPositionToGeometryPose(links, input_multibody_state=True))
+        builder.ExportInput(pose.get_input_port(), "link_state")
+        builder.Connect(pose.get_output_port(), scene.get_source_pose_port(links.get_source_id()))
+        self._frames = {}
+        source = scene.RegisterSource("surroundings")
+        points = course.points[0]
+        for constraint, point in zip(course.acting.constraints, points, strict=True):
+            own = own_values(constraint, model.dae, course.parameters[0])
+            picture = constraint.picture(own, point, self._size)
+            if picture is None:
+                continue
+            frame = GeometryFrame(constraint.name)
+            self._frames[constraint] = scene.RegisterFrame(source, frame)
+            seen = GeometryInstance(
+                constraint.placement(own).inverse() @ picture.pose,
+                _shape(picture.form),
+                constraint.name,
+            )
+            seen.set_perception_properties(_surface_properties())
+            scene.RegisterGeometry(source, frame.id(), seen)
+        if self._frames:
+            builder.ExportInput(scene.get_source_pose_port(source), "surroundings")
+        builder.ExportOutput(scene.get_query_output_port(), "query")
+        self._diagram = builder.Build()
+        self._context = self._diagram.CreateDefaultContext()
+        self._world = scene.world_frame_id()
+        self._largest = max(
+            float(np.linalg.norm(load.forces, axis=1).max(initial=0.0)) for load in course.loads
+        )
+
+    def draw(self, axis: Axes, number: int) -> None:
+        """Draws the moment of that number, with the paths up to it."""
+        course = self._course
+        axis.imshow(self._render(number), interpolation="nearest")
+        axis.set_axis_off()
+        load = course.loads[number]
+        for row, force in enumerate(load.forces):
+            for points, color in ((self._wanted, DESIRED), (self._points[: number + 1], ACTUAL)):
+                axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
+            size = float(np.linalg.norm(force))
+            if size > _LEAST_FORCE * self._largest:
+                tail = load.points[row] - 0.25 * self._size * force / self._largest
+                head, tail = self._camera.project(np.array([load.points[row], tail]))
+                shape = {"color": FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
+                axis.annotate(
+                    f"{size:.1f} N", head, tail, color=FORCE, fontsize=11, arrowprops=shape
+                )
+            if bright := course.flashes[number, row]:
+                x, y = self._camera.project(load.points[row])[0]
+                axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
+        time = course.start_time + course.times[number]
+        axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")
+        axis.text(12, 46, self.notes[number], fontsize=11, color="0.25")
+        axis.set_xlim(-0.5, _WIDTH - 0.5)
+        axis.set_ylim(_HEIGHT - 0.5, -0.5)
+
+    def _render(self, number: int) -> Pixels:
+        course, diagram, context = self._course, self._diagram, self._context
+        link_state = diagram.GetInputPort("link_state")
+        link_state.FixValue(context, course.states[number][: link_state.size()])
+        if self._frames:
+            poses = FramePoseVector()
+            for constraint, frame in self._frames.items():
+                own = own_values(constraint, course.plant.model.dae, course.parameters[number])
+                poses.set_value(frame, constraint.placement(own))
+            diagram.GetInputPort("surroundings").FixValue(context, poses)
+        query = diagram.GetOutputPort("query").Eval(context)
+        image = query.RenderColorImage(self._camera.color, self._world, self._camera.pose)
+        return np.array(image.data[:, :, :3])
+
+
+def _extent(course: Course) -> tuple[FloatArray, float]:
+    """The middle and the size, in m, of the box around all places of the robot."""
+    some = course.states[:: max(1, len(course.states) // _PLACES)]
+    boxes = [scene_extent(course.plant.model, course.acting, state) for state in some]
+    half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
+    middles = np.array([middle for middle, _ in boxes])
+    low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low))
+
+
+def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:
+    """A form as what is rendered: a mesh as the text of an .obj file."""
+    if isinstance(form, Shape):
+        return form
+    points = np.array(form.vertices())
+    faces = np.array([[triangle.vertex(k) for k in range(3)] for triangle in form.triangles()])
+    # The renderer asks for normals at the corners: the mean of those around.
+    corners, normals = points[faces], np.zeros_like(points)
+    for k in range(3):
+        edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        np.add.at(normals, faces[:, k], np.cross(*edges))
+    rows = [
+        *("v {:.9g} {:.9g} {:.9g}".format(*point) for point in points),
+        *("vn {:.9g} {:.9g} {:.9g}".format(*normal) for normal in normals),
+        *("f " + " ".join(f"{k}//{k}" for k in face) for face in faces + 1),
+    ]
+    text = "\n".join(rows)
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "surface")))
+
+
+def _surface_properties() -> PerceptionProperties:
+    properties = PerceptionProperties()
+    properties.AddProperty("phong", "diffuse", Rgba(0.75, 0.85, 0.95, 0.5))
+    properties.AddProperty("label", "id", RenderLabel.kDontCare)
+    return properties

@@ -1,0 +1,72 @@
+"""The phases of a task in pictures of its record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.simulation.records.record import Record
+
+if TYPE_CHECKING:  # Loaded with the first figure.
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Span:
+    """A phase in a record.
+
+    Attributes:
+        name: What it is, "Press" for example.
+        begin, end: From when to when, in s.
+    """
+
+    name: str
+    begin: float
+    end: float
+
+
+def phase_spans(record: Record) -> list[Span]:
+    """The phases of a record, one after the other; none if it has no tasks."""
+    if "phase" not in record.signals or not record.time.size:
+        return []
+    names = [
+        signal.name.partition(" ")[2] or signal.name for signal in record.signals["phase"].signals
+    ]
+    places = np.argmax(record["phase"], axis=1)
+    # A sample at the moment of a change shows what was before.
+    last = np.flatnonzero(np.append(np.diff(places) != 0, True))
+    begins = [record.time[0], *record.time[last[:-1]]]
+    return [
+        Span(names[places[row]], float(begin), float(record.time[row]))
+        for row, begin in zip(last, begins, strict=True)
+    ]
+
+
+def phases_at(record: Record, times: FloatArray) -> list[str]:
+    """The name of the phase at each time in s; "" where there is no task."""
+    spans = phase_spans(record)
+    ends = [span.end for span in spans[:-1]]
+    return [spans[i].name if spans else "" for i in np.searchsorted(ends, times)]
+
+
+def mark_phases(figure: Figure, record: Record) -> None:
+    """Draws where phases begin into axes over time, each with its name."""
+    spans = phase_spans(record)
+    for axis in figure.axes:
+        axis.margins(x=0.01)
+        for span in spans:
+            axis.axvline(span.begin, color="0.6", linewidth=0.6, linestyle=":", zorder=0.3)
+            axis.text(
+                span.begin,
+                0.97,
+                f" {span.name}",
+                transform=axis.get_xaxis_transform(),
+                rotation=90,
+                va="top",
+                fontsize=6,
+                color="0.45",
+                zorder=0.5,
+            )

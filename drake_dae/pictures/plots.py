@@ -1,0 +1,235 @@
+"""Pictures of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.pictures.axes import (
+    decades,
+    flatten,
+    grid,
+    labelled,
+    legend,
+    round_off,
+    short,
+    squares,
+)
+from drake_dae.pictures.event_marks import mark_events, mark_labels
+from drake_dae.pictures.phases import mark_phases
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
+
+if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
+    from matplotlib.figure import Figure
+
+    from drake_dae.pictures.course import ContactPath
+
+PATHS = "path.png"
+"""The plot of the points that move on surfaces, where there are any."""
+
+PLOTS = ("outputs.png", "errors.png", "residual.png", "controls.png", PATHS)
+"""The files that `save_plots` writes."""
+
+HELD = 1e-4
+"""An output whose reference stands still is held, and not drawn, where it is as near as this beside
+its size."""
+
+_DPI = 110
+
+
+def save_plots(
+    record: Record,
+    predicted: FloatArray,
+    limits: FloatArray | None,
+    folder: str | Path,
+    paths: Sequence[ContactPath] = (),
+    accuracy: float | None = None,
+) -> list[Path]:
+    """Draws a run into PNG files: outputs, errors, constraint residual, controls, paths.
+
+    Args:
+        record: A record with desired_output, controlled_output, constraint_residual and control.
+        predicted: The tracking error by theory, shape (k, p).
+        limits: The largest |u|, shape (p,), infinite or None where there is none.
+        folder: The folder to write to.
+        paths: The paths of points on surfaces; without any there is no such file.
+        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+    """
+    figures = [
+        plot_outputs(record, predicted),
+        plot_errors(record, predicted, accuracy),
+        plot_residual(record),
+        plot_controls(record, limits),
+    ]
+    for figure in figures:
+        mark_phases(figure, record)
+    if paths:
+        figures.append(plot_paths(paths))
+    files = [Path(folder) / name for name in PLOTS[: len(figures)]]
+    for file, figure in zip(files, figures, strict=True):
+        figure.savefig(file, dpi=_DPI)
+    return files
+
+
+def plot_outputs(record: Record, predicted: FloatArray) -> Figure:
+    """Controlled outputs, with their references dashed; one that is held is a line of text.
+
+    Args:
+        record: A record with controlled_output and desired_output.
+        predicted: The tracking error by theory, shape (k, p).
+    """
+    values = record["controlled_output"]
+    desired = record["desired_output"]
+    signals = record.signals["controlled_output"].signals
+    size = output_sizes(record, predicted)
+    off = np.max(np.abs(values - desired), axis=0, initial=0.0)
+    held = (np.ptp(desired, axis=0) == 0.0) & (off <= HELD * size)
+    drawn = np.flatnonzero(~held)
+    figure, axes = grid(
+        [labelled(signals[i]) for i in drawn],
+        ("actual", "reference", *mark_labels(record)) if len(drawn) else (),
+        [
+            f"{signals[i].name} = {short(desired[0, i])} {signals[i].unit}".rstrip()
+            + (f" (within {short(off[i], 1)})" if off[i] > ROUND_OFF * size[i] else "")
+            for i in np.flatnonzero(held)
+        ],
+        "held: ",
+    )
+    for axis, i in zip(axes, drawn, strict=False):
+        axis.plot(record.time, values[:, i], color="C0", label="actual")
+        axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
+    mark_events(axes, record)
+    if len(drawn):
+        legend(figure, axes[0])
+    return figure
+
+
+def plot_errors(record: Record, predicted: FloatArray, accuracy: float | None = None) -> Figure:
+    """|z - r| of every output on a log scale, over the error that theory predicts.
+
+    With an accuracy, what lies below it is grey: there errors are those of the integrator. An
+    output that is predicted to have no error, and stays there, is a line of text.
+
+    Args:
+        record: A record with controlled_output and desired_output.
+        predicted: The tracking error by theory, shape (k, p).
+        accuracy: The accuracy that the integrator was asked for; None with fixed steps.
+    """
+    values = record["controlled_output"]
+    errors = np.abs(values - record["desired_output"])
+    signals = record.signals["controlled_output"].signals
+    size = output_sizes(record, predicted)
+    blurred = (accuracy or 0.0) * size
+    largest = np.max(np.maximum(errors, np.abs(predicted)), axis=0, initial=0.0)
+    drawn = np.flatnonzero((largest > blurred) | (accuracy is None))
+    label = "below the integrator's accuracy" if accuracy is not None else "round-off"
+    titles = [labelled(Signal(f"|error of {signals[i].name}|", signals[i].unit)) for i in drawn]
+    figure, axes = grid(
+        titles,
+        ("predicted", "actual", label, *mark_labels(record)) if len(drawn) else (),
+        [
+            f"{signals[i].name} ("
+            + (
+                f"{short(largest[i], 1)} {signals[i].unit}".rstrip()
+                if largest[i] > ROUND_OFF * size[i]
+                else "round-off"
+            )
+            + ")"
+            for i in range(len(signals))
+            if i not in drawn
+        ],
+        f"below the integrator's accuracy of {short(accuracy or 0.0)} all the time: ",
+    )
+    for axis, i in zip(axes, drawn, strict=False):
+        floor = round_off(values[:, i])
+        for data, style in (
+            (
+                np.abs(predicted[:, i]),
+                {"color": "C1", "linewidth": 4, "alpha": 0.5, "label": "predicted"},
+            ),
+            (errors[:, i], {"color": "C0", "label": "actual"}),
+        ):
+            axis.semilogy(record.time, np.maximum(data, floor), **style)
+        if accuracy is None:
+            axis.axhline(floor, color="0.5", linestyle=":", label=label)
+        else:
+            axis.axhspan(floor / 3.0, blurred[i], color="0.88", zorder=0.5, label=label)
+        decades(axis, floor)
+    mark_events(axes, record)
+    if len(drawn):
+        legend(figure, axes[0])
+    return figure
+
+
+def plot_residual(record: Record) -> Figure:
+    """Constraint outputs and their derivatives, as the steps leave them before projection."""
+    values = np.abs(record["constraint_residual"])
+    labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
+    title = "|constraint residual|, before each step's projection"
+    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record)))
+    floor = round_off(np.ones(1))
+    for i, label in enumerate(labels):
+        axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
+    axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
+    axis.set_yscale("log")
+    decades(axis, floor)
+    mark_events([axis], record)
+    legend(figure, axis)
+    return figure
+
+
+def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
+    """Controls, with the actuators' limits, drawn where these are in sight."""
+    values = record["control"]
+    signals = record.signals["control"].signals
+    bounds = np.full(len(signals), np.inf) if limits is None else limits
+    figure, axes = grid(
+        [
+            labelled(signal) + (f", limit ±{bound:g}" if np.isfinite(bound) else "")
+            for signal, bound in zip(signals, bounds, strict=True)
+        ],
+        marks := mark_labels(record),
+    )
+    mark_events(axes, record)
+    if axes and marks:
+        legend(figure, axes[0])
+    for i, axis in enumerate(axes):
+        axis.plot(record.time, values[:, i], color="C0")
+        scale = max(np.max(np.abs(values[:, i])), 1e-3)
+        flatten(axis, values[:, i], 1e-5 * scale, 0.05 * scale)
+        low, high = axis.get_ylim()
+        margin = 0.5 * (high - low)
+        for bound in (-bounds[i], bounds[i]):
+            if low - margin <= bound <= high + margin:
+                axis.axhline(bound, color="C3", linestyle=":")
+    return figure
+
+
+def plot_paths(paths: Sequence[ContactPath]) -> Figure:
+    """The paths of points on their surfaces, over those that the references want."""
+    figure, axes = squares(
+        [f"path on {labelled(Signal(path.name))}" for path in paths], ("desired", "actual", "start")
+    )
+    for axis, path in zip(axes, paths, strict=True):
+        for points, style in (
+            (path.desired, {"color": "C1", "linewidth": 4, "alpha": 0.5, "label": "desired"}),
+            (path.actual, {"color": "C0", "label": "actual"}),
+            (path.actual[:1], {"color": "C0", "marker": "o", "linestyle": "", "label": "start"}),
+        ):
+            axis.plot(*points.T, **style)
+        # A metre is as long in both directions, also where the path is a line.
+        both = np.vstack([path.actual, path.desired])
+        middle = (np.min(both, axis=0) + np.max(both, axis=0)) / 2.0
+        half = 0.55 * float(np.max(np.ptp(both, axis=0))) or 1e-3
+        axis.set_xlim(middle[0] - half, middle[0] + half)
+        axis.set_ylim(middle[1] - half, middle[1] + half)
+        axis.set_xlabel("along the surface [m]", fontsize=10)
+        axis.set_ylabel("across [m]", fontsize=10)
+    legend(figure, axes[0])
+    return figure

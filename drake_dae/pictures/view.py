@@ -1,0 +1,197 @@
+"""A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
+
+import errno
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from pydrake.geometry import (
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Rgba,
+    SceneGraph,
+)
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.pictures.arrows import ConstraintForceVisualizer, ForceArrows, path_of
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
+from drake_dae.robots.model import RobotModel
+from drake_dae.trace.functions import TracedFunction
+
+FRAME_RATE = 32.0
+"""Frames per second of the live view and of the recording."""
+
+_ON_REQUEST = 1e9
+"""A publish period so long that only a forced publish draws."""
+
+
+@runtime_checkable
+class RobotBlock(Protocol):
+    """A block that simulates a robot, as a `RobotPlant`."""
+
+    model: RobotModel
+    dae: DaeSystem
+    structure: ConstraintStructure
+    exogenous_places: list[int]
+
+    def GetOutputPort(self, port_name: str) -> OutputPort:
+        """Ports as `link_state` and `constraint_force`."""
+
+    def GetMyContextFromRoot(self, root_context: Context) -> Context:
+        """Its part of a diagram's context."""
+
+    def parameters(self, context: Context) -> FloatArray:
+        """All parameters in the order of `dae.parameters`, shape (k,)."""
+
+
+_SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
+
+
+@checked(ModelError)
+def start_meshcat(host: str = "localhost") -> Meshcat:
+    """A Meshcat server that only this machine reaches, unless told otherwise.
+
+    Raises:
+        OSError: No port is left for it.
+    """
+    try:
+        meshcat = Meshcat(MeshcatParams(host=host))
+    except RuntimeError as error:
+        raise OSError(errno.EADDRINUSE, f"no port for Meshcat: {error}") from None
+    meshcat.SetProperty("/Background", "visible", False)
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    return meshcat
+
+
+def add_live_view(
+    builder: DiagramBuilder,
+    plant: RobotBlock,
+    scene_graph: SceneGraph | None,
+    meshcat: Meshcat,
+    exogenous: OutputPort | None = None,
+) -> None:
+    """Adds what draws a robot `FRAME_RATE` times a second while its diagram runs.
+
+    Args:
+        builder: The builder of the diagram, with the plant in it.
+        plant: The robot.
+        scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
+        meshcat: Where to draw.
+        exogenous: What the plant reads at its port of that name, if anything.
+    """
+    period = 1.0 / FRAME_RATE
+    arrows = draw_scene(plant, meshcat)
+    forces = builder.AddSystem(
+        ConstraintForceVisualizer(arrows, meshcat, plant.model, plant.exogenous_places, period)
+    )
+    for name in ("link_state", "constraint_force"):
+        builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
+    if exogenous is not None:
+        builder.Connect(exogenous, forces.GetInputPort("exogenous"))
+    links = view_of_links(plant, scene_graph, meshcat, period)
+    if links is not None:
+        builder.AddSystem(links)
+        builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
+
+
+def draw_scene(plant: RobotBlock, meshcat: Meshcat) -> ForceArrows:
+    """Draws what does not move, and returns what draws the constraint forces.
+
+    Args:
+        plant: The robot.
+        meshcat: Where to draw.
+    """
+    model, dae = plant.model, plant.dae
+    state = plant.structure.manifold.project(dae.nominal_state)
+    loads = ConstraintWrenches(model)
+    draw_surroundings(meshcat, model, loads, state, dae.parameter_values)
+    # From behind, the side and a little above.
+    middle, size = scene_extent(model, loads, state)
+    meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
+    return ForceArrows(meshcat, model, 0.2 * size)
+
+
+def view_of_links(
+    plant: RobotBlock, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
+) -> Diagram | None:
+    """Drake's own picture of a robot, posed by our link state; its plant is not simulated.
+
+    Args:
+        plant: The robot.
+        scene_graph: The geometry of the MultibodyPlant that the links come from, or None. The view
+            has a copy of it.
+        meshcat: Where to draw.
+        period: Time between pictures in s; without one they are drawn when asked for.
+
+    Returns:
+        A diagram with (q, v) as its input, or None if the links have no geometry.
+    """
+    drawn = plant.model.links.plant
+    if scene_graph is None or drawn is None or drawn.get_source_id() is None:
+        return None
+    builder = DiagramBuilder()
+    scene = builder.AddSystem(scene_graph.Clone())
+    pose = builder.AddSystem(MultibodyPositionToGeometryPose(drawn, input_multibody_state=True))
+    builder.ExportInput(pose.get_input_port(), "link_state")
+    builder.Connect(pose.get_output_port(), scene.get_source_pose_port(drawn.get_source_id()))
+    parameters = MeshcatVisualizerParams(publish_period=period)
+    MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
+    diagram = builder.Build()
+    diagram.set_name("view_of_links")
+    return diagram
+
+
+def draw_surroundings(
+    meshcat: Meshcat,
+    model: RobotModel,
+    loads: ConstraintWrenches,
+    state: FloatArray,
+    parameters: FloatArray,
+) -> None:
+    """Draws what the robot touches, around where it touches.
+
+    Args:
+        meshcat: Where to draw.
+        model: The robot.
+        loads: Its constraint loads, with these parameters.
+        state: x, or the link state (q, v) that it begins with.
+        parameters: Values of all parameters.
+    """
+    _, size = scene_extent(model, loads, state)
+    points = loads(state, np.zeros(len(model.dae.force_signals))).points
+    for constraint, point in zip(loads.constraints, points, strict=True):
+        own = own_values(constraint, model.dae, parameters)
+        picture = constraint.picture(own, point, size)
+        if picture is not None:
+            path, stands = path_of(constraint, "surface"), constraint.placement(own)
+            meshcat.SetObject(f"{path}/form", picture.form, rgba=_SURFACE_COLOR)
+            meshcat.SetTransform(f"{path}/form", stands.inverse() @ picture.pose)
+            meshcat.SetTransform(path, stands)
+
+
+def scene_extent(
+    model: RobotModel, loads: ConstraintWrenches, state: FloatArray
+) -> tuple[FloatArray, float]:
+    """The middle and the size, in m, of the box around a robot and the points where it is held.
+
+    Args:
+        model: The robot.
+        loads: Its constraint loads.
+        state: x, or the link state (q, v) that it begins with.
+    """
+    links, dae = model.links, model.dae
+    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+    landmarks = TracedFunction("landmarks", inputs, {"points": links.landmarks()})
+    held = loads(state, np.zeros(len(dae.force_signals))).points
+    own = landmarks(state[: links.q.numel()], dae.parameter_values)[0].reshape(3, -1, order="F").T
+    places = np.vstack([np.zeros((1, 3)), own, held])
+    low, high = places.min(axis=0), places.max(axis=0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)), 1e-3)

@@ -1,0 +1,91 @@
+"""What the constraints of a robot do to it: the point, the force and the moment of each.    (38)"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.model import RobotModel
+from drake_dae.trace.functions import TracedFunction
+
+
+@dataclass(frozen=True, eq=False)
+class Wrenches:
+    """What constraints do to a robot at one moment, in the world, one row per constraint.
+
+    Attributes:
+        points: Where they act, m, shape (k, 3).
+        forces: The forces that act there, N, shape (k, 3).
+        moments: The moments, N m, shape (k, 3).
+    """
+
+    points: FloatArray
+    forces: FloatArray
+    moments: FloatArray
+
+
+class ConstraintWrenches:
+    """Where and how the constraints of a robot act on it, as a fast function.
+
+    Args:
+        model: The robot.
+        parameters: Values of all parameters; the defaults if None.
+
+    Attributes:
+        constraints: The constraints that act at a point.
+        with_moment: Whether each of these has a moment besides its force.
+    """
+
+    def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
+        links, bound = model.links, ConstraintSet(model.constraints)
+        kinematics, force = links.kinematics(), ca.SX.sym("force", bound.size)
+        acting = [
+            (constraint, part, application)
+            for constraint, part in bound.parts()
+            for application in constraint.applications(kinematics)[:1]
+        ]
+        self.constraints: Sequence[Constraint] = [constraint for constraint, _, _ in acting]
+        self.with_moment = [a.moment_axes.nnz() > 0 for _, _, a in acting]
+        columns = {
+            "points": [a.point for _, _, a in acting],
+            "forces": [a.force(force[part]) for _, part, a in acting],
+            "moments": [ca.mtimes(a.moment_axes, force[part]) for _, part, a in acting],
+        }
+        self._function = TracedFunction(
+            "constraint loads",
+            {"q": links.q, "v": links.v, "force": force, "parameters": model.dae.parameter_symbol},
+            {
+                name: kinematics.value(ca.horzcat(ca.SX(3, 0), *column))
+                for name, column in columns.items()
+            },
+        )
+        self._parameters = model.dae.parameter_vector(parameters).copy()
+        self._sizes = links.q.numel(), links.v.numel()
+
+    def __call__(
+        self, state: FloatArray, constraint_force: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Wrenches:
+        """The loads at one moment.
+
+        Args:
+            state: x, or the link state (q, v) that it begins with.
+            constraint_force: lambda, shape (m,).
+            parameters: Values of all parameters at that moment, where some move.
+        """
+        nq, nv = self._sizes
+        q, v = state[:nq], state[nq : nq + nv]
+        values = self._parameters if parameters is None else parameters
+        found = self._function(q, v, constraint_force, values)
+        return Wrenches(*(columns.reshape(3, -1, order="F").T for columns in found))
+
+
+def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -> FloatArray:
+    """The values of a constraint's parameters, below each other, among all of a system."""
+    own = [parameters[dae.parameter_slice(p.name)] for p in constraint.parameters]
+    return np.concatenate([np.zeros(0), *own])

@@ -1,0 +1,28 @@
+"""What a robot touches or holds: constraints, and the surfaces that they are about."""
+
+from drake_dae.robots.constraints.alignment import AxisNormalToSurface
+from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
+from drake_dae.robots.constraints.couplers import JointCoupler
+from drake_dae.robots.constraints.loop_joints import PrismaticLoopJoint, RevoluteLoopJoint
+from drake_dae.robots.constraints.points import CoincidentPoints, FixedDistance, PointOnSurface
+from drake_dae.robots.constraints.rolling import Blade, RollingBall, RollingWheel
+from drake_dae.robots.constraints.welds import WeldedFrames
+from drake_dae.robots.surfaces.surface import Surface
+
+__all__ = [
+    "Application",
+    "AxisNormalToSurface",
+    "Blade",
+    "CoincidentPoints",
+    "Constraint",
+    "FixedDistance",
+    "Joint",
+    "JointCoupler",
+    "PointOnSurface",
+    "PrismaticLoopJoint",
+    "RevoluteLoopJoint",
+    "RollingBall",
+    "RollingWheel",
+    "Surface",
+    "WeldedFrames",
+]

@@ -1,0 +1,219 @@
+"""All constraints of a robot at once, as the model and the pictures need them.      (37), (38)"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from drake_dae.arrays import unknown_name
+from drake_dae.dae.system.contacts import Contact
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Constraint, Joint
+from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
+from drake_dae.robots.links.links import Links
+
+
+@dataclass(frozen=True)
+class ConstraintSet:
+    """The constraints of a robot, one below the other.
+
+    Attributes:
+        constraints: The constraints, in the order of their constraint forces.
+    """
+
+    constraints: Sequence[Constraint]
+
+    @property
+    def size(self) -> int:
+        """m, the number of constraint forces."""
+        return len(self.force_signals)
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        """Names and units of lambda."""
+        return tuple(s for c in self.constraints for s in c.force_signals)
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        """Names and units of what stays zero."""
+        return tuple(s for c in self.constraints for s in c.residual_signals)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters of all constraints."""
+        return tuple(p for c in self.constraints for p in c.parameters)
+
+    def place(self, name: str) -> int:
+        """Where the constraint force with a name stands in lambda.
+
+        Raises:
+            ModelError: There is no such force.
+        """
+        names = [signal.name for signal in self.force_signals]
+        if name not in names:
+            raise ModelError(unknown_name("constraint force", name, names))
+        return names.index(name)
+
+    def parts(self) -> Iterator[tuple[Constraint, slice]]:
+        """Each constraint, and where its constraint forces stand."""
+        start = 0
+        for constraint in self.constraints:
+            stop = start + len(constraint.force_signals)
+            yield constraint, slice(start, stop)
+            start = stop
+
+    def residual(self, frames: Frames) -> ca.SX:
+        """phi(q) of the rows that restrict positions, shape (k, 1)."""
+        return ca.vertcat(ca.SX(0, 1), *[c.residual(frames) for c in self.constraints])
+
+    def rate(self, kinematics: Kinematics) -> ca.SX:
+        """phi'(q, v), and the rates of rows that restrict velocities alone, shape (m, 1)."""
+        return ca.vertcat(ca.SX(0, 1), *[c.rate(kinematics) for c in self.constraints])
+
+    def constraint_output(self, kinematics: Kinematics) -> ca.SX:
+        """k of (2), shape (m, 1): phi, and the rate of rows that restrict velocities alone."""
+        rows = [ca.SX(0, 1)]
+        for constraint in self.constraints:
+            residual = constraint.residual(kinematics)
+            rows.append(residual)
+            if residual.numel() < len(constraint.force_signals):
+                rows.append(constraint.rate(kinematics)[residual.numel() :])
+        return kinematics.value(ca.vertcat(*rows))
+
+    def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
+        """The forces that the constraint forces, shape (m, 1), make on the robot."""
+        total = Reaction(ca.SX(kinematics.v.numel(), 1))
+        for constraint, part in self.parts():
+            total += constraint.reaction(kinematics, constraint_force[part])
+        return total
+
+    def force_on(
+        self, frame: str, name: str, kinematics: Kinematics, constraint_force: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Where a constraint pushes on a frame, and its force on that frame, both in the world.
+
+        Args:
+            frame: The name of the frame.
+            name: The name of the constraint.
+            kinematics: What the constraints are written in.
+            constraint_force: lambda, shape (m, 1).
+
+        Returns:
+            The point in m and the force in N, shapes (3, 1).
+
+        Raises:
+            ModelError: There is no such constraint, or it does not act on the frame at one point.
+        """
+        parts = {constraint.name: (constraint, part) for constraint, part in self.parts()}
+        if name not in parts:
+            raise ModelError(unknown_name("constraint", name, parts))
+        constraint, part = parts[name]
+        acting = constraint.applications(kinematics)
+        found = [a for a in acting if frame in (a.frame_a, a.frame_b)]
+        if len(found) != 1:
+            frames = ", ".join(dict.fromkeys(f for a in acting for f in (a.frame_a, a.frame_b)))
+            where = "at several points of" if found else "not on"
+            raise ModelError(
+                f"constraint '{name}' acts {where} '{frame}', but on it at one point is needed; "
+                f"it acts on {frames or 'no frame that is known'}"
+            )
+        sign = 1.0 if frame == found[0].frame_b else -1.0
+        return found[0].point, sign * found[0].force(constraint_force[part])
+
+    def wrenches(
+        self, kinematics: Kinematics, constraint_force: ca.SX
+    ) -> tuple[ca.SX, tuple[Signal, ...]]:
+        """What each constraint does to each of its frames, and names and units of that.
+
+        A wrench is a moment in N m and a force in N, as in Drake's SpatialForce, both in the world,
+        the force at the frame's origin. Those of one constraint on one frame are added.
+
+        Args:
+            kinematics: What the constraints are written in.
+            constraint_force: lambda, shape (m, 1).
+
+        Returns:
+            The wrenches of the first constraint on its frames, B before A, then those of the
+            others, 6 rows each, in terms of q, v and parameters; and their signals,
+            "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
+        """
+        rows, names = [ca.SX(0, 1)], []
+        for constraint, part in self.parts():
+            own: dict[str, ca.SX] = {}
+            for application in constraint.applications(kinematics):
+                force = application.force(constraint_force[part])
+                moment = ca.mtimes(application.moment_axes, constraint_force[part])
+                for frame, sign in ((application.frame_b, 1.0), (application.frame_a, -1.0)):
+                    lever = application.point - kinematics.position(frame)
+                    wrench = ca.vertcat(moment + ca.cross(lever, force), force)
+                    own[frame] = own.get(frame, ca.SX(6, 1)) + sign * wrench
+            rows += own.values()
+            names += [f"{constraint.name}.{frame}" for frame in own]
+        parts = (("mx", "N m"), ("my", "N m"), ("mz", "N m"), ("fx", "N"), ("fy", "N"), ("fz", "N"))
+        signals = tuple(Signal(f"{name}.{part}", unit) for name in names for part, unit in parts)
+        return kinematics.value(ca.vertcat(*rows)), signals
+
+    def force_matrix(self, links: Links) -> ca.SX:
+        """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""
+        kinematics, force = links.kinematics(), ca.SX.sym("force", self.size)
+        columns = self.reaction(kinematics, force).map(lambda part: ca.jacobian(part, force))
+        return links.generalized_force(kinematics, columns)
+
+    @property
+    def joints(self) -> tuple[tuple[Constraint, Joint], ...]:
+        """The joints that close loops, and what each has along its coordinate."""
+        found = ((constraint, constraint.joint) for constraint in self.constraints)
+        return tuple((constraint, joint) for constraint, joint in found if joint is not None)
+
+    @property
+    def motors(self) -> tuple[Signal, ...]:
+        """Names and units of the controls in these joints."""
+        return tuple(joint.motor for _, joint in self.joints if joint.motor is not None)
+
+    def joint_state(self, links: Links) -> tuple[ca.SX, ca.SX]:
+        """The coordinates of these joints and their rates, shape (l, 1) each, in q and v."""
+        kinematics, parts = links.kinematics(), [c for c, _ in self.joints]
+        positions = ca.vertcat(ca.SX(0, 1), *[c.coordinates(kinematics) for c in parts])
+        rates = ca.vertcat(ca.SX(0, 1), *[c.coordinate_rate(kinematics) for c in parts])
+        return kinematics.value(positions), kinematics.value(rates)
+
+    def joint_columns(self, links: Links) -> ca.SX:
+        """The generalized force of a unit along each of these coordinates, shape (nv, l)."""
+        kinematics, count = links.kinematics(), len(self.joints)
+        unit, total = ca.SX.sym("unit", count), Reaction(ca.SX(links.v.numel(), 1))
+        for i, (constraint, _) in enumerate(self.joints):
+            total += kinematics.reaction(unit[i] * constraint.coordinate_rate(kinematics))
+        columns = total.map(lambda part: ca.jacobian(part, unit))
+        return links.generalized_force(kinematics, columns)
+
+    def drag(self, links: Links) -> ca.SX:
+        """What constraints do without constraint forces, a generalized force, shape (nv, 1)."""
+        total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
+        for constraint in self.constraints:
+            reaction = constraint.drag(kinematics)
+            if reaction is not None:
+                total += links.generalized_force(kinematics, reaction)
+        return total
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """The constraint forces that can only push, if friction acts on one of them."""
+        found = [
+            Contact(signal.name, constraint.friction_parameter)
+            for constraint in self.constraints
+            for signal, pushes in zip(
+                constraint.force_signals, constraint.can_only_push, strict=True
+            )
+            if pushes
+        ]
+        return tuple(found) if any(contact.friction for contact in found) else ()
+
+    def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """M v' + H - G lambda, shape (nv, 1), and phi'' (38), shape (m, 1), by inverse dynamics.
+
+        Neither M nor J is formed: see `Links.inverse_dynamics`.
+        """
+        kinematics = links.kinematics(acceleration)
+        balance = links.inverse_dynamics(kinematics, self.reaction(kinematics, force))
+        return balance, kinematics.value(kinematics.derivative(self.rate(kinematics)))

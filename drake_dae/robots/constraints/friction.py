@@ -1,0 +1,67 @@
+"""Friction of a point on a surface: Coulomb's, made smooth, and viscous."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae.system.signals import Parameter
+
+
+@dataclass(frozen=True, eq=False)
+class Friction:
+    """How a surface pulls at a point that slides on it: F_t = pull lambda + drag.
+
+    Attributes:
+        pull: -mu s, the force in N for a unit of the normal force, shape (3, 1).
+        drag: -d v_t in N, shape (3, 1); None without viscous friction.
+    """
+
+    pull: ca.SX
+    drag: ca.SX | None
+
+    @classmethod
+    def of(cls, name: str, parameters: Sequence[Parameter], sliding: ca.SX) -> "Friction":
+        """The friction by the parameters that `friction_parameters` made.
+
+        Args:
+            name: The name of the constraint.
+            parameters: Its parameters.
+            sliding: v_t, the velocity of the point along the surface, m/s, shape (3, 1).
+        """
+        known = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
+        pull, drag = ca.SX(3, 1), None
+        if "friction" in known:
+            speed = ca.sqrt(ca.sumsqr(sliding) + known["stiction_tolerance"] ** 2)
+            pull = -known["friction"] * sliding / speed
+        if "viscous_friction" in known:
+            drag = -known["viscous_friction"] * sliding
+        return cls(pull, drag)
+
+
+def friction_parameters(
+    name: str, friction: float | None, stiction_tolerance: float, viscous_friction: float | None
+) -> list[Parameter]:
+    """The parameters of friction, of those kinds that there are.
+
+    Args:
+        name: The name of the constraint.
+        friction: mu.
+        stiction_tolerance: v_s in m/s.
+        viscous_friction: d in N s/m.
+
+    Raises:
+        ModelError: A coefficient is negative, or the speed not positive.
+    """
+    tolerance = Parameter(
+        f"{name}.stiction_tolerance", np.array([stiction_tolerance]), "m/s", positive=True
+    )
+    found = []
+    if friction is not None:
+        coefficient = Parameter(f"{name}.friction", np.array([friction]), nonnegative=True)
+        found += [coefficient, tolerance]
+    if viscous_friction is not None:
+        value = np.array([viscous_friction])
+        found.append(Parameter(f"{name}.viscous_friction", value, "N s/m", nonnegative=True))
+    return found

@@ -1,0 +1,319 @@
+"""Joints that close a loop: constraints that keep what a joint of the tree has."""
+
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from math import pi
+from typing import ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+from pydrake.math import RollPitchYaw
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import brief
+from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
+from drake_dae.robots.links.joints import clean
+from drake_dae.robots.links.kinematics import Frames, Kinematics
+from drake_dae.robots.surfaces.surface import Vector
+
+Letter = Literal["x", "y", "z"]
+LETTERS = "xyz"
+
+
+@dataclass(frozen=True)
+class LoopJoint(Constraint):
+    """A joint between frames A and B where a loop is cut, with its damping, limits and motor.
+
+    It connects a frame F, fixed in A at a place, with a frame M, fixed in B: at the coordinate 0
+    they coincide, so that c counts as in a joint of the tree from the parent A to the child B.
+    Beside the constraint forces, which take no power, A exerts along the coordinate on B
+
+        -damping c' - stiffness (c - rest) + u,
+
+    and B the opposite on A, where u is the motor's force, if it has a motor: a control of the
+    robot, behind those of its other actuators. None of this is on the port `constraint_wrenches`.
+    c and c' are on the port `loop_state` of `RobotPlant`, and c can be an output, by
+    `SurfaceCoordinates`. Limits are no stops: reports and summaries tell where c leaves them.
+
+    A motor in it is rigid and has no rotor inertia; for others cut the loop at another joint.
+
+    Attributes:
+        frame_a: Name of frame A, of the parent; "world" is one.
+        frame_b: Name of frame B, of the child, on another body.
+        axis: The joint's axis, an axis of F and M.
+        point_a: Where F stands in A, m, shape (3,).
+        rpy_a: Roll, pitch and yaw by which F is turned in A, rad, shape (3,).
+        point_b: Where M stands in B, m, shape (3,).
+        rpy_b: Roll, pitch and yaw by which M is turned in B, rad, shape (3,).
+        damping: Of the joint, in N m s/rad (N s/m), not negative; the parameter "<name>.damping" if
+            not zero.
+        stiffness: Of a spring, in N m/rad (N/m), not negative; the parameter "<name>.stiffness".
+        rest: Where the spring is slack, rad (m).
+        lower, upper: The limits of c, rad (m); none if None.
+        velocity_limit: The largest |c'|, rad/s (m/s); none if None.
+        motor: Whether it has a motor, the control "<name>.motor".
+        effort_limit: The largest |u|, N m (N); none if None.
+        name: The name of the constraint, before those of its forces and parameters.
+    """
+
+    frame_a: str
+    frame_b: str
+    axis: Letter = "z"
+    point_a: Vector = (0.0, 0.0, 0.0)
+    rpy_a: Vector = (0.0, 0.0, 0.0)
+    point_b: Vector = (0.0, 0.0, 0.0)
+    rpy_b: Vector = (0.0, 0.0, 0.0)
+    damping: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    lower: float | None = None
+    upper: float | None = None
+    velocity_limit: float | None = None
+    motor: bool = False
+    effort_limit: float | None = None
+    name: str = "loop"
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+    units: ClassVar[tuple[str, str]]
+    """Of c, and of its force."""
+    coordinate: ClassVar[str]
+    """What c is called."""
+
+    def __post_init__(self) -> None:
+        check_letter("axis", self.axis)
+        for key in ("damping", "stiffness"):
+            if getattr(self, key) < 0.0:
+                raise ModelError(f"{key} must not be negative, got {getattr(self, key):g}")
+        for key in ("velocity_limit", "effort_limit"):
+            value = getattr(self, key)
+            if value is not None and not value > 0.0:
+                raise ModelError(f"{key} must be positive, got {value:g}; leave it out if unknown")
+        if self.effort_limit is not None and not self.motor:
+            raise ModelError("effort_limit is that of a motor; say motor=True")
+        low, high = self._limits
+        if not low < high:
+            raise ModelError(f"lower must be below upper, got {low:g} and {high:g}")
+        (unit, force), made = self.units, []
+        for key, per in (("damping", f"{force} s/{unit}"), ("stiffness", f"{force}/{unit}")):
+            if getattr(self, key):
+                made.append(Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per))
+        object.__setattr__(self, "parameters", tuple(made))
+
+    @property
+    @abstractmethod
+    def held_axes(self) -> tuple[str, str]:
+        """The axes of F along which M is held, and those about which it is, as letters."""
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        held, turned = self.held_axes
+        forces = signals([f"{self.name}.f{axis}" for axis in held], "N")
+        return (*forces, *signals([f"{self.name}.m{axis}" for axis in turned], "N m"))
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        held, turned = self.held_axes
+        shifts = signals([f"{self.name}.{axis}" for axis in held], "m")
+        return (*shifts, *signals([f"{self.name}.r{axis}" for axis in turned], "rad"))
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        R_WF, _ = self._base(kinematics)
+        held, turned = self._held
+        pushing = ca.horzcat(R_WF[:, held], ca.SX(3, len(turned)))
+        turning = ca.horzcat(ca.SX(3, len(held)), R_WF[:, turned])
+        point = kinematics.position(self.frame_b, self.point_b)
+        return (Application(point, pushing, turning, self.frame_b, self.frame_a),)
+
+    @property
+    def coordinate_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.{self.coordinate}", self.units[0]),)
+
+    @property
+    def joint(self) -> Joint:
+        low, high = self._limits
+        return Joint(
+            lower=low,
+            upper=high,
+            velocity_limit=np.inf if self.velocity_limit is None else self.velocity_limit,
+            motor=Signal(f"{self.name}.motor", self.units[1]) if self.motor else None,
+            effort_limit=np.inf if self.effort_limit is None else self.effort_limit,
+            force=self._force,
+        )
+
+    @property
+    def _limits(self) -> tuple[float, float]:
+        low, high = self.lower, self.upper
+        return -np.inf if low is None else low, np.inf if high is None else high
+
+    def _force(self, position: ca.SX, rate: ca.SX) -> ca.SX:
+        symbols = {p.name: p.symbol for p in self.parameters}
+        damping = symbols.get(f"{self.name}.damping", ca.SX(0))
+        stiffness = symbols.get(f"{self.name}.stiffness", ca.SX(0))
+        return -damping * rate - stiffness * (position - self.rest)
+
+    @property
+    def _held(self) -> tuple[list[int], list[int]]:
+        """The numbers of `held_axes`."""
+        held, turned = ([LETTERS.index(axis) for axis in axes] for axes in self.held_axes)
+        return held, turned
+
+    @property
+    def _own(self) -> int:
+        """The number of the joint's axis."""
+        return LETTERS.index(self.axis)
+
+    def _base(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
+        """R_WF and p_WF."""
+        rotation = ca.mtimes(frames.rotation(self.frame_a), _rotation(self.rpy_a))
+        return rotation, frames.position(self.frame_a, self.point_a)
+
+    def _relative(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
+        """R_FM and p_FM, in F."""
+        R_WF, origin = self._base(frames)
+        R_WM = ca.mtimes(frames.rotation(self.frame_b), _rotation(self.rpy_b))
+        apart = frames.position(self.frame_b, self.point_b) - origin
+        return ca.mtimes(R_WF.T, R_WM), ca.mtimes(R_WF.T, apart)
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class RevoluteLoopJoint(LoopJoint):
+    """A revolute joint that closes a loop.
+
+    See `LoopJoint` for its frames, and for what it has along its angle. The origins of F and M
+    coincide, and so do their axes a:
+
+        phi(q) = (p_FM, 2 / (1 + a . a_M) (b . (a x a_M), c . (a x a_M))),
+
+    in F, with its axes b and c across a; where a_M = -a it is infinite. The constraint forces are
+    what A exerts on B: a force in N at M, in the axes of F, and the moments in N m about b and c;
+    where phi = 0, phi' is the velocity and the angular velocity of M in F.
+
+    In a mechanism that moves in the plane across the axis anyway, the three rows that hold M in it
+    say nothing new, so that the constraints are redundant: `planar` leaves the two of the plane.
+
+    The angle counts from the middle of the limits, or from zero where there are not both, by half
+    a turn either way, where it jumps. A joint that goes round has a damper and a motor, but no
+    limits and no spring.
+
+    Attributes:
+        planar: Whether only the positions across the axis are held.
+    """
+
+    planar: bool = False
+    units = "rad", "N m"
+    coordinate = "angle"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self._limits
+        middle = self._middle
+        ends = [end for end in (low, high, self.rest) if np.isfinite(end)]
+        if any(abs(end - middle) >= pi for end in ends):
+            raise ModelError(
+                f"lower, upper and rest must be within half a turn of {middle:g} rad, where the "
+                f"angle counts from, got {brief(ends)}; a joint that goes round has neither"
+            )
+
+    @property
+    def _middle(self) -> float:
+        """Where the angle counts from."""
+        low, high = self._limits
+        return (low + high) / 2 if np.isfinite(low) and np.isfinite(high) else 0.0
+
+    @property
+    def held_axes(self) -> tuple[str, str]:
+        across = LETTERS.replace(self.axis, "")
+        return (across, "") if self.planar else (LETTERS, across)
+
+    def residual(self, frames: Frames) -> ca.SX:
+        R_FM, p_FM = self._relative(frames)
+        held, turned = self._held
+        axis = R_FM[:, self._own]
+        tilt = 2 / (1 + axis[self._own]) * ca.cross(ca.SX(np.eye(3)[self._own]), axis)
+        return ca.vertcat(p_FM[held], tilt[turned])
+
+    def coordinates(self, frames: Frames) -> ca.SX:
+        R_FM, _ = self._relative(frames)
+        b, c = (self._own + 1) % 3, (self._own + 2) % 3  # b x c = a.
+        sine, cosine = R_FM[c, b] - R_FM[b, c], R_FM[b, b] + R_FM[c, c]
+        s, k = np.sin(self._middle), np.cos(self._middle)
+        return self._middle + ca.atan2(sine * k - cosine * s, cosine * k + sine * s)
+
+    def coordinate_rate(self, kinematics: Kinematics) -> ca.SX:
+        along = self._base(kinematics)[0][:, self._own]
+        spins = [kinematics.angular_velocity(frame) for frame in (self.frame_a, self.frame_b)]
+        return ca.dot(along, spins[1] - spins[0])
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class PrismaticLoopJoint(LoopJoint):
+    """A prismatic joint that closes a loop.
+
+    See `LoopJoint` for its frames, and for what it has along its travel. M does not turn in F, and
+    its origin stays on the axis a of F:
+
+        phi(q) = (b . p_FM, c . p_FM, 2 tan(theta / 2) n),    R_FM = turn by theta about n,
+
+    in F, with its axes b and c across a. The constraint forces are what A exerts on B: a force in
+    N at M along b and c, and a moment in N m, in the axes of F; where phi = 0, phi' is the velocity
+    of M across the axis and its angular velocity in F. The travel is a . p_FM.
+
+    In a mechanism that moves in a plane anyway, two rows say what is not said yet: with the
+    `normal` of that plane, the position across axis and normal, and the turn about the normal.
+
+    Attributes:
+        normal: The axis of F that is the normal of the plane; None in space.
+    """
+
+    normal: Letter | None = None
+    units = "m", "N"
+    coordinate = "travel"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.normal is not None:
+            check_letter("normal", self.normal)
+            if self.normal == self.axis:
+                raise ModelError(f"normal must be another axis than '{self.axis}', the joint's own")
+
+    @property
+    def held_axes(self) -> tuple[str, str]:
+        across = LETTERS.replace(self.axis, "")
+        if self.normal is None:
+            return across, LETTERS
+        return across.replace(self.normal, ""), self.normal
+
+    def residual(self, frames: Frames) -> ca.SX:
+        R_FM, p_FM = self._relative(frames)
+        held, turned = self._held
+        skew = ca.vertcat(R_FM[2, 1] - R_FM[1, 2], R_FM[0, 2] - R_FM[2, 0], R_FM[1, 0] - R_FM[0, 1])
+        return ca.vertcat(p_FM[held], (2 * skew / (1 + ca.trace(R_FM)))[turned])
+
+    def coordinates(self, frames: Frames) -> ca.SX:
+        return self._relative(frames)[1][self._own]
+
+    def coordinate_rate(self, kinematics: Kinematics) -> ca.SX:
+        R_WF, origin = self._base(kinematics)
+        apart = kinematics.position(self.frame_b, self.point_b) - origin
+        carried = kinematics.velocity(self.frame_a, self.point_a)
+        carried = carried + ca.cross(kinematics.angular_velocity(self.frame_a), apart)
+        moving = kinematics.velocity(self.frame_b, self.point_b)
+        return ca.dot(R_WF[:, self._own], moving - carried)
+
+
+def check_letter(what: str, letter: str) -> None:
+    """Refuses what is no axis of a frame.
+
+    Raises:
+        ModelError: It is none of "x", "y", "z".
+    """
+    if letter not in ("x", "y", "z"):
+        raise ModelError(f"{what} must be 'x', 'y' or 'z', got {brief(letter)}")
+
+
+def _rotation(rpy: Vector) -> ca.SX:
+    """Turned by roll, pitch and yaw; what is zero but for round-off is structurally so."""
+    return ca.SX(ca.sparsify(ca.DM(clean(RollPitchYaw(rpy).ToRotationMatrix().matrix()))))

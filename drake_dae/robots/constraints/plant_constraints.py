@@ -1,0 +1,109 @@
+"""Constraints that a MultibodyPlant has already: mimic joints, couplers, rods."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
+
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.constraints.couplers import JointCoupler
+from drake_dae.robots.constraints.points import FixedDistance
+from drake_dae.robots.links.frames import frame_name, joint_names
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.surfaces.surface import triple
+
+
+def plant_constraints(links: Links) -> tuple[Constraint, ...]:
+    """The constraints of the plant that links come from; none if they come from none.
+
+    Couplers, which mimic joints are, become a `JointCoupler` "<follower>_coupler", and rods of
+    AddDistanceConstraint a `FixedDistance` "rod0", "rod1", ... Drake's plants keep them in discrete
+    time alone; these keep them in continuous time too.
+
+    Raises:
+        ModelError: The plant has others, or a rod with a stiffness.
+    """
+    plant = links.plant
+    if plant is None or plant.num_constraints() == 0:
+        return ()
+    found = (*_couplers(plant, links), *_rods(plant))
+    others = plant.num_constraints() - len(found)
+    if others:
+        raise ModelError(
+            f"the plant has {others} constraint(s) that cannot be read back from it; take them out "
+            "of the plant or of its file, and give them as `constraints`: a ball constraint is "
+            "CoincidentPoints, a weld constraint WeldedFrames"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Two joints of a plant with q_follower = ratio q_leader + offset, by their names."""
+
+    follower: str
+    leader: str
+    ratio: float
+    offset: float
+
+
+def couplings_of(plant: MultibodyPlant) -> list[Coupling]:
+    """The couplings of a finalized plant, each a row of a mathematical program as Drake tells it.
+
+    Raises:
+        ModelError: The plant has a constraint of which Drake tells nothing.
+    """
+    program = MathematicalProgram()
+    q = program.NewContinuousVariables(plant.num_positions(), "q")
+    try:
+        AddMultibodyPlantConstraints(plant, q, program, plant.CreateDefaultContext())
+    except RuntimeError as error:
+        raise ModelError(
+            f"the plant has a constraint that is not supported ({error}); leave it out of the plant"
+        ) from None
+    found: list[Coupling] = []
+    followers: set[str] = set()
+    joints = {joint.position_start(): name for name, joint in joint_names(plant).items()}
+    index = {variable.get_id(): i for i, variable in enumerate(q)}
+    for binding in program.GetAllConstraints():
+        row = binding.evaluator()
+        if not isinstance(row, LinearEqualityConstraint) or binding.variables().size != 2:
+            continue
+        names = [joints[index[variable.get_id()]] for variable in binding.variables()]
+        factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
+        # The follower has the factor 1. Where both have it, either may; nobody follows twice.
+        able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
+        place = next((i for i in able if names[i] not in followers), able[0])
+        followers.add(names[place])
+        ratio = -factors[1 - place] / factors[place]
+        offset = float(row.lower_bound()[0]) / factors[place]
+        found.append(Coupling(names[place], names[1 - place], ratio, offset))
+    return found
+
+
+def _couplers(plant: MultibodyPlant, links: Links) -> Iterator[JointCoupler]:
+    units = {signal.name: signal.unit for signal in links.position_signals}
+    for one in couplings_of(plant):
+        unit: Literal["rad", "m"] = "m" if units[one.follower] == "m" else "rad"
+        name = f"{one.follower}_coupler"
+        yield JointCoupler(one.follower, one.leader, one.ratio, one.offset, unit, name)
+
+
+def _rods(plant: MultibodyPlant) -> Iterator[FixedDistance]:
+    every = plant.GetDefaultDistanceConstraintParams()
+    for number, key in enumerate(sorted(every, key=lambda key: key.get_value())):
+        rod = every[key]
+        bodies = [plant.get_body(index) for index in (rod.bodyA(), rod.bodyB())]
+        start, end = (frame_name(plant, body.body_frame()) for body in bodies)
+        if np.isfinite(rod.stiffness()):
+            raise ModelError(
+                f"the distance constraint between '{start}' and '{end}' has a stiffness of "
+                f"{rod.stiffness():g} N/m: that is a spring and no rod; add a LinearSpringDamper"
+            )
+        point_a, point_b = (triple("a point", point) for point in (rod.p_AP(), rod.p_BQ()))
+        yield FixedDistance(start, point_a, end, point_b, rod.distance(), f"rod{number}")

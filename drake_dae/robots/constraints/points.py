@@ -1,0 +1,309 @@
+"""Points that stay on a surface, on each other, or at a distance from each other."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, check_axes
+from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
+from drake_dae.robots.constraints.friction import Friction, friction_parameters
+from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
+from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class PointOnSurface(Constraint):
+    """A point of a frame stays on a surface: phi(q) = signed distance of p_W(q).
+
+    The constraint force is the normal force of the surface on the robot in N; positive pushes the
+    robot to the free side, and a unilateral contact can only push. The parameter "<name>.position"
+    is where the surface stands, and "<name>.rpy" how it is turned about that place; where they are
+    exogenous (see `RobotModel`), the surface moves. Numbers of the surface's `shape` are parameters
+    "<name>.<number>".
+
+    With friction the surface also pulls the point back as it slides, by the velocity v_t in m/s
+    relative to the surface, which may move:
+
+        F_t = -(mu lambda s + d v_t),    s = v_t / sqrt(|v_t|^2 + v_s^2),
+
+    Coulomb's friction, made smooth by the speed v_s, and viscous friction. So at rest it does not
+    hold: below v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance"
+    and "<name>.viscous_friction" are mu, v_s and d; plant and law may have them different, where
+    both have them: 0 is a smooth surface that has. Where the friction that lambda makes turns phi''
+    around, the contact jams (Painleve): see `dae.contacts`.
+
+    Behind springs, motors and valves a law differentiates s, whose slopes are 1 / v_s. With error
+    control it follows the prediction for v_s of 0.001 m/s with all of them; but where the sliding
+    turns around it then asks for 3 to 18 times the control behind springs and valves, which a v_s
+    of 0.01 m/s does without (0.03 m/s behind valves). Fixed steps of 5 ms behind springs take 0.03
+    m/s; at 0.01 m/s they leave 0.01 to 0.4 N, and at 0.003 m/s they fail. With rigid joints v_s
+    does not matter to the law.
+
+    Attributes:
+        frame: Name of the frame.
+        surface: A surface in the world.
+        point: The point in the frame, m, shape (3,).
+        name: The name of the constraint, before those of its force and its parameters.
+        rpy: Roll, pitch and yaw by which the surface is turned, rad, shape (3,): about the fixed
+            axes x, y, z in this order, as in Drake. None for a surface that nobody turns, which
+            has no such parameter.
+        friction: mu, not negative; None for a smooth surface, which has no such parameters.
+        stiction_tolerance: v_s in m/s, the name of it in Drake; only with friction.
+        viscous_friction: d in N s/m, not negative; None for none, without a parameter.
+
+    Raises:
+        ModelError: A coefficient is negative, or the speed not positive.
+    """
+
+    frame: str
+    surface: Surface
+    point: Vector = (0.0, 0.0, 0.0)
+    name: str = "surface"
+    rpy: Vector | None = None
+    friction: float | None = None
+    stiction_tolerance: float = 1e-3
+    viscous_friction: float | None = None
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+    can_only_push: ClassVar[tuple[bool, ...]] = (True,)
+
+    def __post_init__(self) -> None:
+        position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
+        turns = []
+        if self.rpy is not None:
+            turns.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
+        rubbing = friction_parameters(
+            self.name, self.friction, self.stiction_tolerance, self.viscous_friction
+        )
+        surface, shape = with_parameters(self.name, self.surface)
+        object.__setattr__(self, "surface", surface)
+        object.__setattr__(self, "parameters", (position, *turns, *rubbing, *shape))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.force", "N"),)
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.distance", "m"),)
+
+    @property
+    def coordinate_signals(self) -> tuple[Signal, ...]:
+        own = self.surface.coordinate_signals
+        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
+
+    def offset(self, frames: Frames) -> ca.SX:
+        """The point relative to the surface as it stands, in its axes, m, shape (3, 1)."""
+        return self._offset(frames.position(self.frame, self.point))
+
+    def _offset(self, point: ca.SX) -> ca.SX:
+        """The same of any point in the world."""
+        offset = point - self.parameters[0].symbol
+        return ca.mtimes(self._rotation().T, offset) if self.rpy is not None else offset
+
+    def _rotation(self) -> ca.SX:
+        """How the surface is turned, shape (3, 3)."""
+        return rotation_of(self.parameters[1].symbol)
+
+    def _normal(self, frames: Frames) -> ca.SX:
+        """The gradient of phi in the world, shape (3, 1)."""
+        normal = self.surface.unit_normal(self.offset(frames))
+        return normal if self.rpy is None else ca.mtimes(self._rotation(), normal)
+
+    def _friction(self, kinematics: Kinematics) -> Friction | None:
+        """How the point rubs; None where it does not."""
+        sliding = self.sliding(kinematics)
+        return None if sliding is None else Friction.of(self.name, self.parameters, sliding)
+
+    def sliding(self, kinematics: Kinematics) -> ca.SX | None:
+        if self.is_ideal:
+            return None
+        surface = self.parameters[0].rate
+        if self.rpy is not None:
+            turn = self.parameters[1]
+            offset = ca.SX.sym("offset", 3)
+            turning = ca.jtimes(ca.mtimes(self._rotation(), offset), turn.symbol, turn.rate)
+            surface = surface + ca.substitute(turning, offset, self.offset(kinematics))
+        velocity = kinematics.velocity(self.frame, self.point) - surface
+        normal = self._normal(kinematics)
+        return velocity - normal * ca.dot(normal, velocity)
+
+    @property
+    def is_ideal(self) -> bool:
+        return self.friction is None and self.viscous_friction is None
+
+    @property
+    def friction_parameter(self) -> str | None:
+        return None if self.friction is None else f"{self.name}.friction"
+
+    def residual(self, frames: Frames) -> ca.SX:
+        return self.surface.distance(self.offset(frames))
+
+    def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
+        pushed = super().reaction(kinematics, constraint_force)
+        rubbing = self._friction(kinematics)
+        if rubbing is None or self.friction is None:
+            return pushed
+        return pushed + kinematics.push(self.frame, rubbing.pull * constraint_force, self.point)
+
+    def drag(self, kinematics: Kinematics) -> Reaction | None:
+        rubbing = self._friction(kinematics)
+        if rubbing is None or rubbing.drag is None:
+            return None
+        return kinematics.push(self.frame, rubbing.drag, self.point)
+
+    def coordinates(self, frames: Frames) -> ca.SX:
+        return self.surface.coordinates(self.offset(frames))
+
+    def touch(self, frames: Frames) -> Touch:
+        return Touch(
+            self.frame,
+            self.point,
+            self._normal(frames),
+            lambda point: self.surface.distance(self._offset(point)),
+        )
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        push, drag, rubbing = self._normal(kinematics), None, self._friction(kinematics)
+        if rubbing is not None:
+            push, drag = push + rubbing.pull, rubbing.drag
+        point = kinematics.position(self.frame, self.point)
+        return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
+
+    @property
+    def remark(self) -> str:
+        return f"{self.name}: {self.surface.remark}" if self.surface.remark else ""
+
+    @property
+    def extent(self) -> FloatArray | None:
+        return self.surface.extent
+
+    def placement(self, values: FloatArray) -> RigidTransform:
+        turn = np.zeros(3) if self.rpy is None else values[3:6]
+        return RigidTransform(RollPitchYaw(turn), values[:3])
+
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
+        stands = self.placement(values)
+        surface = self.surface.shaped(ca.SX(values[len(values) - len(self.surface.shape) :]))
+        picture = surface.picture(stands.inverse() @ point, size)
+        return None if picture is None else picture.moved(stands)
+
+    def solid(self, values: FloatArray) -> Picture | None:
+        solid = self.surface.solid()
+        return None if solid is None else solid.moved(self.placement(values))
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class CoincidentPoints(Constraint):
+    """A point of frame B stays on a point of frame A: phi(q) = p_WB(q) - p_WA(q).
+
+    A ball joint that closes a loop; a pin, in a mechanism that moves in a plane and so needs the
+    axes of that plane alone. The constraint force is the force in N, in world axes, that A exerts
+    on B at the point; B exerts the opposite on A.
+
+    Attributes:
+        frame_a: Name of frame A, for example "world".
+        point_a: The point in frame A, m, shape (3,).
+        frame_b: Name of frame B, on another body.
+        point_b: The point in frame B, m, shape (3,).
+        axes: The axes of the world along which they coincide, for example "xz".
+        name: The name of the constraint, before those of its forces.
+    """
+
+    frame_a: str
+    point_a: Vector
+    frame_b: str
+    point_b: Vector
+    axes: str = "xyz"
+    name: str = "pin"
+
+    def __post_init__(self) -> None:
+        check_axes("axes", self.axes)
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.f{axis}" for axis in self.axes], "N")
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.{axis}" for axis in self.axes], "m")
+
+    def residual(self, frames: Frames) -> ca.SX:
+        point_b = frames.position(self.frame_b, self.point_b)
+        apart = point_b - frames.position(self.frame_a, self.point_a)
+        return apart[self._rows]
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        point = kinematics.position(self.frame_b, self.point_b)
+        axes = ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes))
+        return (Application(point, *axes, self.frame_b, self.frame_a),)
+
+    @property
+    def _rows(self) -> list[int]:
+        return ["xyz".index(axis) for axis in self.axes]
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class FixedDistance(Constraint):
+    """A rod without mass, with a ball joint at each end, between points of frames A and B:
+
+        phi(q) = |p_WB(q) - p_WA(q)| - length.
+
+    The constraint force is the thrust in N: positive pushes the points apart, so that A exerts it
+    on B away from A, and B the opposite on A; negative is the pull of the rod. The parameter
+    "<name>.length" is its length.
+
+    It is no way to keep two points together: at length zero phi has no gradient. Use
+    `CoincidentPoints` there, and `PointOnSurface` for a point that moves on a sphere that stands in
+    the world. A rope, which can only pull, is no rod.
+
+    Attributes:
+        frame_a: Name of frame A, for example "world".
+        point_a: The point in frame A, m, shape (3,).
+        frame_b: Name of frame B, on another body.
+        point_b: The point in frame B, m, shape (3,).
+        length: The distance of the points, m, positive.
+        name: The name of the constraint, before those of its force and its parameter.
+    """
+
+    frame_a: str
+    point_a: Vector
+    frame_b: str
+    point_b: Vector
+    length: float
+    name: str = "rod"
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        length = Parameter(f"{self.name}.length", np.array([self.length]), "m", positive=True)
+        object.__setattr__(self, "parameters", (length,))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.thrust", "N"),)
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.stretch", "m"),)
+
+    def residual(self, frames: Frames) -> ca.SX:
+        return ca.norm_2(self._apart(frames)) - self.parameters[0].symbol
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        apart = self._apart(kinematics)
+        point = kinematics.position(self.frame_b, self.point_b)
+        away = apart / ca.norm_2(apart)
+        return (Application(point, away, ca.SX(3, 1), self.frame_b, self.frame_a),)
+
+    def _apart(self, frames: Frames) -> ca.SX:
+        start = frames.position(self.frame_a, self.point_a)
+        return frames.position(self.frame_b, self.point_b) - start

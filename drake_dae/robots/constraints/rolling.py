@@ -1,0 +1,250 @@
+"""What rolls, or glides along a blade: constraints of velocities."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots.links.kinematics import Frames, Kinematics
+from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Blade(Constraint):
+    """A blade, or a wheel that turns freely: a point of a frame does not move along an axis of it:
+
+        0 = s(q) . p_W'(q, v),
+
+    with the axis s in the world. No equation of positions says this (r = 1, nonholonomic): the
+    point gets everywhere, by detours. The constraint force is the side force in N that the ground
+    exerts on the frame at the point, positive along the axis; the ground gets the opposite.
+
+    It keeps no height: a joint, or a `PointOnSurface`, does. At rest it holds wherever the robot
+    is, and a start in motion must not move sideways. Two blades on one axle say the same twice.
+
+    Attributes:
+        frame: Name of the frame.
+        axis: The axis in the frame along which the point does not move, of any length, shape (3,).
+        point: The point in the frame, m, shape (3,).
+        name: The name of the constraint, before those of its force and its speed.
+    """
+
+    frame: str
+    axis: Vector = (0.0, 1.0, 0.0)
+    point: Vector = (0.0, 0.0, 0.0)
+    name: str = "blade"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.side_force", "N"),)
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return (Signal(f"{self.name}.side_speed", "m/s"),)
+
+    def rate(self, kinematics: Kinematics) -> ca.SX:
+        return ca.dot(self._side(kinematics), kinematics.velocity(self.frame, self.point))
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        point = kinematics.position(self.frame, self.point)
+        return (Application(point, self._side(kinematics), ca.SX(3, 1), self.frame),)
+
+    def _side(self, kinematics: Kinematics) -> ca.SX:
+        return ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axis))
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class RollingWheel(Constraint):
+    """A wheel rolls on level ground: the rim where it touches has no velocity along the ground:
+
+        0 = f . v_c,  0 = s . v_c,    v_c = p_W' - radius (w x u),
+
+    with the center p_W, the wheel's angular velocity w, the unit vector u from where it touches to
+    the center, in the wheel's plane, the heading f = axle x n / |axle x n|, and s = n x f, which is
+    the axle of an upright wheel (r = 1, nonholonomic). The constraint forces are the traction and
+    the side force in N that the ground exerts on the wheel where it touches, positive along f and
+    s; the ground gets the opposite. A wheel that turns by positive angles about its axle goes
+    forward. The parameter "<name>.radius" is the radius.
+
+    It keeps no height, so that robots whose joints keep it stay regular: on a base that is free to
+    fall, hold the centers of the wheels at their height by a `PointOnSurface` each. A second wheel
+    on the same axle would say again that the axle does not move sideways: give that one
+    holds_side = False.
+
+    Attributes:
+        frame: Name of a frame on the wheel.
+        radius: Its radius, m, positive.
+        axle: The axle in the frame, of any length, toward the left of where the wheel goes,
+            shape (3,).
+        center: Its center in the frame, m, shape (3,).
+        normal: The normal n of the ground, in the world, up, of any length, shape (3,).
+        holds_side: Whether the wheel keeps from moving sideways.
+        name: The name of the constraint, before those of its forces and its parameter.
+    """
+
+    frame: str
+    radius: float
+    axle: Vector = (0.0, 1.0, 0.0)
+    center: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+    holds_side: bool = True
+    name: str = "wheel"
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("axle", "normal"):
+            object.__setattr__(self, name, unit_vector(name, getattr(self, name)))
+        radius = Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True)
+        object.__setattr__(self, "parameters", (radius,))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.{kind}" for kind in ("traction", "side_force")], "N")[
+            : self._count
+        ]
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.{kind}" for kind in ("slip", "side_speed")], "m/s")[
+            : self._count
+        ]
+
+    def rate(self, kinematics: Kinematics) -> ca.SX:
+        up, directions = self._directions(kinematics)
+        spin = kinematics.angular_velocity(self.frame)
+        lever = self.parameters[0].symbol * up
+        rim = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
+        return ca.mtimes(directions.T, rim)
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        up, directions = self._directions(kinematics)
+        center = kinematics.position(self.frame, self.center)
+        point = center - self.parameters[0].symbol * up
+        return (Application(point, directions, ca.SX(3, self._count), self.frame),)
+
+    @property
+    def _count(self) -> int:
+        return 2 if self.holds_side else 1
+
+    def _directions(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX]:
+        """u, shape (3, 1), and f beside s as far as it is held, shape (3, m)."""
+        n = ca.SX(self.normal)
+        axle = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axle))
+        along = ca.cross(axle, n)
+        heading = along / ca.norm_2(along)
+        directions = ca.horzcat(heading, ca.cross(n, heading))
+        return ca.cross(heading, axle), directions[:, : self._count]
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class RollingBall(Constraint):
+    """A ball rolls on a surface without slip, and stays on it:
+
+        phi(q) = distance(p_W) - radius,    0 = t_1 . v_c,  0 = t_2 . v_c,
+        v_c = p_W' - radius (w x n),
+
+    with the center p_W, the angular velocity w, the unit normal n at the center, and the tangents
+    t_1, which is `along` less what it has of n, made one long, and t_2 = n x t_1. The first row
+    restricts positions (r = 2), the others velocities alone (r = 1): together the ball's material
+    point at the contact rests. The constraint forces are the normal force and the two rolling
+    frictions in N that the surface exerts on the ball at the contact; the normal force can only
+    push, and the surface gets the opposite. Nothing hinders the ball from turning about n. The
+    parameters "<name>.position" and "<name>.radius" are where the surface stands and the radius.
+
+    The center is kept at a distance, so the surface must know distances beside it as well: planes,
+    spheres, cylinders and tori do. Whether friction can bear what rolling takes is for the user to
+    check: the forces are on the port. A point that sticks is no ball of radius zero: use
+    `CoincidentPoints` with the world.
+
+    Attributes:
+        frame: Name of a frame on the ball.
+        surface: A surface that stands in the world, and knows distances beside it.
+        radius: The ball's radius, m, positive.
+        center: Its center in the frame, m, shape (3,).
+        along: A direction in the world that is nowhere along the normal, of any length, shape (3,).
+        name: The name of the constraint, before those of its forces and its parameters.
+    """
+
+    frame: str
+    surface: Surface
+    radius: float
+    center: Vector = (0.0, 0.0, 0.0)
+    along: Vector = (1.0, 0.0, 0.0)
+    name: str = "ball"
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
+    can_only_push: ClassVar[tuple[bool, ...]] = (True, False, False)
+
+    def __post_init__(self) -> None:
+        if not self.surface.has_exact_distance:
+            raise ModelError(
+                f"a ball cannot roll on {type(self.surface).__name__}, whose distance is right to "
+                "first order only; use Plane, Sphere, Cylinder or Torus"
+            )
+        object.__setattr__(self, "along", unit_vector("along", self.along))
+        position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
+        radius = Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True)
+        object.__setattr__(self, "parameters", (position, radius))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        kinds = ("force", "friction_1", "friction_2")
+        return signals([f"{self.name}.{kind}" for kind in kinds], "N")
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        slips = signals([f"{self.name}.slip_1", f"{self.name}.slip_2"], "m/s")
+        return (Signal(f"{self.name}.distance", "m"), *slips)
+
+    @property
+    def coordinate_signals(self) -> tuple[Signal, ...]:
+        own = self.surface.coordinate_signals
+        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
+
+    def residual(self, frames: Frames) -> ca.SX:
+        return self.surface.distance(self._offset(frames)) - self.parameters[1].symbol
+
+    def rate(self, kinematics: Kinematics) -> ca.SX:
+        normal, tangents = self._directions(kinematics)
+        spin = kinematics.angular_velocity(self.frame)
+        lever = self.parameters[1].symbol * normal
+        touching = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
+        distance = kinematics.derivative(self.residual(kinematics))
+        return ca.vertcat(distance, ca.mtimes(tangents.T, touching))
+
+    def coordinates(self, frames: Frames) -> ca.SX:
+        return self.surface.coordinates(self._offset(frames))
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        normal, tangents = self._directions(kinematics)
+        center = kinematics.position(self.frame, self.center)
+        point = center - self.parameters[1].symbol * normal
+        axes = ca.horzcat(normal, tangents), ca.SX(3, 3)
+        return (Application(point, *axes, self.frame),)
+
+    def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
+        picture = self.surface.picture(point - values[:3], size)
+        return None if picture is None else picture.moved(values[:3])
+
+    def _offset(self, frames: Frames) -> ca.SX:
+        """The center relative to where the surface stands, m, shape (3, 1)."""
+        return frames.position(self.frame, self.center) - self.parameters[0].symbol
+
+    def _directions(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
+        """n, shape (3, 1), and t_1 beside t_2, shape (3, 2)."""
+        n, along = self.surface.unit_normal(self._offset(frames)), ca.SX(self.along)
+        across = along - n * ca.dot(n, along)
+        first = across / ca.norm_2(across)
+        return n, ca.horzcat(first, ca.cross(n, first))

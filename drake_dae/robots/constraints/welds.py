@@ -1,0 +1,75 @@
+"""Frames that keep their pose in each other."""
+
+from dataclasses import dataclass, field
+
+import casadi as ca
+from pydrake.math import RigidTransform
+
+from drake_dae.arguments import checked
+from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots.links.joints import constant_pose
+from drake_dae.robots.links.kinematics import Frames, Kinematics
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class WeldedFrames(Constraint):
+    """Frame B keeps a pose (R, p) in frame A, as with Drake's WeldFrames and AddWeldConstraint:
+
+        phi(q) = (p_AB(q) - p, 2 tan(theta / 2) n),    R_AB(q) R^T = turn by theta about n,
+
+    all in the axes of A. The constraint force is what A exerts on B, a force in N at B's origin and
+    a moment in N m, in the axes of A; B exerts the opposite on A at the same point. For at phi = 0
+    phi' = (v, w), the velocity and angular velocity of B in A, so that lambda^T phi' is the power
+    of such a force and moment: p_AB' = v, and with E = R_AB R^T, E' = w x E, the orientation error
+
+        r = 2 tan(theta / 2) n = 2 vee(E - E^T) / (1 + tr E)
+
+    has r' = w + w x r / 2 + (w . r) r / 4, which is w at r = 0. It is smooth up to half a turn,
+    where it is infinite: unlike the sine of theta it has no other zero than the pose itself. The
+    parameter "<name>.position" is p.
+
+    Attributes:
+        frame_a: Name of frame A; "world" holds B in place.
+        frame_b: Name of frame B, on another body.
+        pose: X_AB, the pose of B in A; by default the frames coincide.
+        name: The name of the constraint, before those of its forces and its parameter.
+    """
+
+    frame_a: str
+    frame_b: str
+    pose: RigidTransform = field(default_factory=RigidTransform)
+    name: str = "weld"
+    parameters: tuple[Parameter, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", RigidTransform(self.pose))
+        position = Parameter(f"{self.name}.position", self.pose.translation(), "m")
+        object.__setattr__(self, "parameters", (position,))
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        forces, moments = ([f"{self.name}.{kind}{axis}" for axis in "xyz"] for kind in "fm")
+        return (*signals(forces, "N"), *signals(moments, "N m"))
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        shifts, turns = ([f"{self.name}.{kind}{axis}" for axis in "xyz"] for kind in ("", "r"))
+        return (*signals(shifts, "m"), *signals(turns, "rad"))
+
+    def residual(self, frames: Frames) -> ca.SX:
+        R_AW = frames.rotation(self.frame_a).T
+        offset = frames.position(self.frame_b) - frames.position(self.frame_a)
+        wanted = ca.SX(ca.sparsify(ca.DM(constant_pose(self.pose)[0])))
+        E = ca.mtimes(R_AW, ca.mtimes(frames.rotation(self.frame_b), wanted.T))
+        skew = ca.vertcat(E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1])
+        shift = ca.mtimes(R_AW, offset) - self.parameters[0].symbol
+        return ca.vertcat(shift, 2 * skew / (1 + ca.trace(E)))
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        R_WA, none = kinematics.rotation(self.frame_a), ca.SX(3, 3)
+        point = kinematics.position(self.frame_b)
+        axes = ca.horzcat(R_WA, none), ca.horzcat(none, R_WA)
+        return (Application(point, *axes, self.frame_b, self.frame_a),)

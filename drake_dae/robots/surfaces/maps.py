@@ -1,0 +1,298 @@
+"""Surfaces given by data, as heights over a plane: a height map, a mesh."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil
+from pathlib import Path
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, positive
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError, describe_os_error
+from drake_dae.robots.surfaces.mesh_file import heights_of_mesh, read_mesh
+from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
+from drake_dae.robots.surfaces.relief import CELLS, Relief, fit_relief
+from drake_dae.robots.surfaces.surface import Surface, Vector, tangents, triple, unit_vector
+
+Pair = tuple[float, float]
+
+
+class _Map(Surface):
+    """Heights h over a plane, phi = (z - h(x, y)) / sqrt(1 + h_x^2 + h_y^2).
+
+    This is the distance to first order, with x and y along `tangents(normal)`, z along the normal.
+    """
+
+    point: Vector
+    normal: Vector
+    relief: Relief
+    coordinate_signals: ClassVar = (Signal("along", "m"), Signal("across", "m"))
+
+    @property
+    def position(self) -> Vector:
+        return self.point
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        x, y = ca.vertsplit(self.coordinates(offset))
+        height, slope_x, slope_y = self.relief.height(x, y)
+        z = ca.dot(ca.DM(self.normal), offset)
+        return (z - height) / ca.sqrt(1 + slope_x**2 + slope_y**2)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        return ca.vertcat(*[ca.dot(ca.DM(t), offset) for t in tangents(self.normal)])
+
+    @property
+    def extent(self) -> FloatArray:
+        return np.column_stack([self.relief.x, self.relief.y])
+
+    @property
+    @abstractmethod
+    def remark(self) -> str:
+        """How far it is off its data."""
+
+    def picture(self, center: ArrayLike, size: float) -> Picture:
+        sides = self.relief.x, self.relief.y
+        x, y = (np.linspace(side[0], side[1], 3 * CELLS + 1) for side in sides)
+        along, across = tangents(self.normal)
+        places = x[:, None] * along + y[:, None, None] * across
+        points = places + self.relief.heights(x, y)[..., None] * np.array(self.normal)
+        return Picture(mesh_of_grid(points), RigidTransform())
+
+    def _told(self, source: str) -> str:
+        width = max(bells.width for bells in self.relief.bells)
+        return (
+            f"{source}: the surface is off the data by {_millimetres(self.relief.largest)} at most "
+            f"and {_millimetres(self.relief.rms)} rms; what is finer than {_millimetres(width)} is "
+            "smoothed away"
+        )
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class HeightMap(_Map):
+    """Heights on a grid over a plane, from a table or a file, made smooth.
+
+    The surface is the sum of a plane and of bell curves that is closest to the heights: it has
+    derivatives of all orders, which laws behind springs and motors need, and is off the heights by
+    what `remark` says. Beyond the edges it goes over to the plane. Its coordinates are along
+    `tangents(normal)` in m: for the normal z along x and y, for a wall sideways and upward.
+
+    Attributes:
+        size: The lengths of the map along its coordinates, m, shape (2,).
+        heights: Heights in m above the plane through `point`, row by row: a row goes along the
+            first coordinate, the rows follow along the second; shape (r, c).
+        file: A file with the heights instead: .csv, or .npy, or .png, where black is 0 and white is
+            1, and which is seen from above, its second coordinate upward.
+        point: The middle of the map, m, shape (3,).
+        normal: The direction of the heights, which is the free side, of any length, shape (3,).
+        scale: The length of a unit of the heights, m.
+        resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
+            sixteenth of the longer side, but no less than the heights are apart.
+
+    Raises:
+        ModelError: There are no heights, or both a table and a file, or they cannot be read.
+    """
+
+    size: Pair
+    heights: ArrayLike | None = None
+    file: str | Path | None = None
+    point: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+    scale: float = 1.0
+    resolution: float | None = None
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if (self.heights is None) == (self.file is None):
+            raise ModelError("give either heights, row by row, or a file with them")
+        if self.heights is not None:
+            rows = tuple(map(tuple, _table("heights", self.heights).tolist()))
+            object.__setattr__(self, "heights", rows)
+            found = _table_relief(rows, self.size, self.scale, self.resolution)
+        else:
+            source = _stamp(Path(str(self.file)))
+            found = _file_relief(source, self.size, self.scale, self.resolution)
+        object.__setattr__(self, "relief", found)
+
+    @property
+    def remark(self) -> str:
+        return self._told(f"HeightMap '{Path(self.file).name}'" if self.file else "HeightMap")
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class MeshSurface(_Map):
+    """The side of a mesh that is seen along a normal, as heights over a plane, made smooth.
+
+    Rays against the normal sample the mesh over a rectangle, and a smooth surface is fitted to what
+    they hit; see `HeightMap`. So the mesh must cover the rectangle, and must not lie over itself
+    there: an overhang has no single height. A steep step is smoothed over; `remark` tells by how
+    much. To meet a mesh from several sides take several surfaces.
+
+    Attributes:
+        file: A mesh: .obj, or .stl and others that the package trimesh reads.
+        point: Where the origin of the mesh stands in the world, m, shape (3,); its axes are the
+            world's.
+        normal: The free side, and where the rays come from, of any length, shape (3,).
+        middle: The middle of the rectangle along `tangents(normal)` from the origin of the mesh, m,
+            shape (2,); that of the mesh if None.
+        size: The lengths of the rectangle, m, shape (2,); those of the mesh if None.
+        scale: The length of a unit of the mesh, m: 0.001 for millimetres.
+        resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
+            sixteenth of the longer side.
+
+    Raises:
+        ModelError: The mesh cannot be read, has a hole in the rectangle, or an overhang.
+    """
+
+    file: str | Path
+    point: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+    middle: Pair | None = None
+    size: Pair | None = None
+    scale: float = 1.0
+    resolution: float | None = None
+
+    def __post_init__(self) -> None:
+        _check(self)
+        source = _stamp(Path(self.file))
+        rectangle = self.middle, self.size
+        found = _mesh_relief(source, self.normal, rectangle, self.scale, self.resolution)
+        object.__setattr__(self, "relief", found)
+
+    @property
+    def remark(self) -> str:
+        return self._told(f"MeshSurface '{Path(self.file).name}'")
+
+
+def _check(surface: Any) -> None:
+    object.__setattr__(surface, "point", triple("point", surface.point))
+    object.__setattr__(surface, "normal", unit_vector("normal", surface.normal))
+    positive("scale", surface.scale)
+    if surface.resolution is not None:
+        positive("resolution", surface.resolution)
+    for key in ("size", "middle"):
+        pair = getattr(surface, key, None)
+        if pair is None:
+            continue
+        if len(pair) != 2:
+            raise ModelError(f"{key} must be two lengths, got {brief(pair)}")
+        object.__setattr__(surface, key, (float(pair[0]), float(pair[1])))
+        for length in pair if key == "size" else ():
+            positive(key, length)
+
+
+_Source = tuple[str, int, int]
+"""A file, when it was changed last, and how long it is: a fit is kept as long as these stay."""
+
+
+def _stamp(file: Path) -> _Source:
+    try:
+        found = file.stat()
+    except (OSError, ValueError):  # A null byte.
+        raise ModelError(f"no file '{file}'") from None
+    return str(file), found.st_mtime_ns, found.st_size
+
+
+@lru_cache(maxsize=16)
+def _table_relief(
+    rows: tuple[tuple[float, ...], ...], size: Pair, scale: float, resolution: float | None
+) -> Relief:
+    return _map_relief(np.array(rows), size, scale, resolution)
+
+
+@lru_cache(maxsize=16)
+def _file_relief(source: _Source, size: Pair, scale: float, resolution: float | None) -> Relief:
+    return _map_relief(_read_heights(Path(source[0])), size, scale, resolution)
+
+
+def _map_relief(rows: FloatArray, size: Pair, scale: float, resolution: float | None) -> Relief:
+    x, y = (_along(0.0, length, n) for length, n in zip(size, rows.shape[::-1], strict=True))
+    apart = max(x[1] - x[0], y[1] - y[0])
+    return fit_relief(x, y, scale * rows, resolution or max(apart, max(size) / CELLS))
+
+
+@lru_cache(maxsize=16)
+def _mesh_relief(
+    source: _Source,
+    normal: Vector,
+    rectangle: tuple[Pair | None, Pair | None],
+    scale: float,
+    resolution: float | None,
+) -> Relief:
+    vertices, triangles = read_mesh(Path(source[0]))
+    axes = np.column_stack([*tangents(normal), np.array(normal)])
+    seen = scale * vertices @ axes
+    if np.linalg.det(axes) < 0.0:
+        triangles = triangles[:, ::-1]  # A mirror shows their backs.
+    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    middle = (low + high) / 2 if rectangle[0] is None else np.array(rectangle[0])
+    size = high - low if rectangle[1] is None else np.array(rectangle[1])
+    if not np.all(size > 0.0):
+        raise ModelError(f"the mesh has no extent across the normal {normal}; choose another one")
+    resolution = resolution or float(np.max(size)) / CELLS
+    x, y = (
+        _along(center, length, 2 * max(ceil(length / resolution), 4) + 1)
+        for center, length in zip(middle, size, strict=True)
+    )
+    return fit_relief(x, y, heights_of_mesh(seen, triangles, x, y), resolution)
+
+
+def _along(middle: float, length: float, count: int) -> FloatArray:
+    return middle + length * np.linspace(-0.5, 0.5, count)
+
+
+def _read_heights(file: Path) -> FloatArray:
+    """The heights in a file, first row lowest."""
+    kind = file.suffix.lower()
+    rows: ArrayLike
+    try:
+        if kind == ".csv":
+            text = file.read_text("utf-8-sig").replace(",", " ").replace(";", " ")
+            rows = [list(map(float, line.split())) for line in text.splitlines() if line.split()]
+        elif kind == ".npy":
+            rows = np.load(file, allow_pickle=False)
+        elif kind == ".png":
+            from matplotlib.image import imread
+
+            pixels = imread(file)[::-1].astype(float)
+            rows = pixels if pixels.ndim == 2 else pixels[..., :3].mean(axis=2)
+        else:
+            raise ModelError(f"'{file.name}' is no .csv, .npy or .png")
+    except OSError as error:
+        raise ModelError(describe_os_error(error)) from None
+    except (SyntaxError, ValueError, EOFError) as error:  # matplotlib has SyntaxError for a PNG.
+        raise ModelError(f"'{file.name}' has no table of heights: {brief(str(error))}") from None
+    return _table(f"'{file.name}'", rows)
+
+
+def _table(what: str, rows: ArrayLike) -> FloatArray:
+    """Rows as an array.
+
+    Raises:
+        ModelError: They are no table of numbers, or too few.
+    """
+    try:
+        heights = np.asarray(rows, dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(f"{what}: rows of numbers of one length are needed") from None
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise ModelError(
+            f"{what}: two rows of two heights are the least, got shape {heights.shape}"
+        )
+    bad = np.argwhere(~np.isfinite(heights))
+    if bad.size:
+        row, column = bad[0] + 1
+        raise ModelError(f"{what}: row {row}, column {column} is no height")
+    return heights
+
+
+def _millimetres(length: float) -> str:
+    return f"{1e3 * length:.2g} mm"

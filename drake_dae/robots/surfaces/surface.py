@@ -1,0 +1,235 @@
+"""What a surface says of itself, and how any surface is drawn."""
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import Linearization, newton, shortest_steps
+
+Vector = tuple[float, float, float]
+
+CELLS = 24
+"""How many cells a mesh has along each side."""
+
+
+@checked(ModelError)
+class Surface(ABC):
+    """A smooth surface that stands in the world.
+
+    Points are given as offsets from its reference point, so that where it stands can be a
+    parameter.
+
+    1. `position` is where the reference point stands by default.
+    2. `distance` is the signed distance of a point, to first order around the surface: zero on it,
+       positive on the free side, with a gradient of length one on the surface. So the constraint
+       force of `PointOnSurface` is the normal force in newtons. It is smooth around the surface.
+    3. `coordinates` tell where on the surface a point is, one row for each of
+       `coordinate_signals`; with the distance they tell the point, but for poles. A surface may
+       have none.
+    4. `has_exact_distance` where the distance is so beside the surface, too: its gradient is one
+       long there. Balls roll on such surfaces alone.
+    5. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
+       with a shape of its own gives that.
+    6. `shape` are numbers of its form that a study may change, by names; most surfaces have none.
+       `shaped` is the same surface with others, numbers or symbols.
+    7. `solid` is what fills the side that is not free, as a shape of Drake, for its own contact. A
+       surface may have none.
+    8. `remark` says what of it is approximate, if anything is, and `extent` up to which coordinates
+       it is given, if it has an end.
+    """
+
+    coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
+    has_exact_distance: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def position(self) -> Vector:
+        """Where the reference point stands in the world by default, m, shape (3,)."""
+
+    @abstractmethod
+    def distance(self, offset: ca.SX) -> ca.SX:
+        """The signed distance of a point in m.
+
+        Args:
+            offset: The point relative to the reference point, m, shape (3, 1).
+        """
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        """Coordinates along the surface of such a point, shape (2, 1).
+
+        Raises:
+            ModelError: The surface has none.
+        """
+        raise ModelError(
+            f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "
+            "expression"
+        )
+
+    @property
+    def shape(self) -> Mapping[str, float]:
+        """The numbers of its form that may vary: name -> default."""
+        return {}
+
+    def shaped(self, values: ca.SX) -> Self:
+        """The same surface with other numbers of `shape`, numbers or symbols, shape (k, 1)."""
+        return self
+
+    @property
+    def remark(self) -> str:
+        """What of it is approximate, and how much; empty if nothing is."""
+        return ""
+
+    @property
+    def extent(self) -> FloatArray | None:
+        """The least and the largest coordinates up to which it is given, shape (2, 2), or None."""
+        return None
+
+    def unit_normal(self, offset: ca.SX) -> ca.SX:
+        """The gradient of the distance at such a point, shape (3, 1): one long on the surface."""
+        p = ca.SX.sym("p", 3)
+        return ca.substitute(ca.gradient(self.distance(p), p), p, offset)
+
+    def picture(self, center: ArrayLike, size: float) -> Picture | None:
+        """What is to be seen of the surface, standing with its reference point at the origin.
+
+        Warns where Newton's method finds nothing of it near the center: it is then not drawn.
+
+        Args:
+            center: A point of interest, relative to the reference point, m, shape (3,).
+            size: How large a piece of it to draw if it has no end, m.
+        """
+        grid = self._patch(np.asarray(center, float), size)
+        if np.all(np.isfinite(grid), axis=2).sum() < 3:
+            warnings.warn(
+                f"{type(self).__name__}: no point of it is found within {size:.3g} m of "
+                f"{show(center)}, relative to its reference point; it is not drawn",
+                stacklevel=2,
+            )
+            return None
+        return Picture(mesh_of_grid(grid), RigidTransform())
+
+    def solid(self) -> Picture | None:
+        """What lies below the surface, standing with its reference point at the origin."""
+        return None
+
+    def _patch(self, center: FloatArray, size: float) -> FloatArray:
+        """A grid of points on the surface, shape (k, k, 3); NaN where there is none.
+
+        It is a grid of the tangent plane below `center`, each point brought onto the surface by
+        Newton's method.
+        """
+        p = ca.SX.sym("p", 3)
+        distance = self.distance(p)
+        function = TracedFunction(
+            "distance",
+            {"offset": p},
+            {"distance": distance, "gradient": ca.gradient(distance, p)},
+        )
+
+        def linearize(point: FloatArray) -> Linearization | None:
+            gradient = function(point)[1]
+            return shortest_steps(gradient[None], lambda x: function(x)[0])
+
+        def foot(point: FloatArray) -> FloatArray:
+            found, solved = newton(point, linearize)
+            near = solved and np.linalg.norm(found - point) <= size
+            return found if near else np.full(3, np.nan)
+
+        middle = foot(center)
+        if not np.all(np.isfinite(middle)):
+            middle = center
+        normal = function(middle)[1]
+        if not (np.all(np.isfinite(normal)) and normal.any()):
+            # A tip or an axis, where the distance has no gradient; beside it there is one.
+            normal = function(middle + size * np.array([0.07, 0.11, 0.13]))[1]
+        if not (np.all(np.isfinite(normal)) and normal.any()):
+            return np.full((1, 1, 3), np.nan)
+        first, second = tangents(normal / np.linalg.norm(normal))
+        steps = size * np.linspace(-0.5, 0.5, CELLS + 1)
+        return np.array([[foot(middle + a * first + b * second) for b in steps] for a in steps])
+
+
+def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Parameter, ...]]:
+    """A surface whose numbers of shape are symbols, and these as parameters "<name>.<number>".
+
+    Args:
+        name: The name of the constraint that has the parameters.
+        surface: The surface.
+    """
+    made = tuple(
+        Parameter(f"{name}.{key}", np.array([value])) for key, value in surface.shape.items()
+    )
+    if not made:
+        return surface, ()
+    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in made))), made
+
+
+def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across a unit vector, upright where possible.
+
+    For a vertical wall the first is horizontal and the second points up; for a horizontal plane
+    they are x and y.
+    """
+    n = np.asarray(normal, dtype=float)
+    if abs(n[2]) < 0.9:
+        second = np.array([0.0, 0.0, 1.0]) - n[2] * n
+        second /= np.linalg.norm(second)
+        return np.cross(n, second), second
+    first = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    first /= np.linalg.norm(first)
+    return first, np.cross(n, first)
+
+
+def axes_along(direction: ArrayLike) -> FloatArray:
+    """A rotation, shape (3, 3), whose z axis is a unit vector."""
+    z = np.asarray(direction, dtype=float)
+    x, _ = tangents(z)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def rotation_of(rpy: ca.SX) -> ca.SX:
+    """The rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of Drake's RollPitchYaw, shape (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = (ca.vertsplit(part) for part in (ca.cos(rpy), ca.sin(rpy)))
+    return ca.blockcat(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def triple(name: str, value: ArrayLike) -> Vector:
+    """Three finite numbers as a tuple.
+
+    Raises:
+        ModelError: They are not.
+    """
+    array = vector(name, value, 3)
+    return (float(array[0]), float(array[1]), float(array[2]))
+
+
+def unit_vector(name: str, value: ArrayLike) -> Vector:
+    """A direction of any length, made one long.
+
+    Raises:
+        ModelError: It is not three finite numbers, or zero.
+    """
+    array = np.array(triple(name, value))
+    length = float(np.linalg.norm(array))
+    if length == 0.0:
+        raise ModelError(f"{name} must not be zero")
+    # A unit vector stays as it is, so that what was saved reads back equal.
+    return triple(name, array if abs(length - 1.0) < 1e-15 else array / length)

@@ -1,0 +1,249 @@
+"""A closed loop's law, plant and projection as plain C99, for somebody's real-time loop."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from string import Template
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import Context
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.running.export.samples import Call, samples, tests
+from drake_dae.running.export.text import braced, comment, string
+from drake_dae.trace.compiled import generate
+from drake_dae.trace.functions import TracedFunction
+
+TEMPLATES = Path(__file__).parent / "c99"
+
+
+@dataclass(frozen=True, eq=False)
+class _Vector:
+    """A vector of the C code.
+
+    Attributes:
+        what: What it is, in words.
+        signals: Names and units of its entries.
+        default: What it is where nobody says otherwise, shape (k,); None if there is no such thing.
+    """
+
+    what: str
+    signals: Sequence[Signal]
+    default: FloatArray | None = None
+
+
+@checked(ModelError)
+def export_code(loop: ClosedLoop, context: Context, name: str, folder: str | Path) -> list[Path]:
+    """Writes the law, the plant and the projection of a closed loop as C99 without dependencies.
+
+    In the folder stand then: name.h with sizes, names and units; name.c; test_name.c, which
+    compares them with values that Python computed; a Makefile, whose `make` compiles and runs that;
+    and LICENSE.txt. Files of these names are overwritten.
+
+    Args:
+        loop: The closed loop.
+        context: Its context at the start, whose state and parameters the test program has too.
+        name: What the files are called, and, in letters that C takes, the functions.
+        folder: Where to write; made if there is none.
+
+    Returns:
+        The files.
+
+    Raises:
+        ModelError: No sample has values, so that nothing could be compared.
+        OSError: A file cannot be written.
+    """
+    plant, controller = loop.plant, loop.controller
+    law, structure = controller.law, plant.structure
+    plant_parameters = plant.current_parameters(plant.GetMyContextFromRoot(context))
+    law_parameters = controller.all_parameters(controller.GetMyContextFromRoot(context))
+    if not re.search("[A-Za-z]", name):
+        raise ModelError(f"a name of C has letters of A to Z, got {name!r}")
+    prefix = re.sub("[^A-Za-z0-9]+", "_", name).strip("_").lower()
+    if prefix[0].isdigit():
+        prefix = f"dae_{prefix}"
+    file = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
+    vectors = _vectors(law, structure, plant_parameters, law_parameters)
+    calls = _calls(law, structure)
+    generated = generate(
+        *(_renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
+    )
+    words = {
+        "title": comment(f"{structure.system.name} ({name})"),
+        "name": file,
+        "prefix": prefix,
+        "guard": prefix.upper(),
+        "version": version("drake_dae"),
+        "casadi": ca.__version__,
+        "vectors": "".join(_declared(prefix, *item) for item in vectors.items()),
+        "names": "".join(_defined(prefix, *item) for item in vectors.items()),
+        "law": calls["law"].signature,
+        "plant": calls["plant"].signature,
+        "generated": generated,
+        "calls": "".join(_called(prefix, *item) for item in calls.items()),
+        "residual": calls["residual"].signature,
+        "residuals": str(max(1, len(structure.manifold.residual_signals))),
+        **tests(prefix, calls, samples(loop, context, calls)),
+    }
+    names = {
+        "system.h": f"{file}.h",
+        "system.c": f"{file}.c",
+        "test.c": f"test_{file}.c",
+        "Makefile": "Makefile",
+        "LICENSE.txt": "LICENSE.txt",
+    }
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for template, target in names.items():
+        text = Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(words)
+        (folder / target).write_text(text, encoding="utf-8")
+    return [folder / target for target in names.values()]
+
+
+def _vectors(
+    law: TrackingLaw,
+    structure: ConstraintStructure,
+    plant_parameters: FloatArray,
+    law_parameters: FloatArray,
+) -> dict[str, _Vector]:
+    """All vectors of the C code, by their names there."""
+    system = structure.system
+    moves = "; what moves comes here, too, with its derivatives" if system.exogenous else ""
+    gains = [
+        Signal(f"K of {system.output_signals[i].name} for {chain.name}")
+        for j, chain in enumerate(law.coordinate_signals)
+        for i in np.flatnonzero(law.gains.matrix[:, j])
+    ]
+    vectors = {
+        "state": _Vector("x, the state", system.state_signals),
+        "control": _Vector("u, the control", system.control_signals),
+        "reference": _Vector("R, the references with their derivatives", law.reference_signals),
+        "measured_force": _Vector("v as it is measured", system.constraint_input_signals),
+        "tracking_error": _Vector("e = z - r (29)", system.output_signals),
+        "constraint_force": _Vector("v, the constraint inputs", system.constraint_input_signals),
+        "constraint_residual": _Vector("zero on N*", structure.manifold.residual_signals),
+        "controlled_output": _Vector("z, the controlled outputs", system.output_signals),
+        "parameters": _Vector(f"of the plant{moves}", _parameters(system), plant_parameters),
+        "law_parameters": _Vector(
+            "of the law's model, and then the gains",
+            [*_parameters(law.system), *gains],
+            law_parameters,
+        ),
+    }
+    if not law.measured_force:
+        del vectors["measured_force"]
+    if law.integral.outputs:
+        vectors["integral"] = _Vector("the integrals of errors", law.integral.signals)
+        rates = [Signal(f"d/dt {s.name}", s.unit.removesuffix(" s")) for s in law.integral.signals]
+        vectors["integral_rate"] = _Vector("their derivatives by the time", rates)
+    return vectors
+
+
+def _parameters(system: DaeSystem) -> list[Signal]:
+    """Names and units of all parameters, and of the derivatives of those that move."""
+    rates = [
+        signal.derivative(order)
+        for p in system.exogenous.moving
+        for order in range(1, len(p.derivatives) + 1)
+        for signal in p.signals
+    ]
+    return [signal for p in system.parameters for signal in p.signals] + rates
+
+
+def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
+    """The functions of the C code, by their names there."""
+    system, derivatives = structure.system, structure.derivatives
+    force = derivatives.expand(derivatives.constraint_input)
+    plant = system.trace(
+        "plant",
+        {
+            "rate": derivatives.expand(derivatives.rate),
+            "constraint_force": force,
+            "controlled_output": system.l + ca.mtimes(system.m, force),
+        },
+        {"control": derivatives.control},
+        structure.elimination.pivot,
+    )
+    residual = system.trace(
+        "residual", {"constraint_residual": structure.manifold.residual_expression}
+    )
+    own = structure.manifold.newton_step
+    inputs = {name: own.function.sx_in(i) for i, name in enumerate(own.input_names)}
+    moved = ca.SX(system.scale) * own.function(*inputs.values())[0]
+    step = TracedFunction("step to the manifold", inputs, {"step": moved}, often=False)
+    names = law.function.input_names
+    return {
+        "law": Call(law.function, [*names[:-1], "law_parameters"], law.function.output_names),
+        "plant": Call(plant, plant.input_names, plant.output_names),
+        "residual": Call(residual, residual.input_names, residual.output_names),
+        "newton_step": Call(step, step.input_names, step.output_names),
+    }
+
+
+def _renamed(function: ca.Function, name: str) -> ca.Function:
+    """The same function under a name of C."""
+    inputs = function.sx_in()
+    return ca.Function(name, inputs, function.call(inputs), {"cse": False})
+
+
+def _declared(prefix: str, name: str, vector: _Vector) -> str:
+    """What the header says of a vector."""
+    size = f"{prefix}_{name}_SIZE".upper()
+    width = max([len(comment(signal.name)) for signal in vector.signals], default=0)
+    lines = [f"/* {name}: {vector.what}"]
+    for index, signal in enumerate(vector.signals):
+        entry = f"     {index:3d}  {comment(signal.name).ljust(width)}  {comment(signal.unit)}"
+        lines.append(entry.rstrip())
+    lines[-1] += " */"
+    lines.append(f"enum {{ {size} = {len(vector.signals)} }};")
+    for what in ("names", "units"):
+        lines.append(f"extern const char *const {prefix}_{name}_{what}[{size} + 1];")
+    if vector.default is not None:
+        lines.append(f"extern const double {prefix}_default_{name}[{size} + 1];")
+    return "\n".join([*lines, "", ""])
+
+
+def _defined(prefix: str, name: str, vector: _Vector) -> str:
+    """The names, units and defaults of a vector."""
+    lines = []
+    for what in ("name", "unit"):
+        texts = [string(getattr(signal, what)) for signal in vector.signals]
+        lines.append(f"const char *const {prefix}_{name}_{what}s[] = {braced([*texts, '0'])};")
+    if vector.default is not None:
+        values = braced([*map(repr, vector.default.tolist()), "0.0"])
+        lines.append(f"const double {prefix}_default_{name}[] = {values};")
+    return "\n".join([*lines, ""])
+
+
+def _called(prefix: str, name: str, call: Call) -> str:
+    """The C function that calls what CasADi generated."""
+    traced = f"{prefix}_traced_{name}"
+    function = call.function.function
+    kind = f"static int {name}" if name == "newton_step" else f"int {prefix}_{name}"
+    own, count = len(call.outputs), len(call.inputs)
+    # Without a matrix that must be regular its pivot is 1, and there is no check of it.
+    checks = ["&pivot", "&finite", "&valid"][: function.n_out() - own]
+    lines = [
+        f"{kind}({call.signature}) {{",
+        "  double pivot = 1.0, finite = 0.0, valid = 0.0;",
+        f"  const double *arg[{max(count, function.sz_arg())}] = {braced(call.inputs)};",
+        f"  static const int sizes[{count}] = {braced(list(map(str, call.function.sizes)))};",
+        f"  double *res[{function.sz_res()}] = {braced([*call.outputs, *checks])};",
+        f"  {traced}(arg, res, 0, 0, 0);",
+        "  (void)valid;",
+        f"  return status(pivot, finite, {count}, arg, sizes);",
+        "}",
+        "",
+        "",
+    ]
+    return "\n".join(lines)

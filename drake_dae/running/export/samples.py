@@ -1,0 +1,153 @@
+"""Inputs and outputs that Python computed, and the part of the test program that compares them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.running.export.text import braced
+from drake_dae.trace.functions import TracedFunction
+
+SAMPLES = 10
+"""How many inputs the test program has for each function."""
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A function of the C code.
+
+    Attributes:
+        function: What it computes.
+        inputs, outputs: What its arguments are called in C, in the order of the function's.
+    """
+
+    function: TracedFunction
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+    @property
+    def signature(self) -> str:
+        """The arguments as C declares them."""
+        inputs = [f"const double *{name}" for name in self.inputs]
+        return ", ".join([*inputs, *(f"double *{name}" for name in self.outputs)])
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Inputs and outputs of a function, by the names of its arguments."""
+
+    inputs: Mapping[str, FloatArray]
+    outputs: Mapping[str, FloatArray]
+
+
+def samples(
+    loop: ClosedLoop, context: Context, calls: Mapping[str, Call]
+) -> dict[str, list[Sample]]:
+    """Inputs and outputs of all functions: at the start, and at states near and on N*.
+
+    Raises:
+        ModelError: No sample of a function has values.
+    """
+    plant, manifold = loop.plant, loop.plant.structure.manifold
+    random = np.random.default_rng(0)
+    own = plant.GetMyContextFromRoot(context)
+    start, given = plant.state(own), plant.current_parameters(own)
+    model = loop.controller.all_parameters(loop.controller.GetMyContextFromRoot(context))
+    states = [start, *plant.structure.states][:SAMPLES]
+    found: dict[str, list[Sample]] = {name: [] for name in (*calls, "project")}
+    for index, state in enumerate(states):
+        near = state + 1e-4 * random.normal(size=state.size) * np.maximum(1.0, np.abs(state))
+        time = context.get_time() + 0.1 * index
+        values = {
+            "state": state,
+            "other": states[0],
+            "reference": loop.reference.reference(time),
+            "measured_force": random.normal(size=plant.dae.num_constraints),
+            "integral": random.normal(size=len(loop.controller.law.integral.outputs)),
+            "parameters": given,
+            "law_parameters": model,
+            "control": np.zeros(plant.dae.num_controls),
+        }
+        for name, call in calls.items():
+            # The residual on N* is but round-off.
+            values["state"] = near if name == "residual" else state
+            results = call.function(*(values[source] for source in call.inputs))
+            if not call.function.is_valid:
+                continue
+            outputs = dict(zip(call.outputs, results, strict=True))
+            inputs = {source: values[source] for source in call.inputs}
+            found[name].append(Sample(inputs, outputs))
+            if name == "law":
+                values["control"] = outputs["control"]
+        try:
+            projected = manifold.project(near, given)
+        except InconsistentStateError:
+            continue
+        found["project"].append(
+            Sample({"state": near, "parameters": given}, {"projected": projected})
+        )
+    empty = [name for name, samples in found.items() if not samples]
+    if empty:
+        raise ModelError(
+            f"{plant.dae.name}: nothing to compare: {', '.join(empty)} has no values at the start "
+            "nor at any state where the structure was examined"
+        )
+    return found
+
+
+def tests(
+    prefix: str, calls: Mapping[str, Call], samples: Mapping[str, Sequence[Sample]]
+) -> dict[str, str]:
+    """The data of the test program, and its comparisons."""
+    data, checks = [], []
+
+    def table(name: str, rows: Sequence[FloatArray]) -> str:
+        width = max(1, rows[0].size)
+        lines = ",\n".join(braced([*map(repr, row.tolist())] or ["0.0"]) for row in rows)
+        data.append(f"static const double {name}[{len(rows)}][{width}] = {{\n{lines}}};\n")
+        return f"{name}[k]"
+
+    def compare(what: str, wanted: str, rows: Sequence[FloatArray]) -> str:
+        scale = max((float(np.max(np.abs(row), initial=0.0)) for row in rows), default=0.0)
+        place = f"k, {rows[0].size}, found_{what}, {wanted}, {scale!r}"
+        return f'      failures += differs("{what}", {place});'
+
+    for name, call in calls.items():
+        if name == "newton_step":  # Static; what calls it is compared.
+            continue
+        own = samples[name]
+        inputs = [table(f"{name}_{key}", [s.inputs[key] for s in own]) for key in call.inputs]
+        sizes = {key: max(1, own[0].outputs[key].size) for key in call.outputs}
+        arguments = ", ".join([*inputs, *(f"found_{key}" for key in call.outputs)])
+        checks += [
+            f"  for (k = 0; k < {len(own)}; k++) {{",
+            *(f"    double found_{key}[{size}];" for key, size in sizes.items()),
+            f'    if (refused("{name}", k, {prefix}_{name}({arguments}))) {{',
+            "      failures++;",
+            "    } else {",
+        ]
+        for key in call.outputs:
+            rows = [s.outputs[key] for s in own]
+            checks.append(compare(key, table(f"{name}_wanted_{key}", rows), rows))
+        checks += ["    }", "  }"]
+    own = samples["project"]
+    near = table("project_state", [s.inputs["state"] for s in own])
+    given = table("project_parameters", [s.inputs["parameters"] for s in own])
+    rows = [s.outputs["projected"] for s in own]
+    checks += [
+        f"  for (k = 0; k < {len(own)}; k++) {{",
+        f"    double found_projected[{rows[0].size}];",
+        f"    memcpy(found_projected, {near}, sizeof(found_projected));",
+        f'    if (refused("project", k, {prefix}_project(found_projected, {given}))) {{',
+        "      failures++;",
+        "    } else {",
+        compare("projected", table("project_wanted", rows), rows),
+        "    }",
+        "  }",
+    ]
+    count = sum(len(rows) for name, rows in samples.items() if name != "newton_step")
+    return {"data": "".join(data), "checks": "\n".join(checks), "count": str(count)}

@@ -1,0 +1,206 @@
+"""A run under way without machine code: where it is, and what is kept of it."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy.integrate import DOP853
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import InconsistentStateError
+from drake_dae.running.rollout.dense import Span, fill
+from drake_dae.running.rollout.fused import Fused
+from drake_dae.running.rollout.many import BLOCK
+from drake_dae.running.rollout.run import Ending, Problem, Run
+from drake_dae.systems.blocks.trials import SLOWEST, STEPS
+
+REACHED = 1e-11
+"""A Newton step longer than this, the second, says that N* was not reached in two."""
+
+
+class Ended(Exception):
+    """The run cannot go on."""
+
+    def __init__(self, ending: Ending) -> None:
+        self.ending = ending
+
+
+class Step(NamedTuple):
+    """A step of DOP853.
+
+    Attributes:
+        end, size: Where it leads to, and how long it is, in s.
+        reached: The state there.
+        rate: Its derivative there.
+        stages: The derivatives at its stages, shape (12, n), written over by the next step.
+        is_on: Whether the state is on N*.
+        following: The step to try next, in s.
+        rejected: Whether a longer one was rejected.
+    """
+
+    end: float
+    size: float
+    reached: FloatArray
+    rate: FloatArray
+    stages: FloatArray
+    is_on: bool
+    following: float
+    rejected: bool
+
+
+class Rows(NamedTuple):
+    """Rows of a record to be.
+
+    Attributes:
+        times: Their times in s, shape (k,).
+        states: The states, shape (k, n).
+        hold: What the sensor holds in all of them.
+        between: Whether an interpolant gave them, so that they are not on N*.
+    """
+
+    times: FloatArray
+    states: FloatArray
+    hold: FloatArray
+    between: bool
+
+    def without_last(self) -> Self:
+        """The same without the last one."""
+        return self._replace(times=self.times[:-1], states=self.states[:-1])
+
+
+@dataclass(eq=False)
+class Course:
+    """A run under way; see `Run` and `Problem`."""
+
+    fused: Fused
+    problem: Problem
+    time: float
+    state: FloatArray
+    hold: FloatArray
+    rows: list[Rows] = field(default_factory=list)
+    spans: list[Span] = field(default_factory=list)
+    event: int = 0
+    steps: int = 0
+    before: float = 0.0
+    mark: float = 0.0
+    next: float = 0.0
+    trial_time: float = np.inf
+    trial: FloatArray = field(default_factory=lambda: np.full(1, np.nan))
+
+    def rate(self, time: float, state: FloatArray) -> FloatArray:
+        """The derivative; nan where it has no value, and the earliest such trial is kept."""
+        values = self.fused.rate(time, state, self.hold, self.problem.plant, self.problem.law)
+        if np.isnan(values[0]) and time < self.trial_time and np.isfinite(state).all():
+            self.trial_time, self.trial = time, state.copy()
+        return values
+
+    def accepted_rate(self) -> FloatArray:
+        """The derivative at the accepted state."""
+        values = self.rate(self.time, self.state)
+        if np.isnan(values[0]):
+            raise Ended(Ending.INVALID)
+        return values
+
+    def projected(self, time: float, state: FloatArray) -> FloatArray:
+        """A state on N*."""
+        if not self.fused.functions.loop.plant.projects:
+            return state
+        states, left = self.fused.projections(np.array([time]), state[None], self.problem.plant)
+        if left[0] <= REACHED:
+            return states[0]
+        try:
+            found = self.problem.project(time, state)
+        except InconsistentStateError:
+            raise Ended(Ending.OFF_MANIFOLD) from None
+        return np.concatenate([found, state[found.size :]])
+
+    def note_stages(self, rate: FloatArray, size: float) -> None:
+        """Evaluates the stages of a step of DOP853 one by one, to keep the trial that fails."""
+        rates = [rate]
+        for row, part in zip(DOP853.A[1:], DOP853.C[1:], strict=True):
+            stage = self.state + size * (row[: len(rates)] @ np.array(rates))
+            rates.append(self.rate(self.time + part * size, stage))
+
+    def update(self, *, is_on: bool = False) -> bool:
+        """What happens at the start of a step: the projection, then samples; whether there are any.
+
+        Args:
+            is_on: Whether the state is on N* already.
+        """
+        if not is_on:
+            self.state = self.projected(self.time, self.state)
+        problem, before = self.problem, self.event
+        while self.event < problem.events.size and problem.events[self.event] <= self.time:
+            noise = problem.noise[self.event]
+            self.hold = self.fused.sample(
+                self.time, self.state, self.hold, noise, problem.plant, problem.law
+            )
+            if not np.isfinite(self.hold).all():
+                raise Ended(Ending.INVALID)
+            self.event += 1
+        return self.event > before
+
+    def accept(self, time: float, state: FloatArray) -> None:
+        """Takes over a step; refuses one in a thousand that hardly led on."""
+        self.time, self.state = time, state
+        self.steps += 1
+        self.trial_time = np.inf
+        if self.steps % STEPS == 0:
+            self.before, self.mark = self.mark, time
+            if time - self.before < SLOWEST * (time - self.problem.times[0]):
+                raise Ended(Ending.SLOW)
+
+    def write(self, time: float, state: FloatArray) -> None:
+        """Keeps a row of the record."""
+        self.rows.append(Rows(np.array([time]), state[None], self.hold, False))
+
+    def write_between(self, step: "Step", times: FloatArray) -> None:
+        """Keeps rows that lie within a step, for its interpolant to be computed with others."""
+        found = np.zeros((times.size, self.state.size))
+        rates = np.concatenate([step.stages, step.rate[None]])
+        ends = self.time, step.size, self.state, step.reached
+        self.spans.append(Span(*ends, rates, self.hold, times, found))
+        self.rows.append(Rows(times, found, self.hold, True))
+        if len(self.spans) == BLOCK:
+            self.fill()
+
+    def fill(self) -> None:
+        """Computes the rows within steps."""
+        fill(self.spans, self.fused.rates, self.problem.plant, self.problem.law)
+        self.spans.clear()
+
+    def boundary(self) -> float:
+        """The next time at which a sample changes what is held, or the last one."""
+        end, events = float(self.problem.times[-1]), self.problem.events
+        return min(end, float(events[self.event])) if self.event < events.size else end
+
+    def finish(self, ending: Ending) -> Run:
+        """What the run came to."""
+        self.fill()
+        counts = [len(rows.times) for rows in self.rows]
+        times = np.concatenate([rows.times for rows in self.rows])
+        states = np.concatenate([rows.states for rows in self.rows])
+        holds = np.repeat([rows.hold for rows in self.rows], counts, axis=0)
+        between = np.repeat([rows.between for rows in self.rows], counts)
+        if self.fused.functions.loop.plant.projects and between.any():
+            apart = np.flatnonzero(between)
+            found, left = self.fused.projections(times[apart], states[apart], self.problem.plant)
+            for index in np.flatnonzero(~(left <= REACHED)):
+                found[index] = self.projected(times[apart[index]], states[apart[index]])
+            states[apart] = found
+        rows, valid = self.fused.rows(times, states, holds, self.problem.plant, self.problem.law)
+        count = int(np.argmin(np.append(valid, False)))
+        if count < len(valid):
+            ending = Ending.INVALID
+            self.time, self.state = self.trial_time, self.trial = times[count], states[count]
+        return Run(
+            rows[:count],
+            ending,
+            self.time,
+            self.state,
+            self.steps,
+            self.before,
+            self.next,
+            self.trial_time,
+            self.trial,
+        )

@@ -1,0 +1,235 @@
+"""A closed loop as functions of CasADi's interpreter: its derivative, its steps, its record."""
+
+from collections.abc import Sequence
+from math import isfinite
+
+import casadi as ca
+import numpy as np
+from scipy.integrate import DOP853
+
+from drake_dae.arrays import FloatArray
+from drake_dae.running.rollout.functions import LoopFunctions
+from drake_dae.running.rollout.many import Many
+from drake_dae.running.rollout.run import Tableau
+
+CHUNK = 64
+"""So many fixed steps are one call of CasADi."""
+
+
+class Called:
+    """A CasADi function that is called on arrays of its own; a column of its is a row of these.
+
+    Args:
+        function: The function; its inputs and outputs are dense.
+
+    Attributes:
+        results: Its outputs, written over by each call, shapes (n,) or (k, n).
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        def array(shape: tuple[int, int]) -> FloatArray:
+            return np.zeros(shape[::-1] if shape[1] > 1 else shape[0])
+
+        self._arrays = [array(function.size_in(i)) for i in range(function.n_in())]
+        self.results = [array(function.size_out(i)) for i in range(function.n_out())]
+        self._buffer, self._evaluate = function.buffer()
+        for index, own in enumerate(self._arrays):
+            self._buffer.set_arg(index, own.reshape(-1).data)
+        for index, own in enumerate(self.results):
+            self._buffer.set_res(index, own.reshape(-1).data)
+
+    def __call__(self, *arguments: FloatArray | float) -> list[FloatArray]:
+        """The outputs."""
+        for array, given in zip(self._arrays, arguments, strict=True):
+            array[...] = given
+        self._evaluate()
+        return self.results
+
+
+class Fused:
+    """Plant, law, references and sensor as one function.
+
+    All functions take the time, the state with that of the sensor and the law's integrals, what the
+    sensor holds (or its noise), and the parameters of plant and law.
+
+    Attributes:
+        functions: The closed loop.
+        controlled: A step of DOP853, as `controlled_step` has it.
+        rates: The derivative of the state at many moments, and what `rate` has with it.
+    """
+
+    def __init__(self, functions: LoopFunctions) -> None:
+        self.functions = functions
+        loop, dae = functions.loop, functions.loop.plant.dae
+        size = functions.size
+        self._sizes = sizes = (
+            1,
+            size,
+            dae.num_constraints,
+            functions.plant.sizes[-1],
+            functions.law.sizes[-1],
+        )
+        names = ("time", "state", "hold", "plant", "law")
+        inputs = [ca.SX.sym(name, count) for name, count in zip(names, sizes, strict=True)]
+        time, state, hold, plant, law = inputs
+        reference, moving, of_law, *checks = functions.signals.function(time)
+        if loop.exogenous is not None:
+            plant, law = ca.SX(plant), ca.SX(law)
+            plant[loop.plant.exogenous_places] = moving
+            law[loop.controller.exogenous_places] = of_law
+        options = {"cse": False}
+        rate, force, valid = functions.rate(state, reference, hold, plant, law)
+        self._rate = ca.Function("rate", inputs, [rate, force, valid + checks[-1]], options)
+        row, valid = functions.row(state, reference, hold, plant, law, moving)
+        row = ca.cse([row, valid + checks[-1]])
+        self._rows = Many(ca.Function("rows", inputs, row, options))
+        self._projection = self._project_function()
+        self._projections = Many(self._projection)
+        self._steps: dict[bytes, tuple[Called, Called]] = {}
+        self._called = Called(self._rate)
+        self.controlled = Called(self._controlled_step())
+        self.rates = Many(self._rate)
+
+    def rate(self, *arguments: FloatArray | float) -> FloatArray:
+        """The derivative of the state, a fresh array; nan where it has no value."""
+        rate, _, valid = self._called(*arguments)
+        values = rate.copy()
+        if not isfinite(valid[0]):
+            values[:] = np.nan
+        return values
+
+    def sample(
+        self,
+        time: float,
+        state: FloatArray,
+        hold: FloatArray,
+        noise: FloatArray,
+        plant: FloatArray,
+        law: FloatArray,
+    ) -> FloatArray:
+        """What the sensor holds from now on; not finite where the force has no value."""
+        sensor = self.functions.loop.sensor
+        if sensor is None or not sensor.sample_period:
+            return noise
+        if self.functions.num_lags:
+            force = self.functions.felt(state)
+        else:
+            rate = self.rate(time, state, hold, plant, law)
+            force = self._called.results[1] + rate[0] * 0.0
+        return force + sensor.bias + sensor.noise_deviation * noise
+
+    def rows(
+        self,
+        times: FloatArray,
+        states: FloatArray,
+        holds: FloatArray,
+        plant: FloatArray,
+        law: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Rows of the record, and which of them have values.
+
+        Args:
+            times: Their times, shape (k,).
+            states: The states, shape (k, n).
+            holds: What the sensor holds, shape (k, m).
+            plant, law: The parameters.
+        """
+        rows, valid = self._rows(times[:, None], states, holds, plant, law)
+        return rows, np.isfinite(valid[:, 0])
+
+    def projections(
+        self, times: FloatArray, states: FloatArray, plant: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """States after two Newton steps to N*, shape (k, n), and the lengths of the last ones.
+
+        Args:
+            times: Their times, shape (k,).
+            states: The states, shape (k, n).
+            plant: The plant's parameters.
+        """
+        found, left = self._projections(times[:, None], states, plant)
+        return found, left[:, 0]
+
+    def steps(self, tableau: Tableau) -> tuple[Called, Called]:
+        """A fixed step, as `_step` has it, and many of them as one function.
+
+        Args:
+            tableau: The method.
+        """
+        key = tableau.a.tobytes() + tableau.b.tobytes()
+        if key not in self._steps:
+            one = self._step(tableau)
+            self._steps[key] = Called(one), Called(one.mapaccum("steps", CHUNK, 1))
+        return self._steps[key]
+
+    def _symbols(self) -> list[ca.MX]:
+        return [ca.MX.sym("x", size) for size in self._sizes]
+
+    def _step(self, tableau: Tableau) -> ca.Function:
+        """A fixed step: the projection by two Newton steps, then a Runge-Kutta step.
+
+        A function of state, time, step, what is held, and parameters; it returns the state, and
+        below each other what is finite if all has values, and the length of the last Newton step.
+        """
+        time, state, hold, plant, law = self._symbols()
+        step = ca.MX.sym("step")
+        symbols = [state, time, step, hold, plant, law]
+        state, left = self._projection(time, state, plant)
+        rates: list[ca.MX] = []
+        finite = ca.MX(0.0)
+        for row, part in zip(tableau.a, tableau.c, strict=True):
+            stage = state + step * _weighted(row, rates)
+            rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
+            rates.append(rate)
+            finite += valid
+        reached = state + step * _weighted(tableau.b, rates)
+        checks = ca.vertcat(finite + ca.sum1(reached), left)
+        return ca.Function("step", symbols, [reached, checks])
+
+    def _controlled_step(self) -> ca.Function:
+        """A step of DOP853 from a state on N* to the next one.
+
+        A function of what all functions take, of the rate there, the step, and the absolute and the
+        relative error that it may make. It returns the state that is reached, on N*; the rate
+        there; below each other the squares of both error estimates over what they may be, what is
+        finite if all stages have values, the length of the last Newton step, and what is finite if
+        the rate has a value; and the rates of all stages side by side.
+        """
+        symbols = time, state, hold, plant, law = self._symbols()
+        first, step = ca.MX.sym("first", self._sizes[1]), ca.MX.sym("step")
+        absolute, relative = ca.MX.sym("absolute", self._sizes[1]), ca.MX.sym("relative")
+        rates, finite = [first], ca.MX(0.0)
+        for row, part in zip(DOP853.A[1:], DOP853.C[1:], strict=True):
+            stage = state + step * _weighted(row, rates)
+            rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
+            rates.append(rate)
+            finite += valid
+        reached = state + step * _weighted(DOP853.B, rates)
+        unit = absolute + ca.fmax(ca.fabs(state), ca.fabs(reached)) * relative
+        errors = [ca.sumsqr(_weighted(e, rates) / unit) for e in (DOP853.E5, DOP853.E3)]
+        found, left = self._projection(time + step, reached, plant)
+        last, _, valid = self._rate(time + step, found, hold, plant, law)
+        checks = ca.vertcat(*errors, finite, left, valid)
+        symbols = [*symbols, first, step, absolute, relative]
+        return ca.Function("controlled", symbols, [found, last, checks, ca.horzcat(*rates)])
+
+    def _project_function(self) -> ca.Function:
+        """(t, state, the plant's parameters) -> the state on N*, as `projection` has it."""
+        functions, loop = self.functions, self.functions.loop
+        sizes = [1, functions.size, functions.plant.sizes[-1]]
+        symbols = [ca.SX.sym("x", size) for size in sizes]
+        time, state, plant = symbols
+        x, left = state[: loop.plant.dae.num_states], ca.SX(0.0)
+        if loop.plant.projects:
+            own = ca.SX(plant)
+            if loop.exogenous is not None:
+                own[loop.plant.exogenous_places] = functions.signals.function(time)[1]
+            x, left = functions.projection(2)(x, own)
+        found = ca.densify(ca.vertcat(x, state[loop.plant.dae.num_states :]))
+        return ca.Function("projection", symbols, [found, ca.densify(left)], {"cse": False})
+
+
+def _weighted(weights: FloatArray, rates: Sequence[ca.MX]) -> ca.MX:
+    """The weighted sum of rates; weights that are zero, or too many, count for nothing."""
+    pairs = zip(weights.tolist(), rates, strict=False)
+    return sum((weight * rate for weight, rate in pairs if weight), ca.MX(0.0))

@@ -1,0 +1,136 @@
+"""What a scenario with Drake's own contact uses where it does not say how the law is tuned."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from drake_dae.dae.beyond.contact_gains import contact_gains
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.errors import ScenarioError
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario import parts as parts
+from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
+
+_FORCE = 10.0
+"""The force in N at which a patch has the stiffness that is meant."""
+
+_NOISE = 1e-3
+"""The deviation of velocities in rad/s that is expected where no encoders tell it."""
+
+_DIGITS = 3
+"""To so many digits numbers are advised."""
+
+
+def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
+    """A scenario whose law is tuned by `contact_gains`, as far as it says nothing of its own.
+
+    That is where `gains` are left out and the plant is Drake's own contact: then gains, the
+    integrals of forces and of points along them, damping of the constraint, an observer of what the
+    model lacks and of friction, and measured force, as far as each is left out.
+
+    Args:
+        scenario: The scenario, with all of its outputs.
+        model: Its robot.
+        structure: The structure of the model's system.
+
+    Returns:
+        The scenario, the same where nothing is advised, and what was chosen in words.
+
+    Raises:
+        ScenarioError: Nothing is known to advise, since there are stages of actuation.
+    """
+    material = scenario.plant
+    if not (scenario.is_advised and isinstance(material, ContactMaterial)):
+        return Completed(scenario)
+    if model.stages:
+        raise ScenarioError(
+            (
+                "gains",
+                "behind springs, motors and valves nothing is advised for Drake's own contact; say "
+                "them, with integral and observer. The scenario wall_flexible_contact tells how",
+            )
+        )
+    sampling = scenario.sampling
+    period = material.time_step if sampling is None else sampling.period
+    late = 0 if sampling is None else sampling.late_samples
+    mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
+    stiffness = _stiffness(material)
+    noise = _NOISE
+    if scenario.encoders is not None:
+        noise = float(np.max(scenario.encoders.velocity_deviation(period))) or _NOISE
+    found = contact_gains(stiffness, mobility, period, late, noise)
+    names = [signal.name for signal in model.dae.output_signals]
+    positions, forces = np.split(np.array(names), [len(model.position_signals)])
+    points = _moved(model)
+    integral = scenario.integral
+    if integral is None:
+        integral = [name for name in positions if name in points] + forces.tolist()
+    force = scenario.force
+    if not force.is_measured:
+        force = parts.MeasuredForce(sample_period=period)
+    # A force of degree 0 has a gain where it is integrated, and none otherwise.
+    of_forces = {name: [_rounded(found.force_gain)] for name in forces.tolist() if name in integral}
+    of_positions = {
+        name: [_rounded(gain) for gain in found.position_gains(3 if name in integral else 2)]
+        for name in positions.tolist()
+    }
+    gains = parts.Coefficients(outputs=of_positions | of_forces)
+    damping = scenario.constraint_damping
+    if damping is None and found.constraint_damping:
+        damping = parts.Poles(all=[-_rounded(found.constraint_damping)])
+    observer = scenario.observer
+    if observer is None:
+        rubbing = [c.name for c in model.constraints if c.friction_parameter]
+        observer = parts.Observer(
+            rate=_rounded(found.observer_rate),
+            force_rate=_rounded(found.observer_force_rate),
+            friction_rate=_rounded(found.friction_rate),
+            friction=rubbing,
+        )
+    chosen = replace(
+        scenario,
+        gains=gains,
+        integral=integral,
+        constraint_damping=damping,
+        observer=observer,
+        force=force,
+    )
+    known = ", ".join(observer.friction) or "none"
+    note = (
+        f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
+        f"{period:g} s and velocities within {noise:.2g} rad/s: "
+        f"Butterworth's poles of positions at {_rounded(found.position_rate):g} 1/s, and of "
+        f"forces one at {-_rounded(found.force_gain):g} 1/s, with integrals of "
+        f"{', '.join(integral)}, damping of the constraint "
+        f"{_rounded(found.constraint_damping):g} 1/s, an observer of "
+        f"{observer.rate:g} 1/s that identifies the friction of: {known}"
+    )
+    return Completed(chosen, (note,))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def _moved(model: RobotModel) -> list[str]:
+    """The names of outputs that are coordinates of points."""
+    return [
+        signal.name
+        for output in model.positions
+        for signal in output.signals(model.links)
+        if signal.unit == "m"
+    ]
+
+
+def _stiffness(material: ContactMaterial) -> float:
+    """How stiff a contact is, in N/m.
+
+    A ball of radius R that is pressed by d into a layer with the pressure E s / h at depth s has a
+    patch of the radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h).
+    """
+    if material.contact_model == "point":
+        return material.stiffness
+    pressure = np.pi * material.modulus * material.radius / material.thickness
+    return float(2.0 * np.sqrt(pressure * _FORCE))

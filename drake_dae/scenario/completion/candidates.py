@@ -1,0 +1,144 @@
+"""Outputs that may complete those of a scenario."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+
+from drake_dae.dae.system.signals import Signal
+from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.outputs import (
+    AxisCoordinates,
+    JointPositions,
+    PointCoordinates,
+    PositionOutput,
+)
+from drake_dae.scenario import parts as parts
+from drake_dae.scenario.completion.postures import Posture
+from drake_dae.scenario.completion.tool_axis import ToolAxis, tool_axis
+from drake_dae.scenario.scenario import Output, Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a robot touches a surface: the constraint's name, the point, the tool's axis there."""
+
+    constraint: str
+    touch: Touch
+    axis: ToolAxis
+
+
+class Candidates:
+    """The rows that are given, and after them those that may complete them, one output each.
+
+    Args:
+        scenario: The scenario.
+        links: Its robot.
+        given: The outputs that it gives.
+        bound: What the robot touches.
+
+    Attributes:
+        signals: Names and units of all rows.
+        expression: All rows, shape (c, 1).
+        outward: Where tools touch, and their outward axes in the world, shape (3, 1).
+        tilts: The rows that are zero where tools are normal to their surfaces; none if `tool_axis`
+            of the scenario is free.
+        axes: The rows of the tools' directions that may be outputs, by `tool_axis`.
+        joints: The rows of positions of joints.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        links: Links,
+        given: Sequence[PositionOutput],
+        bound: ConstraintSet,
+    ) -> None:
+        self._forms: list[Output] = []
+        self.signals: list[Signal] = [s for output in given for s in output.signals(links)]
+        self._given = len(self.signals)
+        rows = [output.expression(links) for output in given]
+        touching = [(c.name, c.touch(links)) for c in bound.constraints]
+        places = [_Place(name, t, tool_axis(links, t)) for name, t in touching if t is not None]
+
+        def add(forms: Iterable[Output]) -> list[int]:
+            first = len(self.signals)
+            for form in forms:
+                output = parts.made(form, bound.constraints)
+                rows.append(output.expression(links))
+                self._forms.append(form)
+                self.signals += output.signals(links)
+            return list(range(first, len(self.signals)))
+
+        self._points = [add(_points(place, {s.name for s in self.signals})) for place in places]
+        kind = scenario.tool_axis
+        self.tilts = add(form for place in places for form in _tilts(place) if kind != "free")
+        fixed = [form for place in places for form in _directions(place) if kind == "fixed"]
+        self.axes = add(fixed) if fixed else self.tilts
+        self.joints = add(JointPositions([signal.name]) for signal in links.position_signals)
+        self.expression = ca.vertcat(ca.SX(0, 1), *rows)
+        self.outward = [
+            (p.touch, p.axis.sign * links.rotation(p.touch.frame)[:, p.axis.column]) for p in places
+        ]
+
+    def points(self, posture: Posture) -> list[int]:
+        """The rows along each surface: of the world's axes all but that closest to the normal."""
+        normals = abs(posture.normals.reshape(-1, 3))
+        across = normals.argmax(axis=1)
+        return [
+            row
+            for rows, axis in zip(self._points, across, strict=True)
+            for k, row in enumerate(rows)
+            if k != axis
+        ]
+
+    def form(self, row: int) -> Output:
+        """How a scenario writes a row that completes."""
+        return self._forms[row - self._given]
+
+
+def _points(place: _Place, taken: set[str]) -> list[Output]:
+    frame, point = place.touch.frame, place.touch.point
+    # A name stands once: that of the constraint is free where the frame's is taken.
+    named = ((axis, f"{frame}.{axis}" in taken) for axis in "xyz")
+    return [
+        PointCoordinates(frame, axis, point, f"{place.constraint}_point" if is_taken else "")
+        for axis, is_taken in named
+    ]
+
+
+def _tilts(place: _Place) -> list[Output]:
+    axis = place.axis.axis
+    others = "xyz".replace(axis, "")
+    return [parts.TiltFromNormal(place.constraint, axis, one) for one in others]
+
+
+def _directions(place: _Place) -> list[Output]:
+    return [AxisCoordinates(place.touch.frame, place.axis.axis, one) for one in "xyz"]
+
+
+_JOINED = {
+    PointCoordinates: "axes",
+    AxisCoordinates: "components",
+    parts.TiltFromNormal: "components",
+    JointPositions: "joints",
+}
+"""Which attribute of an output holds its rows."""
+
+
+def merged(forms: Iterable[Output]) -> list[Output]:
+    """The same rows in fewer outputs: those that differ in what rows they have become one."""
+    found: list[Any] = []
+    for form in forms:
+        key = _JOINED[type(form)]
+        own = getattr(form, key)
+        if found and type(found[-1]) is type(form):
+            both = getattr(found[-1], key) + own
+            if replace(found[-1], **{key: both}) == replace(form, **{key: both}):
+                found[-1] = replace(form, **{key: both})
+                continue
+        found.append(form)
+    return found

@@ -1,0 +1,373 @@
+"""What a scenario leaves open: outputs that are missing, and where the robot starts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.references import Reference
+from drake_dae.dae.references.by_name import meant
+from drake_dae.errors import ReferenceSignalError, ScenarioError
+from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.force_outputs import force_outputs, force_rows
+from drake_dae.robots.links.links import Links
+from drake_dae.scenario import parts as parts
+from drake_dae.scenario.completion.candidates import Candidates, merged
+from drake_dae.scenario.completion.choice import best_joints, first_independent
+from drake_dae.scenario.completion.postures import Posture, Postures
+from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.scenario.scenario import Scenario
+
+REGULAR = 1e-3
+"""A start whose `independence` is less is singular."""
+
+_TIMES = 25
+"""At so many times along the reference choices are compared."""
+
+_DIGITS = 4
+"""Decimals of m and rad with which a start is written."""
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A scenario of which nothing is left open.
+
+    Attributes:
+        scenario: The scenario.
+        notes: What was chosen, a line each; none if there was nothing to choose.
+    """
+
+    scenario: Scenario
+    notes: tuple[str, ...] = ()
+
+
+def complete(
+    scenario: Scenario,
+    links: Links,
+    constraints: Sequence[Constraint],
+    of_plant: Sequence[Constraint],
+    guess: FloatArray,
+) -> Completed:
+    """Chooses the outputs that a scenario leaves out, and where the robot starts.
+
+    Outputs are missing where they are, with the force outputs, fewer than the actuators. Those that
+    complete them are, as far as each is independent of the ones before: the world coordinates along
+    the surface of each point that touches one; what `tool_axis` holds of the tool's direction; and
+    positions of joints, of which that set is taken that keeps B(x) best conditioned, and joints off
+    their limits, along the reference. What has no reference holds the value that it starts with.
+
+    Without start.positions the robot starts where its default configuration leads by Newton's
+    method, or else, of 60 tries, in the posture of best `quality` with the first values of the
+    references.
+
+    Args:
+        scenario: The scenario.
+        links: Its robot.
+        constraints: Its constraints.
+        of_plant: Those that the robot's file has.
+        guess: The default configuration with start.positions, shape (nq,).
+
+    Raises:
+        ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
+    """
+    bound = ConstraintSet([*constraints, *of_plant])
+    given = [parts.made(form, constraints) for form in scenario.outputs]
+    size = sum(len(output.signals(links)) for output in given)
+    steered = force_outputs(scenario.forces, bound)
+    names = [signal.name for output in steered for signal in output.signals(bound)]
+    S = force_rows(steered, bound, links)
+    actuators = len(links.actuator_signals) + len(bound.motors)
+    missing = actuators - size - S.shape[0]
+    if not (size or S.shape[0] or scenario.references):
+        return Completed(scenario)  # It is only simulated.
+    if scenario.task is not None:
+        return Completed(scenario)
+    if scenario.control_weights or scenario.compliances is not None:
+        return Completed(scenario)
+    if np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals):
+        return Completed(scenario)  # The model refuses it.
+    if missing < 0 or (missing == 0 and scenario.start.positions):
+        return Completed(scenario)
+    candidates = Candidates(scenario, links, given, bound)
+    postures = Postures(
+        links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
+    )
+    # Rows that references name are known before the posture is: by the normal near the guess.
+    near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
+    movable = _movable(postures) if missing else []
+    along = [row for row in candidates.points(near) if row in movable] if near else []
+    task = _Task(scenario, candidates, size, missing, names, along)
+    if missing == 0:
+        return _with_start(scenario, task, postures, guess)
+    return _with_outputs(scenario, task, postures, guess)
+
+
+class _Task:
+    """Which rows have references, and their values.
+
+    Attributes:
+        scenario, candidates: The arguments.
+        given: How many rows the scenario gives.
+        missing: How many are missing.
+        referred: The rows that have references: those that are given, and then those that complete
+            them and are named by references.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        candidates: Candidates,
+        given: int,
+        missing: int,
+        forces: Sequence[str],
+        along: Sequence[int],
+    ) -> None:
+        """Finds the rows that references name.
+
+        Args:
+            scenario: The scenario.
+            candidates: Its rows.
+            given: How many of these it gives.
+            missing: How many are missing.
+            forces: The names of the force outputs.
+            along: The rows along the surfaces, near the start.
+
+        Raises:
+            ScenarioError: A name means none of them, or they are too many.
+        """
+        self.scenario, self.candidates = scenario, candidates
+        self.given, self.missing = given, missing
+        self._forces, self._along = forces, along
+        self._rows = {name: self._named(name) for name in scenario.references}
+        named = dict.fromkeys(row for rows in self._rows.values() for row in rows)
+        beside = [row for row in named if row is not None and row >= given]
+        if len(beside) > missing:
+            names = ", ".join(candidates.signals[row].name for row in beside)
+            text = f"{names} are {len(beside)} outputs, but only {missing} are missing"
+            raise ScenarioError(("references", text))
+        left = [candidates.signals[row].name for row in range(given) if row not in named]
+        if left:
+            raise ScenarioError(("references", f"left without one: {', '.join(left)}"))
+        self.referred = [*range(given), *beside]
+
+    def _named(self, name: str) -> list[int | None]:
+        """The rows that a key of the references means; None for a force."""
+        key, found = f"references.{name}", list[int | None]()
+        for part in map(str.strip, name.split(",")):
+            found += self._meant(part, key)
+        reference = self.scenario.references[name]
+        if isinstance(reference, Reference) and reference.size != len(found):
+            text = f"{reference.size} values for {len(found)} outputs"
+            raise ScenarioError((key, text))
+        return found
+
+    def _meant(self, name: str, key: str) -> Sequence[int | None]:
+        signals = [signal.name for signal in self.candidates.signals]
+        known = [*signals[: self.given], *self._forces]
+        degrees = [2] * self.given + [0] * len(self._forces)
+        try:
+            places = meant(name, known, degrees)
+        except ReferenceSignalError as error:
+            if not self.missing:
+                raise ScenarioError((key, str(error))) from None
+        else:
+            return [place if place < self.given else None for place in places]
+        # A name of no output yet: of rows that may complete them.
+        along = [signals[row] for row in self._along]
+        beside = [*along, *(one for one in signals[self.given :] if one not in along)]
+        own = [one for one in along if one.rpartition(".")[0] == name]
+        try:
+            chosen = own or [beside[k] for k in meant(name, beside, [2] * len(beside))]
+        except ReferenceSignalError:
+            text = unknown_name("output", name, [*known, *beside])
+            raise ScenarioError((key, text)) from None
+        return [signals.index(one) for one in chosen]
+
+    def wanted(self, time: float) -> FloatArray:
+        """The values of the referred rows at a time in s, shape (referred,)."""
+        values: dict[int | None, float] = {}
+        for name, rows in self._rows.items():
+            found = _value(self.scenario.references[name], len(rows), time)
+            values.update(zip(rows, found.tolist(), strict=True))
+        return np.array([values[row] for row in self.referred])
+
+    def times(self) -> FloatArray:
+        """Times along the references, in s."""
+        begin = self.scenario.integrator.start_time
+        return np.linspace(begin, begin + self.scenario.duration, _TIMES)
+
+    def at_start(self, rows: Sequence[int]) -> FloatArray:
+        """The values of the referred rows at the start, with start.errors."""
+        errors = self.scenario.start.errors
+        wanted = self.wanted(self.scenario.integrator.start_time)
+        signals = [self.candidates.signals[row] for row in rows]
+        return wanted + np.array([errors.get(signal.name, 0.0) for signal in signals])
+
+
+def _with_start(
+    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+) -> Completed:
+    """The scenario with a start, if its default configuration leads to none."""
+    rows = task.referred
+    wanted = task.at_start(rows)
+    near = near_posture(postures, rows, wanted, guess)
+    # The structure is found at the guess itself.
+    if near is not None and all(
+        posture.independence(rows) > REGULAR for posture in (near, postures.at(guess))
+    ):
+        return Completed(scenario)
+    found = _found(task, postures, rows, wanted, guess)
+    return Completed(_started(scenario, task, found), (_start_note(task, found),))
+
+
+def _with_outputs(
+    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+) -> Completed:
+    """The scenario with all outputs and a start."""
+    candidates, referred = task.candidates, task.referred
+    posture, is_normal = _posture(task, postures, referred, guess)
+    # What completes the outputs, in the order of their worth.
+    open_points = [row for row in candidates.points(posture) if row not in referred]
+    room = task.missing - len(referred) + task.given
+    along = first_independent(posture, referred, open_points, room)
+    rows = [*referred, *along]
+    room -= len(along)
+    axes = [row for row in candidates.axes if row not in rows]
+    held = first_independent(posture, rows, axes, len(axes))
+    held = held if len(held) <= room else []
+    rows += held
+    wanted = [task.wanted(time)[: len(referred)] for time in task.times()]
+    free = [row for row in candidates.joints if row not in rows]
+    joints = best_joints(postures, posture, rows, free, room - len(held), np.array(wanted))
+    if joints is None:
+        names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
+        raise ScenarioError(
+            (
+                "outputs",
+                f"{task.missing} are missing, and no positions of joints beside {names} leave "
+                "B(x) regular; name them",
+            )
+        )
+    chosen, resting = [*referred[task.given :], *along, *held, *joints], [*along, *held, *joints]
+    values = _rounded(posture.rows)
+    if is_normal:
+        values[candidates.tilts] = 0.0
+    held_values = {candidates.signals[row].name: float(values[row]) for row in resting}
+    completed = replace(
+        scenario,
+        outputs=[*scenario.outputs, *merged(candidates.form(row) for row in chosen)],
+        references={**scenario.references, **held_values},
+    )
+    names = ", ".join(candidates.signals[row].name for row in chosen)
+    reason = " (joints so that B(x) is best conditioned)" if joints else ""
+    note = f"outputs completed by {names}{reason}"
+    return Completed(_started(completed, task, posture), (note, _start_note(task, posture)))
+
+
+def _movable(postures: Postures) -> list[int]:
+    """The rows that move anywhere: an arm that moves in a plane has others."""
+    some = [postures.at(q).gradients for q in postures.guesses(4)]
+    return np.flatnonzero(np.linalg.norm(some, axis=2).max(axis=0) > 1e-9).tolist()
+
+
+def _posture(
+    task: _Task,
+    postures: Postures,
+    rows: Sequence[int],
+    guess: FloatArray,
+) -> tuple[Posture, bool]:
+    """Where the robot starts, and whether its tools are then normal to their surfaces."""
+    candidates, wanted = task.candidates, task.at_start(rows)
+    both = [*rows, *candidates.tilts]
+    goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
+    if task.scenario.start.positions:
+        for chosen, values in ((both, goal), (rows, wanted)):
+            near = near_posture(postures, chosen, values, guess)
+            if near is not None and near.independence(rows) > REGULAR:
+                return near, len(chosen) > len(rows)
+    if candidates.tilts:
+        found = best_posture(postures, both, goal, [guess, *postures.guesses(TRIES)])
+        if found is not None:
+            return found, True
+    return _found(task, postures, rows, wanted, guess), False
+
+
+def _found(
+    task: _Task,
+    postures: Postures,
+    rows: Sequence[int],
+    wanted: FloatArray,
+    guess: FloatArray,
+) -> Posture:
+    """The best posture with wanted values of rows.
+
+    Raises:
+        ScenarioError: There is none; by how much each row misses its value at the nearest.
+    """
+    guesses = [guess, *postures.guesses(TRIES)]
+    found = best_posture(postures, rows, wanted, guesses)
+    if found is not None:
+        return found
+    nearest = nearest_posture(postures, rows, wanted, guesses)
+    polished = near_posture(postures, rows, wanted, nearest.q)
+    if polished is not None:
+        return polished
+    signals = [task.candidates.signals[row] for row in rows]
+    missed = [
+        f"{signal.name} comes to {value:.4g} {signal.unit}, "
+        f"{abs(goal - value):.2g} {signal.unit} from {goal:.4g} {signal.unit}".replace(" ,", ",")
+        for signal, value, goal in zip(signals, nearest.rows[list(rows)], wanted, strict=True)
+        if abs(goal - value) > 1e-6
+    ]
+    residual = float(np.max(np.abs(nearest.left), initial=0.0))
+    if residual > 1e-6:
+        missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
+    raise ScenarioError(
+        (
+            "references" if len(rows) else "constraints",
+            "the robot cannot start there within its joint limits; the nearest that was found "
+            f" leaves this: {'; '.join(missed) or 'nothing, but at a limit'}. Change the "
+            "first values of the references, start.errors or where the surface stands, or give "
+            "start.positions",
+        )
+    )
+
+
+def _started(scenario: Scenario, task: _Task, posture: Posture) -> Scenario:
+    """The scenario with a start."""
+    return replace(scenario, start=replace(scenario.start, positions=_named(task, posture)))
+
+
+def _named(task: _Task, posture: Posture) -> dict[str, float]:
+    """The positions of a posture by their names, rounded."""
+    names = [task.candidates.signals[row].name for row in task.candidates.joints]
+    return dict(zip(names, _rounded(posture.q).tolist(), strict=True))
+
+
+def _rounded(values: FloatArray) -> FloatArray:
+    """Values as they are written, without -0."""
+    return np.round(values, _DIGITS) + 0.0
+
+
+def _start_note(task: _Task, posture: Posture) -> str:
+    positions = (f"{name}: {value:.4g}" for name, value in _named(task, posture).items())
+    return f"start found: {{{', '.join(positions)}}}"
+
+
+def _value(reference: Reference | float, size: int, time: float) -> FloatArray:
+    """r at a time in s, shape (size,)."""
+    if not isinstance(reference, Reference):
+        return np.full(size, float(reference))
+    return np.asarray(reference.derivatives([0] * size)(time), dtype=float)
+
+
+def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
+    """Parameter name -> value at the start, where it is not the default."""
+    begin = scenario.integrator.start_time
+    moving = {
+        name: np.concatenate([_value(one, getattr(one, "size", 1), begin) for one in references])
+        for name, references in scenario.exogenous.items()
+    }
+    return {**{k: np.atleast_1d(v) for k, v in scenario.plant_parameters.items()}, **moving}

@@ -1,0 +1,246 @@
+"""Where a robot can stand, and how well it can move from there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.loop_state import LoopState
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import Linearization, newton, shortest_steps
+
+EXACT = 1e-9
+"""Equations in m, rad or 1 of which less than this is left are satisfied."""
+
+NEAR_LIMIT = 0.1
+"""A joint within this part of its range from a limit counts as close to it."""
+
+_STEPS = 25
+"""After so many steps another guess is better; a good one takes six."""
+
+_BELOW = 0.02
+"""A body this far behind a surface, relative to the size of the robot, runs into it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """A configuration, and what is known of it.
+
+    Attributes:
+        q: The configuration, shape (nq,).
+        rows: The values of all rows that may be outputs, shape (c,).
+        left: What is left of the constraints, shape (k,).
+        slopes: The gradients of the rows with respect to q, shape (c, nq).
+        constraint_slopes: Those of the constraints, shape (k, nq).
+        gradients: The rates of the rows per unit of v, shape (c, nv).
+        constraints: The rates of the constraints per unit of v, shape (m, nv).
+        forces: S of the force outputs, shape (s, m).
+        mass: M(q), shape (nv, nv).
+        actuation: What a unit of each control does, shape (nv, nu).
+        clearances: How far each body is on the free side of each surface, in m.
+        normals: The unit normal of each surface where it is touched, below each other.
+        leans: The cosine between the outward axis of each tool and its surface's normal.
+    """
+
+    q: FloatArray
+    rows: FloatArray
+    left: FloatArray
+    slopes: FloatArray
+    constraint_slopes: FloatArray
+    gradients: FloatArray
+    constraints: FloatArray
+    forces: FloatArray
+    mass: FloatArray
+    actuation: FloatArray
+    clearances: FloatArray
+    normals: FloatArray
+    leans: FloatArray
+
+    def independence(self, rows: Sequence[int]) -> float:
+        """How independently the controls move some rows and press with the force outputs.
+
+        It is the smallest singular value of B(x) of (16) with M^(1/2) v and M^(-1/2) B_u in the
+        place of v and u, whose unit is that of kinetic energy: each row as long as it would be
+        without constraints, so that neither units nor the length of a lever count. It is 1 where no
+        row hinders another one, and 0 where the robot is singular.
+        """
+        lower = np.linalg.cholesky(self.mass)
+
+        def weighted(gradients: FloatArray) -> FloatArray:
+            return np.linalg.solve(lower, gradients.T).T
+
+        J, P = weighted(self.constraints), weighted(self.gradients[list(rows)])
+        Q = np.linalg.qr(weighted(self.actuation.T).T)[0]
+        inverse = np.linalg.pinv(J, 1e-9)  # J^T (J M^-1 J^T)^-1 in these units.
+        F = (self.forces @ inverse.T) if len(self.forces) else np.zeros((0, len(self.mass)))
+        B = np.vstack([_one_long(P, P - P @ inverse @ J), _one_long(F, F)]) @ Q
+        if len(B) > B.shape[1]:
+            return 0.0
+        return float(np.min(np.linalg.svd(B, compute_uv=False), initial=1.0))
+
+
+def _one_long(rows: FloatArray, scaled: FloatArray) -> FloatArray:
+    """Rows divided by the lengths of others; zero where these are none."""
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return scaled / np.where(length > 1e-9, length, np.inf)
+
+
+class Postures:
+    """The configurations of a robot that touches something.
+
+    Args:
+        links: The robot.
+        bound: What it touches or holds.
+        rows: h(q), what may be outputs, shape (c, 1).
+        forces: S of the force outputs, shape (s, m).
+        touches: Where it touches what has a free side, with the outward axis of the tool there in
+            the world, shape (3, 1).
+        values: Parameter name -> value, where that is not the default.
+
+    Attributes:
+        low, high: The limits of q, shape (nq,) each.
+        size: How far its bodies are from each other at most, in m, in its default configuration.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        bound: ConstraintSet,
+        rows: ca.SX,
+        forces: ca.SX,
+        touches: Sequence[tuple[Touch, ca.SX]],
+        values: Mapping[str, FloatArray],
+    ) -> None:
+        parameters: tuple[Parameter, ...] = (*links.parameters, *bound.parameters)
+        kinematics = links.kinematics()
+        residual, rate = bound.residual(links), kinematics.value(bound.rate(kinematics))
+        rows = ca.vertcat(ca.SX(0, 1), rows)
+        slopes = ca.jacobian(rows, links.q)
+        bodies = links.landmarks()
+        moving = [b for b in ca.horzsplit(bodies) if ca.depends_on(b, links.q)]
+        clearances = [touch.clearance(body) for touch, _ in touches for body in moving]
+        motors = LoopState.of(bound, links).motors
+        self._function = TracedFunction(
+            "postures",
+            {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in parameters])},
+            {
+                "rows": rows,
+                "left": residual,
+                "slopes": slopes,
+                "constraint_slopes": ca.jacobian(residual, links.q),
+                "gradients": ca.mtimes(slopes, links.velocity_map),
+                "constraints": ca.jacobian(rate, links.v),
+                "forces": forces,
+                "mass": links.mass_matrix,
+                "actuation": ca.horzcat(ca.SX(ca.DM(links.actuation_matrix)), motors),
+                "clearances": ca.vertcat(ca.SX(0, 1), *clearances),
+                "normals": ca.vertcat(ca.SX(0, 1), *[touch.normal for touch, _ in touches]),
+                "leans": ca.vertcat(ca.SX(0, 1), *[ca.dot(t.normal, axis) for t, axis in touches]),
+                "bodies": bodies,
+            },
+        )
+        self._parameters = np.concatenate(
+            [np.broadcast_to(values.get(p.name, p.value), p.value.shape) for p in parameters]
+        )
+        self.low, self.high = links.position_limits
+        self._turns = np.array([signal.unit == "rad" for signal in links.position_signals])
+        points = self._values(links.default_positions)["bodies"]
+        self.size = float(np.max(np.ptp(points, axis=1))) or 1.0
+
+    def _values(self, q: FloatArray) -> dict[str, FloatArray]:
+        found = self._function(q, self._parameters)
+        nq = q.size
+        values = dict(zip(self._function.output_names, found, strict=True))
+        # A matrix of one row or column comes as a vector.
+        for name in ("slopes", "constraint_slopes", "gradients", "constraints", "mass"):
+            values[name] = values[name].reshape(-1, nq)
+        values["actuation"] = values["actuation"].reshape(nq, -1)
+        values["forces"] = values["forces"].reshape(-1, max(1, len(values["constraints"])))
+        return values
+
+    def at(self, q: FloatArray) -> Posture:
+        """What is known of a configuration."""
+        values = self._values(q)
+        del values["bodies"]
+        return Posture(q=q, **values)
+
+    def solve(self, rows: Sequence[int], wanted: FloatArray, guess: FloatArray) -> FloatArray:
+        """The configuration on the constraints with wanted values of some rows, near a guess.
+
+        Args:
+            rows: The rows.
+            wanted: Their values.
+            guess: Where Newton's method starts, shape (nq,).
+
+        Returns:
+            q, shape (nq,); whether it is one `left` tells.
+        """
+        chosen = list(rows)
+
+        def residual(q: FloatArray) -> FloatArray:
+            found = self._values(q)
+            return np.concatenate([found["left"], found["rows"][chosen] - wanted])
+
+        def linearize(q: FloatArray) -> Linearization | None:
+            found = self._values(q)
+            gradients = np.vstack([found["constraint_slopes"], found["slopes"][chosen]])
+            return shortest_steps(gradients, residual)
+
+        return self._turned_back(newton(guess, linearize, _STEPS)[0])
+
+    def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
+        """What is left of the constraints and of wanted values of rows, shape (k + len(rows),)."""
+        found = self._values(q)
+        return np.concatenate([found["left"], found["rows"][list(rows)] - wanted])
+
+    def _turned_back(self, q: FloatArray) -> FloatArray:
+        """The same configuration with as few whole turns as possible, within limits."""
+        turned = q - 2 * np.pi * np.round(q / (2 * np.pi)) * self._turns
+        for shift in (-2 * np.pi, 2 * np.pi):
+            moved = turned + shift * self._turns
+            is_better = (self._room(turned) < 0.0) & (self._room(moved) >= 0.0)
+            turned = np.where(is_better, moved, turned)
+        return np.where(self._room(q) >= 0.0, q, turned)
+
+    def _room(self, q: FloatArray) -> FloatArray:
+        """How far each position is from its nearer limit, shape (nq,)."""
+        return np.minimum(q - self.low, self.high - q)
+
+    def is_inside(self, q: FloatArray) -> bool:
+        """Whether all joints are within their limits."""
+        return bool(np.all(self._room(q) >= -1e-9))
+
+    def margin(self, q: FloatArray) -> float:
+        """1 where no joint is close to a limit, 0 where one is at it or beyond."""
+        span = self.high - self.low
+        bounded = np.isfinite(span) & (span > 0.0)
+        share = self._room(q)[bounded] / (NEAR_LIMIT * span[bounded])
+        return float(np.clip(np.min(share, initial=1.0), 0.0, 1.0))
+
+    def quality(self, posture: Posture, rows: Sequence[int]) -> float:
+        """How good a posture is for a task: independence of the rows, less near limits.
+
+        It counts little if a body is behind a surface, or a tool points away from its own.
+        """
+        quality = posture.independence(rows) * self.margin(posture.q)
+        if np.min(posture.clearances, initial=0.0) < -_BELOW * self.size:
+            quality *= 0.1
+        if np.max(posture.leans, initial=-1.0) > 0.0:
+            quality *= 0.1
+        return quality
+
+    def guesses(self, count: int) -> FloatArray:
+        """Configurations between the limits, shape (count, nq): the same ones each time."""
+        random = np.random.default_rng(0)
+        reach = np.where(self._turns, np.pi, self.size)
+        low, high = np.maximum(self.low, -reach), np.minimum(self.high, reach)
+        empty = low > high  # Limits beyond a turn.
+        low, high = np.where(empty, self.low, low), np.where(empty, self.high, high)
+        inset = 0.5 * NEAR_LIMIT * (high - low)
+        return random.uniform(low + inset, high - inset, (count, low.size))

@@ -1,0 +1,84 @@
+"""Where a robot can start: inverse kinematics with any constraints, by many tries."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.scenario.completion.postures import EXACT, Posture, Postures
+
+TRIES = 60
+"""How many guesses a search takes; an arm of seven joints has some forty solutions among them."""
+
+PATIENCE = 20
+"""After so many tries without any result a search ends: one that fails takes long."""
+
+_CLOSEST = 3
+"""From so many of the guesses the nearest is sought of what is out of reach."""
+
+_HARD = 100.0
+"""By this factor constraints weigh more than outputs where not all can be had."""
+
+
+def near_posture(
+    postures: Postures, rows: Sequence[int], wanted: FloatArray, guess: FloatArray
+) -> Posture | None:
+    """The posture near a guess with wanted values of some rows; None if none is within limits."""
+    q = postures.solve(rows, wanted, guess)
+    left = postures.left(rows, wanted, q)
+    is_found = np.all(np.isfinite(left)) and np.max(np.abs(left), initial=0.0) < EXACT
+    return postures.at(q) if is_found and postures.is_inside(q) else None
+
+
+def best_posture(
+    postures: Postures, rows: Sequence[int], wanted: FloatArray, guesses: Sequence[FloatArray]
+) -> Posture | None:
+    """The best posture with wanted values of some rows that Newton's method finds.
+
+    Args:
+        postures: The robot.
+        rows: The rows.
+        wanted: Their values, shape (len(rows),).
+        guesses: Where to start.
+
+    Returns:
+        That with the largest `quality`, the first of equals; None if the first `PATIENCE` guesses
+        lead to none.
+    """
+    found: list[Posture] = []
+    for count, guess in enumerate(guesses):
+        if count == PATIENCE and not found:
+            break
+        posture = near_posture(postures, rows, wanted, guess)
+        found += [posture] if posture is not None else []
+    return max(found, key=lambda one: postures.quality(one, rows), default=None)
+
+
+def nearest_posture(
+    postures: Postures, rows: Sequence[int], wanted: FloatArray, guesses: Sequence[FloatArray]
+) -> Posture:
+    """The posture within limits that comes nearest to wanted values, by least squares.
+
+    The arguments are those of `best_posture`.
+    """
+    from scipy.optimize import least_squares  # Loads what no other run needs.
+
+    chosen = list(rows)
+    low = np.where(np.isfinite(postures.low), postures.low, -np.inf)
+    high = np.maximum(postures.high, low + 1e-6)
+
+    def residual(q: FloatArray) -> FloatArray:
+        left = postures.left(rows, wanted, q)
+        left[: left.size - len(chosen)] *= _HARD
+        return np.nan_to_num(left, nan=1e6, posinf=1e6, neginf=-1e6)
+
+    def gradient(q: FloatArray) -> FloatArray:
+        posture = postures.at(q)
+        return np.vstack([_HARD * posture.constraint_slopes, posture.slopes[chosen]])
+
+    tried = sorted(guesses, key=lambda q: float(np.sum(residual(np.clip(q, low, high)) ** 2)))
+    found = [
+        least_squares(residual, np.clip(q, low, high), gradient, (low, high), max_nfev=50)
+        for q in tried[:_CLOSEST]
+    ]
+    return postures.at(min(found, key=lambda one: float(one.cost)).x)

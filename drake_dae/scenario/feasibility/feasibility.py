@@ -1,0 +1,199 @@
+"""Whether a robot can do what its scenario asks for, before it is simulated."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.analysis.analyze import analyze
+from drake_dae.analysis.report import Analysis
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.errors import AssumptionError
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.build import exogenous_references, wire_scenario
+from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
+from drake_dae.scenario.model import completed_model, scenario_structure
+from drake_dae.scenario.parts import IdealConstraints
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.simulation.summary import Limits
+from drake_dae.trace.functions import TracedFunction
+
+SAMPLES = 1001
+"""How many times along a reference are examined, at least."""
+
+MOST_SAMPLES = 20_000
+"""How many times along a reference that varies fast are examined, at most."""
+
+_STRAIGHT = 0.01
+"""How far a reference may be off a straight line between two times, relative to its range."""
+
+_SLACK = 1e-9
+"""How far a value must be beyond its limit to count, in its unit: a start may be on the limit."""
+
+
+def find_feasibility(scenario: Scenario) -> Feasibility:
+    """Analyzes the robot of a scenario, and what its reference takes.
+
+    The figures are those of the law's model without errors: the least that the scenario asks for.
+
+    Args:
+        scenario: What `load_scenario` returns.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key. A violated assumption is
+            no error: the analysis tells it.
+    """
+    completed, model = completed_model(scenario)
+    scenario = completed.scenario
+    try:
+        structure = scenario_structure(model)
+    except AssumptionError:
+        return Feasibility(analyze(model.dae), scenario.duration)
+    if scenario.task is not None:  # What a task takes depends on when it touches.
+        return Feasibility(analyze(model.dae), scenario.duration)
+    # The law's model alone, without what it does not know of the plant.
+    ideal = replace(
+        scenario,
+        plant=IdealConstraints(),
+        plant_payloads=[],
+        plant_pushes=[],
+        encoders=None,
+        observer=None,
+        tolerances=None,
+    )
+    loop, context = wire_scenario(ideal, model, structure)
+    reference, begin = loop.reference.reference, scenario.integrator.start_time
+
+    def signals(time: float) -> FloatArray:
+        moving = [] if loop.exogenous is None else [loop.exogenous.reference(time)]
+        return np.concatenate([reference(time), *moving])
+
+    times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
+    start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    exogenous = exogenous_references(
+        scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
+    )
+    analysis = analyze(
+        model.dae, reference=reference, times=times, start=start, exogenous=exogenous
+    )
+    return Feasibility(
+        analysis, scenario.duration, is_resolved=is_resolved, **_ranges(analysis, model)
+    )
+
+
+def sample_times(
+    reference: Callable[[float], FloatArray], begin: float, end: float
+) -> tuple[FloatArray, bool]:
+    """Times between which a reference is nearly straight.
+
+    Even times alone would see a sinusoid stand still whose period fits between them. Each interval
+    is tried at a random place, until a whole round finds nothing new.
+
+    Args:
+        reference: The function t -> R(t).
+        begin, end: The first and the last time, in s.
+
+    Returns:
+        Between SAMPLES and MOST_SAMPLES increasing times in s, and whether these are enough.
+    """
+    random = np.random.default_rng(0)
+    times = np.linspace(begin, end, SAMPLES)
+    values = np.array([reference(time) for time in times])
+    while True:
+        share = random.uniform(0.3, 0.7, times.size - 1)
+        tried = times[:-1] + share * np.diff(times)
+        found = np.array([reference(time) for time in tried])
+        known = np.concatenate([values, found])
+        # A constant varies by its round-off.
+        allowed = _STRAIGHT * np.ptp(known, axis=0) + 1e-9 * np.abs(known).max(axis=0)
+        off = np.abs(found - values[:-1] - share[:, None] * np.diff(values, axis=0))
+        new = np.flatnonzero(np.any(off > allowed, axis=1))
+        room = MOST_SAMPLES - times.size
+        is_resolved = new.size <= room
+        if not is_resolved:
+            new = np.sort(random.choice(new, room, replace=False))
+        times = np.insert(times, new + 1, tried[new])
+        values = np.insert(values, new + 1, found[new], axis=0)
+        if not (new.size and is_resolved):
+            return times, is_resolved
+
+
+def _ranges(analysis: Analysis, model: RobotModel) -> dict[str, tuple[SignalRange, ...]]:
+    """The signals of a `Feasibility` along the reference, by their names there."""
+    motion, dae, limits = analysis.motion, model.dae, Limits.of(model)
+    if motion is None or not motion.times.size:
+        return {}
+
+    def ranges(
+        signals: Sequence[Signal], values: FloatArray, low: FloatArray, high: FloatArray
+    ) -> tuple[SignalRange, ...]:
+        columns = zip(signals, values.T, low, high, strict=True)
+        return tuple(_range(s, motion.times, v, float(a), float(b)) for s, v, a, b in columns)
+
+    highest, reactions = model.control_limits, dae.force_signals
+    least = np.array([-np.inf if limits.can_pull(signal) else 0.0 for signal in reactions])
+    found = {
+        "controls": ranges(dae.control_signals, motion.controls, -highest, highest),
+        "constraint_forces": ranges(
+            reactions, _forces(dae, motion), least, np.full(least.size, np.inf)
+        ),
+    }
+    if model.joint_force is not None:
+        effort = model.links.effort_limits
+        forces = _along(model, model.joint_force, motion.states)
+        found["joint_forces"] = ranges(model.links.actuator_signals, forces, -effort, effort)
+    if limits.state is not None:
+        low, high = limits.state
+        bounded = np.isfinite(low) | np.isfinite(high)
+        chosen = [s for s, yes in zip(dae.state_signals, bounded, strict=False) if yes]
+        values = motion.states[:, : low.size][:, bounded]
+        found["joints"] = ranges(chosen, values, low[bounded], high[bounded])
+    if limits.loops is not None:
+        low, high = limits.loops
+        bounded = np.isfinite(low) | np.isfinite(high)
+        loops = model.loop_joints
+        chosen = [s for s, yes in zip(loops.signals, bounded, strict=True) if yes]
+        values = _along(model, loops.state, motion.states)[:, bounded]
+        own = ranges(chosen, values, low[bounded], high[bounded])
+        found["joints"] = (*found.get("joints", ()), *own)
+    return found
+
+
+def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
+    """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
+    if dae.sharing is None:
+        return motion.constraint_inputs
+    v = ca.SX.sym("v", dae.num_constraints)
+    function = dae.trace("shared forces", {"forces": dae.forces(v)}, {"v": v})
+    pairs = zip(motion.states, motion.constraint_inputs, strict=True)
+    return np.array([function(x, given, dae.parameter_values)[0] for x, given in pairs])
+
+
+def _along(model: RobotModel, expression: ca.SX, states: FloatArray) -> FloatArray:
+    """The values of an expression of the state at each state, shape (k, size)."""
+    dae = model.dae
+    inputs = {"state": dae.state, "parameters": dae.parameter_symbol}
+    function = TracedFunction("along the motion", inputs, {"value": ca.densify(expression)})
+    return np.array([function(state, dae.parameter_values)[0] for state in states])
+
+
+def _range(
+    signal: Signal, times: FloatArray, values: FloatArray, low: float, high: float
+) -> SignalRange:
+    """Where a signal goes between its limits, and when."""
+    least, largest = int(np.argmin(values)), int(np.argmax(values))
+    beyond = (values < low - _SLACK) | (values > high + _SLACK)
+    return SignalRange(
+        signal,
+        least=float(values[least]),
+        least_time=float(times[least]),
+        largest=float(values[largest]),
+        largest_time=float(times[largest]),
+        low=low,
+        high=high,
+        beyond_time=float(times[np.argmax(beyond)]) if beyond.any() else None,
+    )

@@ -1,0 +1,194 @@
+"""What a scenario's reference takes: values, tables, and what is wrong."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drake_dae.analysis.report import Analysis
+from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
+from drake_dae.dae.system.signals import Signal
+
+
+@dataclass(frozen=True, eq=False)
+class SignalRange:
+    """One signal along the reference.
+
+    Attributes:
+        signal: Name and unit.
+        least, least_time: The lowest value, and when in s.
+        largest, largest_time: The highest value, and when in s.
+        low, high: What is allowed; infinite where all is.
+        beyond_time: When it first leaves what is allowed, in s; None if never.
+    """
+
+    signal: Signal
+    least: float
+    least_time: float
+    largest: float
+    largest_time: float
+    low: float
+    high: float
+    beyond_time: float | None
+
+    @property
+    def peak(self) -> tuple[float, float]:
+        """The value of largest size, and when."""
+        if abs(self.least) > abs(self.largest):
+            return self.least, self.least_time
+        return self.largest, self.largest_time
+
+    def to_dict(self) -> dict[str, Any]:
+        """The range as plain numbers; None for an infinite limit."""
+        return {
+            "name": self.signal.name,
+            "unit": self.signal.unit,
+            "least": {"value": self.least, "time": self.least_time},
+            "largest": {"value": self.largest, "time": self.largest_time},
+            "low": self.low if np.isfinite(self.low) else None,
+            "high": self.high if np.isfinite(self.high) else None,
+            "beyond_time": self.beyond_time,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Feasibility:
+    """The analysis of a scenario's robot, and what its reference takes.
+
+    The figures are those of the law's model without errors: the least that the scenario asks for.
+
+    Attributes:
+        analysis: What `analyze` says of the robot, around the start and along the reference.
+        duration: How long the scenario lasts, in s.
+        controls: u, with what the actuators can do as limits.
+        joint_forces: What the actuation puts on the joints, with their effort limits; empty with
+            rigid joints, where that is u.
+        constraint_forces: lambda; zero is the lower limit where a constraint can only push.
+        joints: Positions and velocities of the joints that have limits.
+        is_resolved: Whether the times follow the reference; if not, it varies faster than they do,
+            and the values between them are not known.
+    """
+
+    analysis: Analysis
+    duration: float
+    controls: tuple[SignalRange, ...] = ()
+    joint_forces: tuple[SignalRange, ...] = ()
+    constraint_forces: tuple[SignalRange, ...] = ()
+    joints: tuple[SignalRange, ...] = ()
+    is_resolved: bool = True
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is violated, exceeded or out of reach, one text each; empty if nothing is."""
+        return (
+            *self.analysis.problems,
+            *map(_exceeded, _beyond((*self.controls, *self.joint_forces))),
+            *map(_pulling, _beyond(self.constraint_forces)),
+            *map(_left, _beyond(self.joints)),
+        )
+
+    def __repr__(self) -> str:
+        found = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Feasibility('{self.analysis.system.name}': {found})"
+
+    def __str__(self) -> str:
+        return to_text(self._parts())
+
+    def to_markdown(self) -> str:
+        """The report with Markdown tables."""
+        return to_markdown(self._parts())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as plain numbers, lists and texts."""
+        return {
+            "analysis": self.analysis.to_dict(),
+            "duration": self.duration,
+            "resolved": self.is_resolved,
+            **{
+                key: [r.to_dict() for r in getattr(self, key)]
+                for key in ("controls", "joint_forces", "constraint_forces", "joints")
+            },
+            "problems": list(self.problems),
+        }
+
+    def _parts(self) -> list[Part]:
+        tables = (
+            _table(_NEEDED, self.controls, _needed_row),
+            _table(["joint force", *_NEEDED[1:]], self.joint_forces, _needed_row),
+            _table(_FORCE, self.constraint_forces, _force_row),
+            _table(_JOINT, self.joints, _joint_row),
+        )
+        parts = [*self.analysis.parts(), *(table for table in tables if table.rows)]
+        motion = self.analysis.motion
+        if motion is not None and motion.times.size:
+            text = f"Started without errors, and examined at {motion.times.size} times."
+            if not self.is_resolved:
+                text += (
+                    " The reference varies too fast for these: what lies between them is not "
+                    "known. A shorter duration takes them closer together."
+                )
+            parts.append([text])
+        parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
+        return parts
+
+
+_NEEDED = ["control needed", "unit", "largest", "at", "limit", ""]
+_FORCE = ["constraint force", "unit", "least", "at", "largest", "at", ""]
+_JOINT = ["joint", "unit", "least", "largest", "limits", ""]
+
+
+def _table(
+    head: list[str], ranges: Iterable[SignalRange], row: Callable[[SignalRange], list[str]]
+) -> Table:
+    names = ([r.signal.name, r.signal.unit or "1", *row(r)] for r in ranges)
+    return Table(head, list(names), left=2)
+
+
+def _needed_row(r: SignalRange) -> list[str]:
+    value, time = r.peak
+    limit = f"{r.high:.4g}" if np.isfinite(r.high) else "none"
+    remark = "" if r.beyond_time is None else "over its limit"
+    return [digits(abs(value)), _when(r, time), limit, remark]
+
+
+def _force_row(r: SignalRange) -> list[str]:
+    remark = "" if r.beyond_time is None else "pulls: a real contact would open"
+    least, largest = digits(r.least), digits(r.largest)
+    return [least, _when(r, r.least_time), largest, _when(r, r.largest_time), remark]
+
+
+def _joint_row(r: SignalRange) -> list[str]:
+    remark = "" if r.beyond_time is None else f"leaves at {r.beyond_time:.4g} s"
+    return [digits(r.least), digits(r.largest), f"{r.low:.4g} to {r.high:.4g}", remark]
+
+
+def _when(r: SignalRange, time: float) -> str:
+    """When, in words; nothing for a constant, whose extremes are round-off."""
+    size = max(abs(r.least), abs(r.largest))
+    return f"{time:.4g} s" if r.largest - r.least > 1e-9 * size else ""
+
+
+def _beyond(ranges: Iterable[SignalRange]) -> list[SignalRange]:
+    return [r for r in ranges if r.beyond_time is not None]
+
+
+def _exceeded(r: SignalRange) -> str:
+    (value, time), unit = r.peak, r.signal.unit
+    return (
+        f"{r.signal.name} needs {abs(value):.4g} {unit} at {time:.4g} s, limit {r.high:.4g} {unit}"
+    )
+
+
+def _pulling(r: SignalRange) -> str:
+    return (
+        f"{r.signal.name} pulls from {r.beyond_time:.4g} s on, most with {-r.least:.4g} "
+        f"{r.signal.unit} at {r.least_time:.4g} s: a real contact would open"
+    )
+
+
+def _left(r: SignalRange) -> str:
+    return (
+        f"{r.signal.name} goes from {digits(r.least)} to {digits(r.largest)} {r.signal.unit}, its "
+        f"limits are {r.low:.4g} and {r.high:.4g}, left at {r.beyond_time:.4g} s"
+    )

@@ -1,0 +1,186 @@
+"""All keys of a scenario: what they mean, take and default to, read from its forms."""
+
+import re
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from drake_dae.scenario.forms.typed_yaml import TAG, load_yaml
+from drake_dae.scenario.scenario import scenario_schema
+
+NOTHING = object()
+"""The default of a key that must be given."""
+
+OWN = object()
+"""The default of a key that has a form with defaults of its own."""
+
+EXAMPLES = Path(__file__).parent / "examples.yaml"
+
+_ONE = (
+    r"(?:m/s|kg m\^2|N m s/rad|N s/m|m/\(N s\)|N m/rad|N m/A|N/m|rad/s|1/s(?:\^mu_i|\^mu)?|N m|rad"
+    r"|degrees|ohm|Pa|s/m|H|m|s|N|kg)"
+)
+_UNIT = re.compile(
+    rf"(?:, |\bin )({_ONE}(?:(?:, \.\.\., | or | \(){_ONE}\)?)?)(?=[,.;:)\s]|$)"
+    r"|\bin the (outputs?'s? units?)"
+)
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a form.
+
+    Attributes:
+        name: The key.
+        text: What it means.
+        takes: Which values it takes, in words.
+        unit: The unit of its numbers; empty for none.
+        default: Its value where it is left out, as plain data, `OWN`, or `NOTHING` if it must be
+            given.
+        is_number: Whether it takes numbers.
+    """
+
+    name: str
+    text: str
+    takes: str
+    unit: str
+    default: Any
+    is_number: bool
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A form of a scenario: a mapping with keys of its own.
+
+    Attributes:
+        title: Its tag, or its name where it has none.
+        where: Its dotted key in the scenario where it stands first; "*" is any name or number.
+        text: What it means.
+        keys: Its keys.
+        examples: Examples, which have all of its keys together.
+        data: A scenario as plain data around it.
+        path: Where it stands in that.
+    """
+
+    title: str
+    where: str
+    text: str
+    keys: tuple[Key, ...]
+    examples: tuple[Mapping[str, Any], ...]
+    data: Any
+    path: tuple[str | int, ...]
+
+    def scenario(self, value: Any) -> Any:
+        """A scenario as plain data with a value of this form."""
+        return _with(self.data, self.path, value)
+
+
+@cache
+def entries() -> tuple[Entry, ...]:
+    """Each form of a scenario once, in the order in which they stand."""
+    examples = load_yaml(EXAMPLES.read_text("utf-8"), EXAMPLES.name)
+    return tuple(_entries(scenario_schema(), None, (), examples, set()))
+
+
+def _entries(
+    schema: Mapping[str, Any],
+    data: Any,
+    path: tuple[str | int, ...],
+    examples: Mapping[str, Any],
+    seen: set[str],
+) -> Iterator[Entry]:
+    """The forms within a schema, whose value stands in data at a path, but those seen before."""
+    for one in (*schema.get("anyOf", ()), *schema.get("oneOf", ())):
+        yield from _entries(one, data, path, examples, seen)
+    if "items" in schema:
+        yield from _entries(schema["items"], _with(data, path, [None]), (*path, 0), examples, seen)
+    if isinstance(schema.get("additionalProperties"), dict):
+        inner = schema["additionalProperties"]
+        yield from _entries(inner, _with(data, path, {"any": None}), (*path, "any"), examples, seen)
+    if "properties" not in schema:
+        return
+    properties = schema["properties"]
+    tag = {TAG: properties[TAG]["const"]} if TAG in properties else {}
+    title = tag.get(TAG, schema["title"])
+    if title in seen:
+        return
+    seen.add(title)
+    given = examples.get(title, {})
+    given = tuple({**tag, **example} for example in (given if isinstance(given, list) else [given]))
+    required = [name for name in schema.get("required", ()) if name != TAG]
+    keys = tuple(
+        Key(
+            name,
+            inner.get("description", ""),
+            _takes(inner),
+            unit_of(inner.get("description", "")) if _is_number(inner) else "",
+            NOTHING if name in required else inner.get("default", OWN),
+            _is_number(inner),
+        )
+        for name, inner in properties.items()
+        if name != TAG
+    )
+    where = ".".join("*" if part in (0, "any") else str(part) for part in path)
+    yield Entry(title, where, schema["description"], keys, given, data, path)
+    for name, inner in properties.items():
+        if name != TAG:
+            inside = _with(data, path, {**given[0], name: None})
+            yield from _entries(inner, inside, (*path, name), examples, seen)
+
+
+def unit_of(text: str) -> str:
+    """The unit that a text tells, "in N m" or "..., m, ..."; empty where it tells none."""
+    found = _UNIT.search(text)
+    return (found[1] or found[2]) if found else ""
+
+
+def _with(data: Any, path: tuple[str | int, ...], value: Any) -> Any:
+    """Plain data with another value at a path."""
+    if not path:
+        return value
+    changed = deepcopy(data)
+    place = changed
+    for part in path[:-1]:
+        place = place[part]
+    place[path[-1]] = value
+    return changed
+
+
+_WORDS = {
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "string": "text",
+    "null": "nothing",
+}
+
+
+def _takes(schema: Mapping[str, Any]) -> str:
+    """Which values a schema allows, in words."""
+    if "oneOf" in schema:
+        tags = (one["properties"][TAG]["const"] for one in schema["oneOf"] if "properties" in one)
+        texts = (_takes(one) for one in schema["oneOf"] if "properties" not in one)
+        return ", ".join([*texts, *tags])
+    if "anyOf" in schema:
+        return ", or ".join(dict.fromkeys(map(_takes, schema["anyOf"])))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(map(str, schema.get("enum", [schema.get("const")])))
+    if "properties" in schema:
+        return f"keys of {schema['title']}"
+    if "items" in schema:
+        inner = _takes(schema["items"])
+        if "minItems" in schema:
+            return f"{schema['minItems']} numbers"
+        return {"a number": "a list of numbers"}.get(inner, f"a list: {inner}")
+    if isinstance(schema.get("additionalProperties"), dict):
+        return f"names, each with {_takes(schema['additionalProperties'])}"
+    return _WORDS.get(schema.get("type", ""), "any value")
+
+
+def _is_number(schema: Mapping[str, Any]) -> bool:
+    """Whether a schema has numbers outside of forms of their own."""
+    inner = [*schema.get("anyOf", ()), schema.get("items"), schema.get("additionalProperties")]
+    return schema.get("type") == "number" or any(_is_number(one) for one in inner if one)

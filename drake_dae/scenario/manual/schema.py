@@ -1,0 +1,51 @@
+"""The JSON Schema of a scenario for editors, which see keys, but no tags."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.scenario import scenario_schema
+
+
+def editor_schema() -> dict[str, Any]:
+    """`scenario_schema` without the entries "_tag", so that editors complete and check keys.
+
+    An editor passes on what stands behind a tag, so that any form fits where a tag chooses.
+    """
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$comment": f"Tags, for an editor: {', '.join(custom_tags())}",
+        **_untagged(scenario_schema()),
+        "patternProperties": {"^_": True},
+    }
+
+
+def custom_tags() -> list[str]:
+    """All tags, as the YAML language server takes them: "!Sphere mapping"."""
+    return [f"{tag} mapping" for tag in dict.fromkeys(_tags(scenario_schema()))]
+
+
+def _untagged(schema: Any) -> Any:
+    if isinstance(schema, list):
+        return [_untagged(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    plain = {
+        ("anyOf" if key == "oneOf" else key): _untagged(value)
+        for key, value in schema.items()
+        if key != TAG
+    }
+    if TAG in schema.get("properties", {}):
+        plain["title"] = schema["properties"][TAG]["const"]
+    if TAG in schema.get("required", ()):
+        plain["required"] = [name for name in schema["required"] if name != TAG]
+    return plain
+
+
+def _tags(schema: Mapping[str, Any]) -> Iterator[str]:
+    for value in schema.values():
+        for one in value if isinstance(value, list) else [value]:
+            if isinstance(one, dict):
+                if TAG in one:
+                    yield one[TAG]["const"]
+                yield from _tags(one)

@@ -1,0 +1,327 @@
+"""The robot of a scenario, with what it touches and what it shall steer."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import QuaternionFloatingJoint
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
+from drake_dae.robots.actuation import Stage
+from drake_dae.robots.actuation.chain import chain
+from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.constraints.plant_constraints import plant_constraints
+from drake_dae.robots.control_choice import control_choice
+from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.loads import KnownForce
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.outputs import PositionOutput
+from drake_dae.scenario.completion.completion import Completed, complete
+from drake_dae.scenario.keys import at, each
+from drake_dae.scenario.parts import Robot, Written, made
+from drake_dae.scenario.robot_file.changes import change_robot, finalize
+from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
+from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
+from drake_dae.scenario.robot_file.reading import read_into, read_robot
+from drake_dae.scenario.scenario import Scenario
+
+
+def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
+    """The robot of a scenario, with what it touches and what it shall steer.
+
+    Args:
+        scenario: What `load_scenario` returns.
+        scene_graph: Where the robot's geometry is registered; needed to draw it.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    return completed_model(scenario, scene_graph)[1]
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def complete_scenario(scenario: Scenario) -> Completed:
+    """A scenario of which nothing is left open: its outputs, and where the robot starts.
+
+    Outputs may be left out, or be fewer than the actuators less the force outputs. What completes
+    them, as far as each is independent of those before it: the world coordinates of each point that
+    touches a surface along it; what `tool_axis` holds of the tool's axis; and positions of joints,
+    of which that set is taken that keeps B(x) (16) best conditioned, and joints off their limits,
+    along the reference. Whatever has no reference holds the value that it starts with.
+
+    Where start.positions are left out and the robot's default configuration leads to no regular
+    start, that is sought with the first values of the references.
+
+    Args:
+        scenario: What `load_scenario` returns.
+
+    Returns:
+        The scenario, the same where nothing was left out, and what was chosen in words.
+
+    Raises:
+        ScenarioError: Something does not fit, the start cannot be reached, or no outputs complete
+            those that are given; the message names the key.
+    """
+    return _read(scenario, SceneGraph()).completed
+
+
+def completed_model(
+    scenario: Scenario,
+    scene_graph: SceneGraph | None = None,
+    payloads: Sequence[Payload] = (),
+) -> tuple[Completed, RobotModel]:
+    """What `complete_scenario` and `scenario_model` return, of a robot with these payloads more."""
+    robot = _read(scenario, scene_graph or SceneGraph(), payloads)
+    scenario = robot.completed.scenario
+    outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
+    with at("actuation" if robot.stages else "outputs"):
+        model = RobotModel(
+            robot.links,
+            robot.constraints,
+            outputs,
+            start_guess(scenario.start.positions, robot.links),
+            robot.name,
+            robot.stages,
+            scenario.forces,
+            tuple(scenario.exogenous),
+            robot.loads,
+            scenario.compliances,
+            scenario.control_weights or None,
+            scenario.compiled,
+        )
+    return robot.completed, model
+
+
+@dataclass(frozen=True, eq=False)
+class _Robot:
+    """A scenario's robot as far as it is checked, and the scenario with nothing left open."""
+
+    name: str
+    links: MultibodyExpressions
+    constraints: Sequence[Constraint]
+    stages: Sequence[Stage]
+    loads: Sequence[KnownForce]
+    completed: Completed
+
+
+def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()) -> _Robot:
+    # The robot.
+    name = scenario.robot.title
+    links, loops = robot_links(scenario.robot, scene_graph, payloads)
+
+    # What it touches or holds.
+    constraints = _constraints(scenario.constraints, loops, links)
+    actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
+    if not actuators:
+        text = (
+            f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
+            "list of joints. Without this key those are driven to which the file gives an "
+            "actuator, as a URDF does by a <transmission>"
+        )
+        raise ScenarioError(("robot.actuators", text))
+
+    # What it shall steer, from where, and by what.
+    _outputs(scenario.outputs, constraints, links)
+    guess = start_guess(scenario.start.positions, links)
+    stages = _stages(scenario.actuation, links)
+    _check_forces(scenario.forces, constraints, links)
+    _check_compliances(scenario.compliances, constraints, links)
+    loads = each("loads", scenario.loads, lambda load: _load(load, links))
+    with at("control_weights"):
+        choice = control_choice(name, scenario.control_weights or None, actuators)
+    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
+
+    # What it leaves open.
+    completed = complete(scenario, links, constraints, plant_constraints(links), guess)
+    return _Robot(name, links, constraints, stages, loads, completed)
+
+
+def scenario_structure(model: RobotModel) -> Structure:
+    """The structure of a scenario's robot.
+
+    Raises:
+        AssumptionError: The robot violates an assumption of the theory.
+        ScenarioError: The robot starts nowhere near its constraints.
+    """
+    try:
+        return find_structure(model.dae)
+    except InconsistentStateError as error:
+        raise ScenarioError(("constraints or start.positions", str(error))) from error
+
+
+@at("robot.file")
+def add_robot(
+    robot: Robot,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    payloads: Sequence[Payload] = (),
+) -> None:
+    """Adds the robot of a scenario to a plant that is not finalized.
+
+    Args:
+        robot: The robot.
+        plant: The plant, registered in the scene graph.
+        scene_graph: The scene graph.
+        payloads: What the scenario has under `plant_payloads`.
+
+    Raises:
+        ScenarioError: Drake cannot read the file, or drops something of it; or what the scenario
+            says beside it does not fit.
+    """
+    change_robot(robot, plant, read_into(plant, robot, scene_graph))
+    add_payloads("plant_payloads", payloads, plant)
+    cut_loops(plant)
+
+
+@at("robot.file")
+def robot_links(
+    robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
+) -> tuple[MultibodyExpressions, list[Constraint]]:
+    """The links of a scenario's robot, and the constraints that those joints are which close loops.
+
+    Args:
+        robot: What the scenario has under `robot`.
+        scene_graph: Where its geometry is registered.
+        payloads: What the scenario has under `plant_payloads`, for the links of the plant.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    plant, efforts = read_robot(robot, scene_graph)
+    change_robot(robot, plant, efforts)
+    add_payloads("plant_payloads", payloads, plant)
+    cuts = cut_loops(plant)
+    finalize(plant)
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        if isinstance(joint, QuaternionFloatingJoint):
+            name = joint.child_body().name()
+            raise ModelError(
+                f"body '{name}' is free; weld it to the world by "
+                f"robot.base, as base: {{weld: {name}}}, or name it in robot.free, which gives it "
+                "a joint in roll, pitch and yaw. A quaternion is not supported: no force keeps its "
+                "length"
+            )
+    links = MultibodyExpressions(plant)
+    try:
+        plant_constraints(links)
+    except ModelError as error:
+        raise ModelError(
+            f"{error}. With leave_out: [constraints] under robot the file stays as it is"
+        ) from None
+    return links, loop_constraints(cuts, plant)
+
+
+def _constraints(
+    forms: Sequence[Constraint | Written[Constraint]], loops: Sequence[Constraint], links: Links
+) -> list[Constraint]:
+    constraints = each("constraints", forms, lambda form: made(form, ()))
+    each("constraints", constraints, lambda constraint: _try(constraint, links))
+    taken = [constraint.name for constraint in (*plant_constraints(links), *loops)]
+    for index, constraint in enumerate(constraints):
+        name = constraint.name
+        if not name or name in taken:
+            key = f"constraints.{index}.name"
+            raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
+        taken.append(name)
+    return [*constraints, *loops]
+
+
+def _try(constraint: Constraint, links: Links) -> None:
+    """Writes a constraint's equations, so that what it names is looked for."""
+    if constraint.residual(links).numel() < len(constraint.force_signals):
+        constraint.rate(links.kinematics())
+
+
+def _check_forces(
+    forces: Sequence[str | ForceOutput] | None, constraints: Sequence[Constraint], links: Links
+) -> None:
+    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    each("forces", forces or (), lambda one: force_rows(force_outputs([one], bound), bound, links))
+    with at("forces"):
+        force_outputs(forces, bound)
+
+
+def _check_compliances(
+    compliances: Mapping[str, float] | None, constraints: Sequence[Constraint], links: Links
+) -> None:
+    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    for name, value in (compliances or {}).items():
+        with at(f"compliances.{name}"):
+            bound.place(name)
+            if not value > 0.0:
+                raise ModelError(f"a compliance must be positive, got {value}")
+
+
+def _outputs(
+    forms: Sequence[PositionOutput | Written[PositionOutput]],
+    constraints: Sequence[Constraint],
+    links: Links,
+) -> list[PositionOutput]:
+    outputs = each("outputs", forms, lambda form: made(form, constraints))
+    each("outputs", outputs, lambda output: output.expression(links))
+    return outputs
+
+
+def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
+    if links.actuator_signals:
+        each("actuation", stages, lambda stage: stage.attach(links))
+    else:
+        with at("actuation"):
+            chain(stages, links)  # It refuses them.
+    return stages
+
+
+def _load(load: KnownForce, links: Links) -> KnownForce:
+    load.reaction(links.kinematics())
+    return load
+
+
+@at("exogenous")
+def _check_exogenous(
+    names: Iterable[str],
+    links: Links,
+    members: Sequence[Constraint | KnownForce],
+    stages: Sequence[Stage],
+    choice: Sequence[Parameter],
+) -> None:
+    """Refuses to move what is no parameter."""
+    attached = [stage.attach(links).parameters for stage in stages]
+    groups = [links.parameters, *(member.parameters for member in members), *attached]
+    known = [parameter.name for group in (*groups, choice) for parameter in group]
+    for name in names:
+        if name not in known:
+            raise ModelError(unknown_name("parameter", name, known))
+
+
+@at("start.positions")
+def start_guess(positions: dict[str, float], links: Links) -> FloatArray:
+    """q near which the robot starts."""
+    guess = links.default_positions.copy()
+    for name, value in positions.items():
+        index = index_of(name, links.position_signals, "joint position")
+        low, high = (limits[index] for limits in links.position_limits)
+        if not low <= value <= high:
+            unit = links.position_signals[index].unit
+            raise ModelError(
+                f"{name} = {value:g} {unit} is outside its limits, {low:g} to {high:g} {unit}"
+            )
+        guess[index] = value
+    return guess
+
+
+def index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
+    """Where a name stands among signals."""
+    names = [signal.name for signal in signals]
+    if name not in names:
+        raise ModelError(unknown_name(kind, name, names))
+    return names.index(name)

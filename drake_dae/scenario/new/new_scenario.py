@@ -1,0 +1,129 @@
+"""A scenario for a robot of which nothing but its file is known."""
+
+from itertools import product
+from pathlib import Path
+from textwrap import shorten
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.systems.analysis import SimulatorConfig
+
+from drake_dae.arguments import checked
+from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.robots.constraints import PointOnSurface
+from drake_dae.robots.links.frames import joint_names
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.outputs import PointCoordinates
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.surfaces.surfaces import Plane
+from drake_dae.scenario import parts as parts
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.model import complete_scenario, robot_links
+from drake_dae.scenario.new.places import find_places
+from drake_dae.scenario.new.robot import NewRobot, new_robot
+from drake_dae.scenario.new.task import SurfaceKind, Task, circle
+from drake_dae.scenario.new.text import scenario_text
+from drake_dae.scenario.scenario import Scenario
+
+_SHARES = (1.0, 0.5, 0.2)
+"""Of the usual circle and force, what is tried at each place."""
+
+_PLACES = 4
+"""So many places are tried."""
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def new_scenario(
+    file: str,
+    surface: SurfaceKind = "plane",
+    tip: str = "",
+    point: Vector = (0.0, 0.0, 0.0),
+    folder: str | Path = "",
+) -> tuple[Scenario, str]:
+    """A scenario in which a robot circles on a surface within its limits, and presses on it.
+
+    The base is what nothing in the file holds; the chain of joints is the longest that neither
+    mimics nor grasps nor rolls, or that to `tip`; all other joints are locked. The surface stands
+    where the tip reaches it with its axis along the normal and the task's directions are most
+    independent. Outputs and start are those of `complete_scenario`. Circle and force leave room to
+    the joints' limits, and `find_feasibility` finds no problem.
+
+    Args:
+        file: The robot's file, as a scenario has it.
+        surface: What it works on: "plane", "cylinder" or "sphere".
+        tip: The frame that touches; found if empty.
+        point: The point in that frame, m, shape (3,).
+        folder: Where the text will be written: a robot's file below is named relative to it.
+
+    Returns:
+        The scenario, and its text with a comment to each choice; `load_scenario` makes the same
+        scenario of it.
+
+    Raises:
+        ScenarioError: The file cannot be read, has no such tip, or no place is reached; the message
+            has what was tried.
+    """
+    is_url = file.startswith("package://")
+    robot = new_robot(file if is_url or not file else str(Path(file).resolve()), tip, point)
+    links, _ = robot_links(robot.robot, SceneGraph())
+    _check_mass(links, robot)
+    tried: list[str] = []
+    places = find_places(links, robot.tip, point)[:_PLACES]
+    for share, place in product(_SHARES, places):
+        task = circle(place, surface, share)
+        try:
+            whole = complete_scenario(_scenario(robot, task, links)).scenario
+            problems = find_feasibility(whole).problems
+        except DrakeDaeError as error:
+            problems = (str(error),)
+        if not problems:
+            return whole, scenario_text(whole, robot, task, Path(folder).resolve())
+        x, y, z = task.center
+        where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
+        tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
+    raise ScenarioError(
+        (
+            "robot",
+            f"no place was found where '{robot.tip}' can move along a {surface}. Tried: "
+            + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
+            + ". Give another tip, or copy a shipped scenario",
+        )
+    )
+
+
+def _check_mass(links: Links, robot: NewRobot) -> None:
+    """Refuses a chain that a force cannot move, as one without inertias."""
+    plant = links.plant
+    assert plant is not None
+    mass = np.linalg.eigvalsh(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+    if mass[0] > 1e-12 * mass[-1]:
+        return
+    joints = joint_names(plant)
+    bodies = [joints[name].child_body() for name in robot.chain]
+    empty = ", ".join(body.name() for body in bodies if body.default_mass() == 0.0)
+    text = f"links without mass, which no force can move: {empty or 'of the chain'}"
+    raise ScenarioError(("robot.file", f"{text}; give them <inertial> with mass and inertia"))
+
+
+def _scenario(robot: NewRobot, task: Task, links: Links) -> Scenario:
+    """The task of a robot, its outputs left open."""
+    names = [signal.name for signal in links.position_signals]
+    stem = Path(robot.robot.file).name.split(".")[0]
+    along = "".join("xyz"[way] for way in task.place.ways)
+    near = dict(zip(names, (np.round(task.place.q, 4) + 0.0).tolist(), strict=True))
+    touching = PointOnSurface(robot.tip, task.surface, robot.point, task.name)
+    return Scenario(
+        description=f"{stem} draws a {task.path} on a {task.name} and presses on it",
+        robot=robot.robot,
+        constraints=[touching],
+        # On a surface that bends much, an axis that stays normal to it hinders the way along.
+        tool_axis="normal" if isinstance(task.surface, Plane) else "fixed",
+        outputs=[PointCoordinates(robot.tip, along, robot.point)],
+        gains=parts.Poles(all=[-4.0]),
+        references=dict(task.references(robot.tip)),
+        start=parts.Start(positions=near),
+        duration=2 * task.period,
+        integrator=SimulatorConfig(
+            integration_scheme="runge_kutta5", accuracy=1e-8, use_error_control=True
+        ),
+    )

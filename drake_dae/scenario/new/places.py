@@ -1,0 +1,202 @@
+"""Where a robot can work: places for a surface that its tip reaches well."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.constraints import PointOnSurface
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.surfaces.surfaces import Plane
+from drake_dae.scenario.completion.choice import first_independent
+from drake_dae.scenario.completion.postures import Posture, Postures
+from drake_dae.scenario.completion.search import near_posture
+from drake_dae.scenario.completion.tool_axis import tool_axis
+from drake_dae.trace.functions import TracedFunction
+
+# A table, walls around, and a ceiling: axis of the normal, its sign, and how much they are liked.
+_NORMALS = (
+    (2, 1.0, 1.0),
+    (0, -1.0, 0.8),
+    (1, -1.0, 0.7),
+    (0, 1.0, 0.6),
+    (1, 1.0, 0.6),
+    (2, -1.0, 0.4),
+)
+
+_TRIES = 40
+"""So many postures are tried for each normal."""
+
+_PATIENCE = 8
+"""After so many tries without a tool that is normal to the surface it is given up."""
+
+_SLANTED = 0.3
+"""How much a posture counts in which the tool is not normal to the surface."""
+
+_SLOW = 0.3
+"""The part of the joints' speed limits that a path may take, and of effort limits a force."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place for a surface.
+
+    Attributes:
+        point: Where the tip touches, m, shape (3,).
+        axis: Which axis of the world the normal is along.
+        sign: 1 or -1: to which side.
+        q: A posture there, shape (nq,).
+        quality: How independently the task's directions can be moved there, from 0 to 1, less near
+            limits.
+        ways: Which axes of the world along the surface it can be moved along, one or two.
+        directions: How many of the normal, the two ways along, and the two angles these are.
+        speed: How fast the tip may move along, m/s, for the joints to stay below their limits.
+        force: How hard it may press, N, likewise; infinite without limits.
+        size: The size of the robot, m.
+    """
+
+    point: FloatArray
+    axis: int
+    sign: float
+    q: FloatArray
+    quality: float
+    ways: tuple[int, ...]
+    directions: int
+    speed: float
+    force: float
+    size: float
+
+    @property
+    def normal(self) -> Vector:
+        """The normal toward the robot."""
+        normal = [0.0, 0.0, 0.0]
+        normal[self.axis] = self.sign
+        return (normal[0], normal[1], normal[2])
+
+
+def find_places(links: Links, tip: str, point: Vector) -> list[Place]:
+    """The best place for each direction of a surface, the most liked first.
+
+    Each is the best of some postures with the tool normal to the surface, where that can be had: by
+    the independence of the task's directions, off joint limits, with bodies on the free side, the
+    base beside the tip, and half of the torques left when the robot stands still.
+
+    Args:
+        links: The robot.
+        tip: The frame that touches.
+        point: The point in it, m.
+    """
+    search = _Search(links, tip, point)
+    found = [search.best(axis, sign) for axis, sign, _ in _NORMALS]
+    ranked = [(place, liked) for place, (_, _, liked) in zip(found, _NORMALS, strict=True) if place]
+    ranked.sort(key=lambda pair: -pair[0].quality * pair[0].directions * pair[1])
+    return [place for place, _ in ranked]
+
+
+class _Search:
+    """Postures of a robot beside surfaces that are not there yet."""
+
+    def __init__(self, links: Links, tip: str, point: Vector) -> None:
+        self._links = links
+        touch = PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
+        axis = tool_axis(links, touch)
+        rotation, place = links.rotation(tip), links.position(tip, point)
+        # The tip's place, and for each axis of the world the two components across the tool's.
+        across = [k for k in range(3) if k != axis.column]
+        rows = ca.vertcat(place, *[rotation[k, across].T for k in range(3)])
+        self._postures = Postures(links, ConstraintSet(()), rows, ca.SX(0, 0), [], {})
+        bodies = ca.horzsplit(links.landmarks())
+        still = [body for body in bodies if not ca.depends_on(body, links.q)]
+        moving = [place, *(body for body in bodies if ca.depends_on(body, links.q))]
+        weight = ca.substitute(links.bias, links.v, ca.SX.zeros(links.v.numel()))
+        self._function = TracedFunction(
+            "places",
+            {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in links.parameters])},
+            {
+                "outward": axis.sign * rotation[:, axis.column],
+                "moving": ca.horzcat(*moving),
+                "still": ca.horzcat(*still),
+                "weight": weight,
+            },
+        )
+        self._values = np.concatenate([p.value for p in links.parameters])
+        speeds = links.velocity_limits[1]
+        self._speeds = np.where(np.isfinite(speeds) & (speeds > 0.0), speeds, np.inf)
+        efforts = np.full(links.v.numel(), np.inf)
+        driven = np.argmax(np.abs(links.actuation_matrix), axis=0)
+        efforts[driven] = links.effort_limits
+        self._efforts = np.where(efforts > 0.0, efforts, np.inf)
+        self._guesses = self._postures.guesses(_TRIES)
+
+    def best(self, axis: int, sign: float) -> Place | None:
+        """The best place for a surface with a normal, None if none is any good."""
+        tilts = [3 + 2 * axis, 4 + 2 * axis]
+        aligned: list[Posture] = []
+        for count, guess in enumerate(self._guesses):
+            if count == _PATIENCE and not aligned:
+                break  # A robot that moves in a plane never turns its tool some ways.
+            posture = near_posture(self._postures, tilts, np.zeros(2), guess)
+            aligned += [] if posture is None else [posture]
+        slanted = [self._postures.at(guess) for guess in self._guesses]
+        found = [self._place(axis, sign, posture, 1.0) for posture in aligned]
+        found += [self._place(axis, sign, posture, _SLANTED) for posture in slanted]
+        good = [place for place in found if place is not None]
+        return max(good, key=lambda one: one.quality * one.directions, default=None)
+
+    def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> Place | None:
+        """The place of a posture, None where the tip cannot move along the surface."""
+        tilts = [3 + 2 * axis, 4 + 2 * axis]
+        first = [k for k in range(3) if k != axis]
+        rows = first_independent(posture, [], [axis, *first, *tilts], posture.q.size)
+        ways = tuple(row for row in rows if row in first)
+        if axis not in rows or not ways:
+            return None
+        quality = posture.independence(rows) * self._postures.margin(posture.q)
+        quality *= worth * self._surroundings(posture, axis, sign)
+        return Place(
+            posture.rows[:3],
+            axis,
+            sign,
+            posture.q,
+            quality,
+            ways,
+            len(rows),
+            self._speed(posture, rows, len(ways)),
+            self._force(posture, axis),
+            self._postures.size,
+        )
+
+    def _surroundings(self, posture: Posture, axis: int, sign: float) -> float:
+        """A factor of 0.1 for whatever speaks against a posture."""
+        outward, moving, still, weight = self._function(posture.q, self._values)
+        place, size = posture.rows[:3], self._postures.size
+        behind = sign * (moving.reshape(3, -1)[axis] - place[axis])
+        roots = still.reshape(3, -1).mean(axis=1)
+        beside = place - roots
+        beside[axis] = 0.0
+        # A table may be as high as the base; a wall must not cut it.
+        in_front = axis == 2 or sign * (roots[axis] - place[axis]) > 0.1 * size
+        is_beside = axis != 2 or np.linalg.norm(beside) > 0.2 * size
+        doubts = (
+            bool(np.min(behind) < -0.02 * size),
+            bool(sign * outward[axis] > -0.5),
+            not in_front,
+            not is_beside,
+            bool(np.any(np.abs(weight) > 0.5 * self._efforts)),
+        )
+        return float(0.1 ** sum(doubts))
+
+    def _speed(self, posture: Posture, rows: list[int], ways: int) -> float:
+        """How fast the tip may move along any way: they are the rows after that of the normal."""
+        inverse = np.linalg.pinv(posture.gradients[rows])[:, 1 : 1 + ways]
+        fastest = np.max(np.abs(inverse) / self._speeds[:, None], initial=0.0)
+        return float(_SLOW / fastest) if fastest > 0.0 else np.inf
+
+    def _force(self, posture: Posture, axis: int) -> float:
+        """How hard the tip may press."""
+        lever = np.abs(posture.gradients[axis])
+        share = np.max(lever / self._efforts, initial=0.0)
+        return float(_SLOW / 2 / share) if share > 0.0 else np.inf

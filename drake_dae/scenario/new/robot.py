@@ -1,0 +1,280 @@
+"""The robot of a new scenario: its base, the chain that works, its tip, and what is locked."""
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydrake.multibody.parsing import GetScopedFrameByName, PackageMap
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Joint,
+    PrismaticJoint,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    RigidBody,
+    WeldJoint,
+)
+
+from drake_dae.arrays import unknown_name
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.plant_constraints import couplings_of
+from drake_dae.robots.links.frames import joint_names, unique_names
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.keys import at
+from drake_dae.scenario.parts import Base, Robot
+from drake_dae.scenario.robot_file.changes import finalize
+from drake_dae.scenario.robot_file.packages import find_packages
+from drake_dae.scenario.robot_file.reading import read_robot
+
+_NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
+"""What grasps or rolls: joints with such names are locked, if others are left."""
+
+# A hand may be the link that the last joint of an arm turns, a finger not.
+_FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
+
+_LEFT_OUT: tuple[tuple[Literal["joint_friction", "inertia"], ...], ...] = (
+    (),
+    ("joint_friction",),
+    ("inertia",),
+    ("joint_friction", "inertia"),
+)
+"""What must be left out of a file is found by trying."""
+
+_TOOLS = [
+    re.compile(word, re.IGNORECASE)
+    for word in ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
+]
+"""How vendors name the frame at the end of an arm, the best names first."""
+
+
+@dataclass(frozen=True)
+class NewRobot:
+    """A robot with a chain of joints that works, and everything else locked.
+
+    Attributes:
+        robot: What the scenario has under `robot`.
+        chain: The joints that move, from the base to the tip.
+        tip: The frame at the end of the chain.
+        point: The point in it that touches, m, shape (3,).
+        remarks: Key under `robot`, or "tip" -> why it is so.
+    """
+
+    robot: Robot
+    chain: tuple[str, ...]
+    tip: str
+    point: Vector
+    remarks: Mapping[str, str]
+
+
+def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewRobot:
+    """Finds what a scenario must say of a robot whose file does not say it.
+
+    The chain is the longest of joints that turn or slide, without those that mimic others, grasp or
+    roll; or that which leads to a tip that is given.
+
+    Args:
+        file: The robot's file, as a scenario has it.
+        tip: A frame; found if empty.
+        point: The point in it.
+
+    Raises:
+        ScenarioError: The file cannot be read, has no such tip, or nothing that can move it.
+    """
+    with at("robot.file"):
+        plant, robot = _read(file)
+        tree = _Tree(plant)
+        robot, remarks = _held(tree, robot)
+        chain, end = _chain(tree, tip)
+        remarks["tip"] = (
+            f"at the end of {_count(len(chain), 'joint')}"
+            if tip
+            else f"the end of the longest chain, of {_count(len(chain), 'joint')}"
+        )
+        locked = _locked(tree, chain)
+        if locked:
+            remarks["locked"] = "m or rad; all that is not of the chain, or mimics"
+        driven = {
+            plant.get_joint_actuator(index).joint().index()
+            for index in plant.GetJointActuatorIndices()
+        }
+        actuators = None
+        if any(joint.index() not in driven for joint in chain):
+            actuators = "all"
+            remarks["actuators"] = "that are not locked: the file drives not all of them"
+        return NewRobot(
+            replace(robot, locked=locked, actuators=actuators),
+            tuple(tree.names[joint.index()] for joint in chain),
+            end,
+            point,
+            remarks,
+        )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _read(file: str) -> tuple[MultibodyPlant, Robot]:
+    """The finalized plant, and the robot with what must be left out of its file."""
+    problem: ModelError | None = None
+    packages = _folders_above(file)
+    for leave_out in _LEFT_OUT:
+        robot = Robot(file, packages, actuators="all", leave_out=list(leave_out))
+        try:
+            plant, _ = read_robot(robot)
+        except ModelError as error:
+            problem = problem or error
+            continue
+        finalize(plant)
+        return plant, robot
+    assert problem is not None
+    raise problem
+
+
+def _folders_above(file: str) -> dict[str, str]:
+    """Packages that are found nowhere else -> folders of that name above the file."""
+    with suppress(RuntimeError, ValueError, OSError):  # Whoever reads the file tells it.
+        _, missing = find_packages(file, PackageMap())
+        return {
+            name: str(folder)
+            for name in missing
+            for folder in [one for one in Path(file).resolve().parents if one.name == name][:1]
+        }
+    return {}
+
+
+class _Tree:
+    """The bodies and joints of a plant, from the world outward."""
+
+    def __init__(self, plant: MultibodyPlant) -> None:
+        self.plant = plant
+        self.joints: list[Joint] = [plant.get_joint(i) for i in plant.GetJointIndices()]
+        self.above = {joint.child_body().index(): joint for joint in self.joints}
+        self.names = {joint.index(): name for name, joint in joint_names(plant).items()}
+        self.couplings = couplings_of(plant) if plant.num_constraints() else []
+        bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+        self.bodies: dict[str, RigidBody] = dict(
+            zip(unique_names(plant, bodies), bodies, strict=True)
+        )
+
+    def path(self, body: RigidBody) -> list[Joint]:
+        """The joints from the world to a body."""
+        found: list[Joint] = []
+        while body.index() in self.above:
+            found.append(self.above[body.index()])
+            body = found[-1].parent_body()
+        return found[::-1]
+
+    @property
+    def coupled(self) -> set[str]:
+        """Names of joints that follow or lead others."""
+        return {name for one in self.couplings for name in (one.follower, one.leader)}
+
+    def can_work(self, joint: Joint) -> bool:
+        """Whether a joint turns or slides for itself."""
+        if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+            return False
+        low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        return self.names[joint.index()] not in self.coupled and bool(high > low)
+
+
+def _held(tree: _Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
+    """The robot with a base that the world holds, and remarks."""
+    remarks: dict[str, str] = {}
+    if robot.packages:
+        remarks["packages"] = "where package://<name>/ leads"
+    if robot.leave_out:
+        remarks["leave_out"] = "what the file has and the equations have not"
+    free = [j for j in tree.joints if isinstance(j, QuaternionFloatingJoint)]
+    names = {body.index(): name for name, body in tree.bodies.items()}
+    roots = [names[joint.child_body().index()] for joint in free]
+    if len(roots) > 1:
+        raise ModelError(
+            f"{len(roots)} bodies are held by nothing ({', '.join(roots[:8])}), and a new scenario "
+            "holds one; copy a shipped scenario with several bodies, as two_arms_free_box, and "
+            "write robot.base or robot.free"
+        )
+    for joint in tree.joints:
+        kinds = WeldJoint | RevoluteJoint | PrismaticJoint | QuaternionFloatingJoint
+        if not isinstance(joint, kinds):
+            raise ModelError(
+                f"joint '{joint.name()}' ({joint.type_name()}) neither turns about one axis nor "
+                "slides along one; a new scenario can neither drive nor lock it"
+            )
+    if roots:
+        remarks["base"] = "nothing in the file holds it"
+        robot = replace(robot, base=Base(roots[0]))
+    return robot, remarks
+
+
+def _chain(tree: _Tree, tip: str) -> tuple[list[Joint], str]:
+    """The joints that work, and the name of the frame at their end."""
+    if tip:
+        try:
+            body = GetScopedFrameByName(tree.plant, tip).body()
+        except RuntimeError:
+            raise ModelError(unknown_name("tip", tip, tree.bodies)) from None
+        chain = [joint for joint in tree.path(body) if tree.can_work(joint)]
+        if not chain:
+            raise ModelError(f"no joint that turns or slides for itself moves the tip '{tip}'")
+        return chain, tip
+
+    def longest(joints: Sequence[Joint]) -> list[Joint]:
+        allowed = {joint.index() for joint in joints}
+        paths = [
+            [joint for joint in tree.path(body) if joint.index() in allowed]
+            for body in tree.bodies.values()
+        ]
+        return max(paths, key=len, default=[])
+
+    works = [joint for joint in tree.joints if tree.can_work(joint)]
+    arms = [
+        joint
+        for joint in works
+        if not _NOT_OF_AN_ARM.search(joint.name()) and not _FINGER.search(joint.child_body().name())
+    ]
+    chain = longest(arms) or longest(works)
+    if not chain:
+        raise ModelError("no joint turns or slides for itself, so that there is nothing to drive")
+    return chain, _tip(tree, chain)
+
+
+def _tip(tree: _Tree, chain: Sequence[Joint]) -> str:
+    """The frame that a vendor means by the end of a chain, or else what is farthest out."""
+    last, moving = chain[-1], {joint.index() for joint in chain}
+    context = tree.plant.CreateDefaultContext()
+    origin = last.frame_on_child().CalcPoseInWorld(context).translation()
+    distances: dict[str, float] = {}
+    for name, body in tree.bodies.items():
+        if sum(joint.index() in moving for joint in tree.path(body)) == len(chain):
+            place = tree.plant.EvalBodyPoseInWorld(context, body).translation()
+            distances[name] = float(np.linalg.norm(place - origin))
+    for word in _TOOLS:
+        named = [n for n in distances if word.search(n) and not _FINGER.search(n)]
+        if named:
+            return max(named, key=lambda name: distances[name])
+    return max(distances, key=lambda name: distances[name])
+
+
+def _locked(tree: _Tree, chain: Sequence[Joint]) -> dict[str, float]:
+    """Where each joint that is not of the chain stays; those that follow others follow."""
+    moving = {joint.index() for joint in chain}
+    followers = {one.follower for one in tree.couplings}
+    return {
+        tree.names[joint.index()]: _resting(joint)
+        for joint in tree.joints
+        if isinstance(joint, RevoluteJoint | PrismaticJoint)
+        and joint.index() not in moving
+        and tree.names[joint.index()] not in followers
+    }
+
+
+def _resting(joint: Joint) -> float:
+    """Zero, or what is closest to it within limits."""
+    low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+    return float(min(max(0.0, low), high))

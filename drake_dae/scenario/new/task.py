@@ -1,0 +1,93 @@
+"""What a robot shall do at a place: a surface, a circle on it, and a force."""
+
+from dataclasses import dataclass
+from math import ceil, isfinite, log10, pi
+from typing import Literal
+
+import numpy as np
+
+from drake_dae.dae.references import CircleReference, SinusoidReference
+from drake_dae.robots.surfaces.surface import Surface, Vector
+from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
+from drake_dae.scenario.new.places import Place
+
+SurfaceKind = Literal["plane", "cylinder", "sphere"]
+
+Path = CircleReference | SinusoidReference
+
+SHORTEST = 5.0
+"""A circle takes so long at least, in s."""
+
+_RADIUS, _BEND, _FORCE = 0.08, 0.4, 20.0
+"""Of the circle and of a curved surface, relative to the robot's size; and the largest force, N."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A circle on a surface.
+
+    Attributes:
+        place: Where.
+        name: What the surface is called.
+        surface: The surface.
+        center: The point of the surface in the middle, m, rounded.
+        radius: Of the circle, seen along the normal, m.
+        period: How long it takes, s.
+        force: How hard the tip presses, N.
+    """
+
+    place: Place
+    name: str
+    surface: Surface
+    center: Vector
+    radius: float
+    period: float
+    force: float
+
+    def references(self, tip: str) -> dict[str, Path | float]:
+        """The circle of a frame, or the line where there is one way alone, and the force."""
+        ways, middle = self.place.ways, [self.center[way] for way in self.place.ways]
+        path: Path
+        if len(ways) > 1:
+            path = CircleReference(middle, self.radius, period=self.period)
+        else:
+            path = SinusoidReference(middle[0], [self.radius], [round(2 * pi / self.period, 4)])
+        along = "".join("xyz"[way] for way in ways)
+        return {f"{tip}.{along}": path, f"{self.name}.force": self.force}
+
+    @property
+    def path(self) -> str:
+        """What the tip draws."""
+        return "circle" if len(self.place.ways) > 1 else "line"
+
+
+def circle(place: Place, kind: SurfaceKind, share: float) -> Task:
+    """A circle at a place, of a share of the usual radius and force."""
+    decimals = 2 if place.size > 0.3 else 3
+    x, y, z = (round(float(value), decimals) + 0.0 for value in place.point)
+    center = (x, y, z)
+    radius = _round_number(share * _RADIUS * place.size)
+    force = _round_number(share * min(_FORCE, place.force))
+    period = SHORTEST
+    if isfinite(place.speed):
+        period = max(period, float(ceil(2 * pi * radius / place.speed)))
+    bend = round(_BEND * place.size, decimals)
+    middle = np.round(np.array(center) - bend * np.array(place.normal), decimals) + 0.0
+    inner = (float(middle[0]), float(middle[1]), float(middle[2]))
+    if kind == "cylinder":
+        axis = [0.0, 0.0, 0.0]
+        axis[place.ways[-1]] = 1.0  # A robot that moves in a plane goes around it.
+        if len(place.ways) == 1:
+            axis = [float(k not in (place.axis, *place.ways)) for k in range(3)]
+        surface: Surface = Cylinder(inner, (axis[0], axis[1], axis[2]), bend)
+        return Task(place, "pipe", surface, center, radius, period, force)
+    if kind == "sphere":
+        return Task(place, "ball", Sphere(inner, bend), center, radius, period, force)
+    name = {1.0: "table", -1.0: "ceiling"}[place.sign] if place.axis == 2 else "wall"
+    return Task(place, name, Plane(center, place.normal), center, radius, period, force)
+
+
+def _round_number(value: float) -> float:
+    """The largest of 1, 2, 3, 5, 8 times a power of ten that is not above a value."""
+    power = 10.0 ** int(np.floor(log10(value)))
+    return max(float(f"{k * power:.3g}") for k in (1, 2, 3, 5, 8) if k * power <= value * 1.001)

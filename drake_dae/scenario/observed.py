@@ -1,0 +1,32 @@
+"""The system that the law of a scenario with an observer is for."""
+
+from drake_dae.dae.beyond.disturbance import with_disturbance
+from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.keys import at
+from drake_dae.scenario.scenario import Scenario
+
+
+def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
+    """The structure of what a scenario's law is for: with a disturbance, where it is observed.
+
+    Raises:
+        ScenarioError: The observer does not fit; the message names its key.
+    """
+    observer = scenario.observer
+    if observer is None:
+        return structure
+    with at("observer"):
+        if scenario.exogenous:
+            raise ModelError("not beside exogenous signals, whose port it feeds")
+        rubbing = {c.name: c.friction_parameter for c in model.constraints if c.friction_parameter}
+        for name in observer.friction:
+            if name not in rubbing:
+                raise ModelError(
+                    f"friction: '{name}' is no constraint with friction; give it friction: 0.0 "
+                    f"where it is not known. With friction: {', '.join(rubbing) or 'none'}"
+                )
+        velocities = [signal.name for signal in model.links.velocity_signals]
+        frictions = [rubbing[name] for name in observer.friction]
+        return find_structure(with_disturbance(model.dae, velocities, frictions))

@@ -1,0 +1,284 @@
+"""What a scenario changes about the robot of its file: base, locked joints, actuators, payloads."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Literal
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import GetScopedFrameByName
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Joint,
+    JointActuator,
+    PrismaticJoint,
+    RevoluteJoint,
+    RpyFloatingJoint,
+    WeldJoint,
+)
+
+from drake_dae.arrays import unknown_name
+from drake_dae.errors import DrakeDaeError, ModelError
+from drake_dae.robots.constraints.plant_constraints import Coupling, couplings_of
+from drake_dae.robots.links.frames import joint_names, unique_names
+from drake_dae.scenario.keys import at
+from drake_dae.scenario.parts import Base, Robot
+from drake_dae.scenario.robot_file.efforts import Efforts, limits_of
+from drake_dae.scenario.robot_file.payloads import add_payloads
+from drake_dae.scenario.robot_file.reading import read_robot
+
+
+def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
+    """Makes what a scenario says of a robot beside its file.
+
+    Args:
+        robot: What the scenario has under `robot`.
+        plant: The robot of that file, not finalized.
+        efforts: The effort limits of the file, for actuators that it has not.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    couplings: Sequence[Coupling] = ()
+    if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
+        couplings = _read_couplings(robot)
+    with _told_by_drake():
+        if robot.base is not None:
+            weld_base(robot.base, plant)
+        if robot.locked:
+            lock_joints(robot.locked, plant, couplings)
+        add_free_joints(robot.free, plant)
+        if robot.actuators is not None:
+            drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
+        add_payloads("robot.payloads", robot.payloads, plant)
+
+
+def finalize(plant: MultibodyPlant) -> None:
+    """Finalizes a plant.
+
+    Raises:
+        ModelError: Drake refuses to.
+    """
+    with _told_by_drake():
+        plant.Finalize()
+
+
+@contextmanager
+def _told_by_drake() -> Iterator[None]:
+    """Makes errors of Drake ours, SystemExit for an assertion of its own as well."""
+    try:
+        yield
+    except DrakeDaeError:
+        raise
+    except (RuntimeError, ValueError, SystemExit) as error:
+        raise ModelError(str(error)) from None
+
+
+def _read_couplings(robot: Robot) -> Sequence[Coupling]:
+    """The couplings of the file, from a plant of its own: only a finalized one tells them."""
+    plant, _ = read_robot(robot)
+    finalize(plant)
+    return couplings_of(plant)
+
+
+@at("robot.base.weld")
+def weld_base(base: Base, plant: MultibodyPlant) -> None:
+    """Welds a frame of a body that no joint holds to the world.
+
+    Raises:
+        ScenarioError: There is no such frame, or a joint holds its body.
+    """
+    try:
+        frame = GetScopedFrameByName(plant, base.weld)
+    except RuntimeError:
+        free = _free_bodies(plant)
+        raise ModelError(unknown_name("free body or frame on it", base.weld, free)) from None
+    body = frame.body()
+    if body.index() == plant.world_body().index():
+        raise ModelError("the world holds itself; name a frame of the robot")
+    held = [joint.name() for joint in _joints(plant) if joint.child_body() is body]
+    if held:
+        raise ModelError(
+            f"body '{body.name()}' is held already, by joint '{held[0]}'; bodies that nothing "
+            f"holds: {', '.join(_free_bodies(plant)) or 'none'}"
+        )
+    rotation = RollPitchYaw(np.deg2rad(base.pose.rpy_deg))
+    plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, base.pose.translation))
+
+
+@at("robot.free")
+def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
+    """Gives bodies that no joint holds one in roll, pitch and yaw, for which files have no word.
+
+    Raises:
+        ScenarioError: There is no such body, or a joint holds it.
+    """
+    for name in bodies:
+        try:
+            body = GetScopedFrameByName(plant, name).body()
+            held = [j.name() for j in _joints(plant) if j.child_body().index() == body.index()]
+            if held:
+                raise ModelError(f"'{name}' is not free: joint '{held[0]}' holds it")
+            plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
+        except RuntimeError as error:
+            raise ModelError(f"'{name}' is no body that can be free: {error}") from None
+
+
+@at("robot.locked")
+def lock_joints(
+    locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[Coupling]
+) -> None:
+    """Puts a weld in the place of joints, at given positions.
+
+    Drake locks joints in discrete time alone. A weld has the same motion: X_FM(q) of the joint,
+    from its frame on the parent to that on the child, at the constant q. The torque that holds the
+    joint is then one inside of a body; the actuator, damping and rotor of the joint are gone.
+
+    A joint that a locked one leads, q_f = ratio q_l + offset, is locked with it, and likewise the
+    one that leads a locked one.
+
+    Args:
+        locked: Name -> position, in rad or m.
+        plant: The robot, not finalized; changed.
+        couplings: Those of the plant.
+
+    Raises:
+        ScenarioError: There is no such joint, its position is outside of its limits or
+            contradicts a coupling, or the file has other constraints.
+    """
+    joints = _movable(plant)
+    if plant.num_constraints() > len(couplings):
+        raise ModelError(
+            "the file has constraints other than mimic joints, which Drake loses when a joint is "
+            "locked; take them out of it, and write them under constraints"
+        )
+    positions = dict(locked)
+    _spread(positions, couplings)
+    for name, value in positions.items():
+        if name not in joints:
+            raise ModelError(unknown_name("turning or sliding joint", name, joints))
+        joint = joints[name]
+        low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        # Round-off of a ratio must not put a finger outside.
+        if not low - 1e-9 <= value <= high + 1e-9:
+            unit = "m" if isinstance(joint, PrismaticJoint) else "rad"
+            given = "" if name in locked else ", as the joint that it is coupled to has it,"
+            raise ModelError(
+                f"{name} = {value:g} {unit}{given} is outside its limits, {low:g} to {high:g} "
+                f"{unit}"
+            )
+    # Drake removes joints only where there are no constraints.
+    for key in plant.GetConstraintIds():
+        plant.RemoveConstraint(key)
+    for name, value in positions.items():
+        _weld_joint(joints.pop(name), value, plant)
+    for coupling in couplings:
+        if coupling.follower in joints:
+            pair = joints[coupling.follower], joints[coupling.leader]
+            plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
+
+
+def _spread(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
+    """Adds the joints that are coupled to those with a position."""
+    for _ in couplings:  # As often as the longest chain needs.
+        for one in couplings:
+            if one.leader in positions:
+                wanted = one.ratio * positions[one.leader] + one.offset
+                value = positions.setdefault(one.follower, wanted)
+                if abs(value - wanted) > 1e-9:
+                    raise ModelError(
+                        f"{one.follower} = {value:g}, but it is coupled to {one.leader} = "
+                        f"{positions[one.leader]:g}, which makes it {wanted:g}; lock one of them"
+                    )
+            elif one.follower in positions and one.ratio != 0.0:
+                positions[one.leader] = (positions[one.follower] - one.offset) / one.ratio
+
+
+def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
+    """Puts a weld in the place of a joint with one position."""
+    name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
+    if isinstance(joint, PrismaticJoint):
+        pose = RigidTransform(position * joint.translation_axis())
+    else:
+        pose = RigidTransform(AngleAxis(position, joint.revolute_axis()), np.zeros(3))
+    for actuator in _actuators(plant):
+        if actuator.joint() is joint:
+            plant.RemoveJointActuator(actuator)
+    try:
+        plant.RemoveJoint(joint)
+    except RuntimeError as error:
+        raise ModelError(f"'{name}' cannot be locked: {error}") from None
+    plant.AddJoint(WeldJoint(name, inboard, outboard, pose))
+
+
+@at("robot.actuators")
+def drive_joints(
+    driven: Literal["all"] | Sequence[str] | Mapping[str, float | None],
+    plant: MultibodyPlant,
+    couplings: Sequence[Coupling],
+    efforts: Mapping[str, float],
+) -> None:
+    """Gives actuators to the joints that a scenario names, and takes them from all others.
+
+    An actuator that the file has stays, with its gear ratio and its rotor.
+
+    Args:
+        driven: Names of joints, or name -> effort limit in N m or N; or "all" that turn or slide
+            and follow no other.
+        plant: The robot, not finalized; changed.
+        couplings: Those of the plant.
+        efforts: Name -> effort limit of the file, for actuators that are new and have none.
+
+    Raises:
+        ScenarioError: There is no such joint, or it has several positions.
+    """
+    joints = _movable(plant)
+    if driven == "all":
+        followers = {coupling.follower for coupling in couplings}
+        driven = [name for name in joints if name not in followers]
+    limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
+    for name in limits:
+        if name not in joints:
+            raise ModelError(unknown_name("turning or sliding joint", name, joints))
+    chosen = {joints[name].index(): limit for name, limit in limits.items()}
+    names = {joints[name].index(): name for name in limits}
+    has: set[int] = set()
+    for actuator in _actuators(plant):
+        index = actuator.joint().index()
+        if index not in chosen:
+            plant.RemoveJointActuator(actuator)
+            continue
+        has.add(index)
+        if chosen[index] is not None:
+            actuator.set_effort_limit(chosen[index])
+    for index, limit in chosen.items():
+        if index not in has:
+            own = efforts.get(names[index], np.inf)
+            joint = joints[names[index]]
+            plant.AddJointActuator(joint.name(), joint, own if limit is None else limit)
+
+
+def _joints(plant: MultibodyPlant) -> list[Joint]:
+    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+
+
+def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
+    """Name -> joint, of those with one position."""
+    return {
+        name: joint
+        for name, joint in joint_names(plant).items()
+        if isinstance(joint, RevoluteJoint | PrismaticJoint)
+    }
+
+
+def _actuators(plant: MultibodyPlant) -> list[JointActuator]:
+    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+
+
+def _free_bodies(plant: MultibodyPlant) -> list[str]:
+    """The names of the bodies that no joint holds, without the world."""
+    held = {joint.child_body().index() for joint in _joints(plant)}
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    return unique_names(plant, [body for body in bodies if body.index() not in held])

@@ -1,0 +1,201 @@
+"""Joints of a robot's file that close loops: cut out of the tree, and made constraints."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Joint, JointActuator, PrismaticJoint, RevoluteJoint, WeldJoint
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints import Constraint, PrismaticLoopJoint, RevoluteLoopJoint
+from drake_dae.robots.links.frames import frame_name, joint_names
+from drake_dae.robots.surfaces.surface import axes_along, triple
+
+
+@dataclass(frozen=True)
+class CutJoint:
+    """A joint that closes a loop, as it was in the plant.
+
+    Attributes:
+        name: Its name.
+        slides: Whether it slides; else it turns.
+        bodies: The indices of parent and child.
+        poses: The poses of its frames on parent and child.
+        axis: Its axis in these frames, shape (3,).
+        options: What the constraint has of it: damping, limits, motor.
+    """
+
+    name: str
+    slides: bool
+    bodies: tuple[Any, Any]
+    poses: tuple[RigidTransform, RigidTransform]
+    axis: FloatArray
+    options: dict[str, Any]
+
+
+def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
+    """Takes joints out of a plant until the others form a tree; a driven one only if it must be.
+
+    Args:
+        plant: Not finalized; changed.
+
+    Raises:
+        ModelError: A loop has no joint that can be cut, or Drake cannot take it out.
+    """
+    driven = {a.joint().index(): a for a in _actuators(plant)}
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    joints.sort(key=lambda joint: _reluctance(joint, joint.index() in driven), reverse=True)
+    groups = {index: index for index in range(plant.num_bodies())}
+
+    def group(body: int) -> int:
+        while groups[body] != body:
+            body = groups[body]
+        return body
+
+    found = []
+    for joint in joints:
+        first, second = (
+            group(int(body.index())) for body in (joint.parent_body(), joint.child_body())
+        )
+        groups[first] = second
+        if first == second:
+            actuator = driven.get(joint.index())
+            found.append(_cut(joint, names.get(joint.index(), joint.name()), actuator, plant))
+    return found
+
+
+def _reluctance(joint: Joint, is_driven: bool) -> int:
+    """The higher, the later it is cut."""
+    if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+        return 2
+    return 1 if is_driven else 0
+
+
+def _cut(
+    joint: Joint, name: str, actuator: JointActuator | None, plant: MultibodyPlant
+) -> CutJoint:
+    if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+        raise ModelError(
+            f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
+            "and write it under constraints, as a !WeldedFrames or !CoincidentPoints"
+        )
+    slides = isinstance(joint, PrismaticJoint)
+    options: dict[str, Any] = {"damping": joint.default_damping(), "name": name}
+    limits = {
+        "lower": joint.position_lower_limits()[0],
+        "upper": joint.position_upper_limits()[0],
+        "velocity_limit": joint.velocity_upper_limits()[0],
+    }
+    if actuator is not None:
+        if actuator.default_rotor_inertia() != 0.0:
+            raise ModelError(
+                f"joint '{name}' closes a loop, as all joints of it do that could be cut, and its "
+                "motor has a rotor: that cannot be a constraint; leave one joint without motor"
+            )
+        options["motor"] = True
+        limits["effort_limit"] = actuator.effort_limit()
+        plant.RemoveJointActuator(actuator)
+    options |= {key: float(value) for key, value in limits.items() if isfinite(value)}
+    frames = joint.frame_on_parent(), joint.frame_on_child()
+    cut = CutJoint(
+        name,
+        slides,
+        (joint.parent_body().index(), joint.child_body().index()),
+        (frames[0].GetFixedPoseInBodyFrame(), frames[1].GetFixedPoseInBodyFrame()),
+        np.array(joint.translation_axis() if slides else joint.revolute_axis()),
+        options,
+    )
+    try:
+        plant.RemoveJoint(joint)
+    except RuntimeError as error:
+        raise ModelError(f"joint '{name}' closes a loop, and cannot be cut: {error}") from None
+    return cut
+
+
+def loop_constraints(cuts: Sequence[CutJoint], plant: MultibodyPlant) -> list[Constraint]:
+    """The constraints that cut joints are.
+
+    Where all joints of a loop move in one plane, the constraint is one of that plane alone: in
+    space it would be redundant.
+
+    Args:
+        cuts: What `cut_loops` returned.
+        plant: The robot, finalized.
+    """
+    return [_constraint(cut, plant) for cut in cuts]
+
+
+def _constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
+    bodies = [plant.get_body(index) for index in cut.bodies]
+    context = plant.CreateDefaultContext()
+    pose = plant.EvalBodyPoseInWorld(context, bodies[0]) @ cut.poses[0]
+    normal = _normal(cut, pose.rotation() @ cut.axis, plant)
+    axes = axes_along(cut.axis)
+    if cut.slides and normal is not None:
+        across = pose.rotation().inverse() @ normal
+        axes = np.column_stack([across, np.cross(cut.axis, across), cut.axis])
+    places = [pose @ RigidTransform(RotationMatrix(axes), np.zeros(3)) for pose in cut.poses]
+    own = dict(cut.options)
+    for letter, body, place in zip("ab", bodies, places, strict=True):
+        own[f"frame_{letter}"] = frame_name(plant, body.body_frame())
+        own[f"point_{letter}"] = triple("a point", place.translation())
+        own[f"rpy_{letter}"] = triple("an angle", RollPitchYaw(place.rotation()).vector())
+    if cut.slides:
+        return PrismaticLoopJoint(axis="z", normal=None if normal is None else "x", **own)
+    return RevoluteLoopJoint(axis="z", planar=normal is not None, **own)
+
+
+def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArray | None:
+    """The normal of the plane in which all joints of a loop move; None if there is none.
+
+    Args:
+        cut: The joint that closes the loop.
+        axis: Its axis in the world.
+        plant: The robot, finalized.
+    """
+    others = list(_path(cut, plant))
+    turning = [own for slides, own in others if not slides] + ([] if cut.slides else [axis])
+    sliding = [own for slides, own in others if slides] + ([axis] if cut.slides else [])
+    if not turning:
+        return None
+    normal = turning[-1]
+    flat = all(np.linalg.norm(np.cross(normal, one)) < 1e-9 for one in turning)
+    return normal if flat and all(abs(normal @ one) < 1e-9 for one in sliding) else None
+
+
+def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArray]]:
+    """Of the joints between two bodies: whether it slides, and its axis in the world."""
+    context = plant.CreateDefaultContext()
+    above: dict[int, Joint] = {
+        int(joint.child_body().index()): joint
+        for joint in (plant.get_joint(index) for index in plant.GetJointIndices())
+    }
+    lines: list[dict[int, Joint]] = []
+    for body in map(int, cut.bodies):
+        line: dict[int, Joint] = {}
+        while body in above and body not in line:
+            line[body] = above[body]
+            body = int(above[body].parent_body().index())
+        lines.append(line)
+    for body in set(lines[0]) ^ set(lines[1]):
+        joint = (lines[0] | lines[1])[body]
+        if isinstance(joint, WeldJoint):
+            continue
+        if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+            yield False, np.array([1.0, 0.0, 0.0])  # It moves out of any plane.
+            yield False, np.array([0.0, 1.0, 0.0])
+            continue
+        slides = isinstance(joint, PrismaticJoint)
+        axis = joint.translation_axis() if slides else joint.revolute_axis()
+        frame = joint.frame_on_parent().CalcPoseInWorld(context)
+        yield slides, frame.rotation() @ axis
+
+
+def _actuators(plant: MultibodyPlant) -> list[JointActuator]:
+    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]

@@ -1,0 +1,173 @@
+"""What Drake cannot read, left out of a robot's files: meshes, and colours given twice.
+
+Vendors write collisions in .stl or .dae, which MultibodyPlant refuses as soon as it has a
+SceneGraph, and MJCF has .stl for all. The equations need none: what remains is read and drawn.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pydrake.geometry import Mesh
+from pydrake.multibody.parsing import (
+    FlattenModelDirectives,
+    LoadModelDirectives,
+    PackageMap,
+    Parser,
+    ProcessModelDirectives,
+)
+
+from drake_dae.scenario.robot_file.mjcf import without_assets
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_COLLISION = re.compile(r"<collision\b[^<]*?(?:/>|>.*?</collision\s*>)", re.DOTALL)
+_MATERIAL = re.compile(
+    r"<material\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"'][^>]*?(?:/>|>(.*?)</material\s*>)", re.DOTALL
+)
+_FILE = {
+    ".urdf": re.compile(r"(<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
+    ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
+}
+"""Per kind of file: what stands before a mesh's name, the name, and what stands after it."""
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Files without the meshes that Drake cannot read.
+
+    Attributes:
+        originals: A copy -> the file that it is a copy of, with the same lines.
+        left_out: The meshes that are left out.
+    """
+
+    originals: dict[Path, Path]
+    left_out: list[Path]
+
+    def named(self, text: str) -> str:
+        """A message of Drake's parser, about the files that the user has."""
+        for copy, original in self.originals.items():
+            text = text.replace(str(copy), str(original))
+        return text
+
+
+def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict[str, Path]:
+    """Adds the models of a file to a plant, without the meshes that Drake cannot read.
+
+    Args:
+        file: A file that Drake's Parser reads.
+        parser: It knows the packages, and the plant.
+        folder: An empty one, where copies of files are written.
+        copies: Empty; the copies are added, also where the files are refused then.
+
+    Returns:
+        The file of each model instance of directives, or the file itself under "".
+
+    Raises:
+        ModelError: A body has its mass from a mesh that Drake cannot read.
+        RuntimeError: Drake refuses the files; the message names copies.
+    """
+    packages = parser.package_map()
+    # Of MJCF Drake reads the meshes also where they are not registered.
+    has_geometry = parser.plant().geometry_source_is_registered()
+    if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
+        own = _readable(file, packages, folder, copies) if has_geometry or _is_mjcf(file) else file
+        parser.AddModels(str(own))
+        return {"": file}
+    directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
+    models: dict[str, Path] = {}
+    for directive in directives.directives:
+        if directive.add_model is not None:
+            model = Path(packages.ResolveUrl(directive.add_model.file))
+            models[directive.add_model.name] = model
+            needed = has_geometry or _is_mjcf(model)
+            own = _readable(model, packages, folder, copies) if needed else model
+            if own != model:
+                directive.add_model.file = own.as_uri()
+    if copies.originals:
+        ProcessModelDirectives(directives, parser)
+    else:
+        parser.AddModels(str(file))
+    return models
+
+
+def _readable(file: Path, packages: PackageMap, folder: Path, copies: Copies) -> Path:
+    """The file, or a copy without the meshes that Drake cannot read."""
+    if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
+        return file
+    text = _COMMENT.sub(_blank, file.read_text("utf-8", errors="replace"))
+    one_colour = _with_first_materials(text) if file.suffix == ".urdf" else text
+    change = without_assets if _is_mjcf(file) else partial(_without_collisions, packages=packages)
+    changed, left_out = change(one_colour, file)
+    if not left_out and one_colour == text:
+        return file
+    copies.left_out.extend(left_out)
+    copy = folder / str(len(copies.originals)) / file.name
+    copy.parent.mkdir()
+    copy.write_text(changed, "utf-8")
+    copies.originals[copy] = file
+    return copy
+
+
+def _is_mjcf(file: Path) -> bool:
+    return file.suffix == ".xml"
+
+
+def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[str, list[Path]]:
+    """A URDF or SDFormat file without the collision meshes that Drake cannot read, and these."""
+    name, left_out = _FILE[file.suffix], []
+
+    def kept(collision: re.Match[str]) -> str:
+        meshes = [_resolved(found[2], file, packages) for found in name.finditer(collision[0])]
+        refused = [mesh for mesh in meshes if mesh is not None and _is_refused(mesh)]
+        left_out.extend(refused)
+        return _blank(collision) if refused else collision[0]
+
+    text = _COLLISION.sub(kept, text)
+    # A copy lies elsewhere: relative names would lead nowhere.
+    return name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text), left_out
+
+
+def _with_first_materials(text: str) -> str:
+    """A URDF in which a material keeps the colour that it has first.
+
+    Vendors give a name several colours, of which other readers take one and Drake none.
+    """
+    colours: dict[str, str] = {}
+
+    def kept(material: re.Match[str]) -> str:
+        name, colour = material[1], " ".join((material[2] or "").split())
+        if not colour or colours.setdefault(name, colour) == colour:
+            return material[0]
+        return f'<material name="{name}"/>' + _blank(material)
+
+    return _MATERIAL.sub(kept, text)
+
+
+def _blank(found: re.Match[str]) -> str:
+    """As many lines as there were, so that messages tell the right one."""
+    return "\n" * found[0].count("\n")
+
+
+def _absolute(name: str, file: Path) -> str:
+    return name if re.match(r"[A-Za-z]\w*:", name) else str(file.parent.resolve() / name)
+
+
+def _resolved(name: str, file: Path, packages: PackageMap) -> Path | None:
+    """Where a mesh is, or None where its name leads nowhere, which Drake tells better."""
+    name = _absolute(name, file)
+    try:
+        return Path(packages.ResolveUrl(name) if "://" in name else name)
+    except RuntimeError:
+        return None
+
+
+def _is_refused(mesh: Path) -> bool:
+    """Whether Drake, asked for the convex hull that a collision needs, says no."""
+    if not mesh.is_file():
+        return False
+    try:
+        Mesh(str(mesh)).GetConvexHull()
+    except RuntimeError:
+        return True
+    return False

@@ -1,0 +1,130 @@
+"""The packages that a robot's files name, "package://<name>/...", found as ROS finds them."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from pydrake.multibody.parsing import PackageMap
+
+from drake_dae.errors import ModelError
+from drake_dae.scenario.keys import at
+from drake_dae.scenario.shipped import FOLDER
+
+_URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
+_MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
+"""What files end with that may name packages themselves."""
+
+
+def add_packages(packages: Mapping[str, str], known: PackageMap) -> None:
+    """Adds the shipped package and those of `robot.packages`.
+
+    Raises:
+        ScenarioError: A folder is not there, or the name is Drake's.
+    """
+    known.AddPackageXml(str(FOLDER / "models" / "package.xml"))
+    for name, folder in packages.items():
+        with at(f"robot.packages.{name}"):
+            try:
+                known.Add(name, folder)
+            except RuntimeError as error:
+                raise ModelError(f"no package in '{folder}': {error}") from None
+
+
+def find_packages(
+    file: str, known: PackageMap, places: Sequence[Path] = ()
+) -> tuple[list[Path], dict[str, str]]:
+    """Adds the packages that a file names, and that files which it names do.
+
+    A package is looked for beside the file that names it: in each folder above that file, a folder
+    of that name or that one itself, with a package.xml that bears the name. Then it is looked for
+    in ROS_PACKAGE_PATH, and then in places.
+
+    Args:
+        file: A path, or a URL of a package.
+        known: The packages that are found already; others are added.
+        places: Where packages lie as folders of their name.
+
+    Returns:
+        The folders of the packages that are added, and what is not found: its name -> a file that
+        names it, or "" where `file` itself does.
+    """
+    folders: list[Path] = []
+    missing: dict[str, str] = {}
+    ros: PackageMap | None = None
+    waiting, seen = [(file, Path())], set()
+    while waiting:
+        url, origin = waiting.pop()
+        for name in _URL.findall(url):
+            if not known.Contains(name) and name not in missing:
+                ros = ros or _ros_packages()
+                found = _beside(name, origin) if origin.name else None
+                if found is None and ros.Contains(name):
+                    found = Path(ros.GetPath(name))
+                if found is None:
+                    found = next((one / name for one in places if (one / name).is_dir()), None)
+                if found is None:
+                    missing[name] = str(origin) if origin.name else ""
+                    continue
+                known.Add(name, str(found))
+                folders.append(found)
+        path = _path(url, known)
+        if path is None or path in seen or path.suffix not in _MODEL or not path.is_file():
+            continue
+        seen.add(path)
+        text = path.read_text("utf-8", errors="replace")
+        text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+        waiting.extend((found[0], path) for found in _URL.finditer(text))
+    return folders, missing
+
+
+def explained(missing: Mapping[str, str]) -> str:
+    """What to do about packages that are not found."""
+    name, origin = next(iter(missing.items()))
+    where = (
+        f", which '{Path(origin).name}' names, is neither beside it" if origin else " is neither"
+    )
+    others = f" (nor are {', '.join(list(missing)[1:])})" if len(missing) > 1 else ""
+    key = "{" + f"{name}: <folder>" + "}"
+    return (
+        f"unknown package '{name}'{where}, as a folder with a package.xml, nor in "
+        f"ROS_PACKAGE_PATH{others}; name its folder under robot.packages, as packages: {key}, "
+        f"so that package://{name}/a is <folder>/a"
+    )
+
+
+def _path(url: str, known: PackageMap) -> Path | None:
+    """The file that a path or a URL leads to; None where it leads nowhere."""
+    if "://" not in url:
+        return Path(url)
+    try:
+        return Path(known.ResolveUrl(url))
+    except RuntimeError:
+        return None
+
+
+def _beside(name: str, file: Path) -> Path | None:
+    """The folder of a package in the folders above a file."""
+    for above in file.resolve().parents:
+        for folder in (above, above / name):
+            if name in _names(folder / "package.xml"):
+                return folder
+    return None
+
+
+def _names(package: Path) -> Iterator[str]:
+    """The name in a package.xml, if there is one."""
+    try:
+        text = package.read_text("utf-8", errors="replace")
+    except (OSError, ValueError):
+        return
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    yield from re.findall(r"<name>\s*([^<]*?)\s*</name>", text)[:1]
+
+
+def _ros_packages() -> PackageMap:
+    """The packages in ROS_PACKAGE_PATH."""
+    packages = PackageMap.MakeEmpty()
+    if os.environ.get("ROS_PACKAGE_PATH"):
+        packages.PopulateFromRosPackagePath()
+    return packages

@@ -1,0 +1,64 @@
+"""Masses that a scenario fastens to a robot."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
+
+from drake_dae.arrays import positive
+from drake_dae.errors import ModelError
+from drake_dae.robots.links.frames import frame_named
+from drake_dae.scenario.forms.forms import Triple
+from drake_dae.scenario.keys import at
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A mass without extension that is fastened to a robot.
+
+    Attributes:
+        frame: Name of the frame that holds it.
+        mass: Its mass, in kg; the parameter "<name>.mass".
+        point: Where it is in the frame, m.
+        name: The name of its body.
+    """
+
+    frame: str
+    mass: float
+    point: Triple = (0.0, 0.0, 0.0)
+    name: str = "payload"
+
+    def __post_init__(self) -> None:
+        positive("the mass of a payload", self.mass)
+
+
+def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -> None:
+    """Adds payloads to a plant that is not finalized.
+
+    Args:
+        key: The key of the scenario that has them.
+        payloads: The payloads.
+        plant: The plant.
+
+    Raises:
+        ScenarioError: There is no such frame of the robot, or another body has the name.
+    """
+    for index, payload in enumerate(payloads):
+        with at(f"{key}.{index}"):
+            _add(payload, plant)
+
+
+def _add(payload: Payload, plant: MultibodyPlant) -> None:
+    frame = frame_named(plant, payload.frame)
+    if frame.body() == plant.world_body():
+        raise ModelError(
+            f"'{payload.frame}' is a frame of the world, and a payload there moves nothing; name a "
+            "frame of the robot"
+        )
+    if plant.HasBodyNamed(payload.name):
+        raise ModelError(f"a payload needs a name of its own; a body '{payload.name}' is there")
+    inertia = SpatialInertia(payload.mass, [0.0, 0.0, 0.0], UnitInertia(0.0, 0.0, 0.0))
+    body = plant.AddRigidBody(payload.name, frame.model_instance(), inertia)
+    plant.WeldFrames(frame, body.body_frame(), RigidTransform(list(payload.point)))

@@ -1,0 +1,236 @@
+"""The robot's files as a MultibodyPlant, with what a scenario changes about it."""
+
+import logging
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from pydrake.geometry import Mesh, Role, SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
+from drake_dae.scenario.keys import at
+from drake_dae.scenario.parts import Robot
+from drake_dae.scenario.robot_file.descriptions import find_description
+from drake_dae.scenario.robot_file.efforts import Efforts, read_efforts
+from drake_dae.scenario.robot_file.meshes import Copies, add_models
+from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
+from drake_dae.scenario.robot_file.resources import check_resources, package_folder
+from drake_dae.scenario.shipped import FOLDER
+
+_IGNORED = re.compile(r"The (?:tag|attribute) '(\w+)' .*ignored")
+_IDLE = {
+    *("camera", "custom", "keyframe", "light", "sensor", "site", "size", "statistic", "visual"),
+    *("timestep", "integrator", "solver", "iterations", "ls_iterations", "tolerance", "jacobian"),
+    *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
+}
+"""What MJCF has and Drake leaves out that no equation of ours has."""
+
+_DRAWN = (".obj", ".gltf", ".dae")
+"""The kinds of mesh that Drake's Meshcat draws."""
+
+
+def read_robot(
+    robot: Robot, scene_graph: SceneGraph | None = None
+) -> tuple[MultibodyPlant, Efforts]:
+    """A plant in continuous time with the models of the robot's file, not finalized.
+
+    Args:
+        robot: What the scenario has under `robot`.
+        scene_graph: Where the robot's geometry is registered; None leaves geometry out.
+
+    Returns:
+        The plant, and the effort limits of joints without an actuator.
+
+    Raises:
+        ModelError: The files cannot be read, or hold what is not supported.
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    # Continuous: only then are the plant's own dynamics those of (37).
+    plant = MultibodyPlant(0.0)
+    if scene_graph is not None:
+        plant.RegisterAsSourceForSceneGraph(scene_graph)
+    return plant, read_into(plant, robot, scene_graph)
+
+
+def read_into(
+    plant: MultibodyPlant, robot: Robot, scene_graph: SceneGraph | None = None
+) -> Efforts:
+    """Adds the models of the robot's file to a plant that is not finalized; see `read_robot`.
+
+    Args:
+        plant: The plant.
+        robot: What the scenario has under `robot`.
+        scene_graph: Where the plant is registered; None leaves geometry out.
+
+    Returns:
+        The effort limits of joints without an actuator.
+    """
+    name, places = robot.file, tuple[Path, ...]()
+    if robot.description:
+        with at("robot.description"):
+            described = find_description(robot.description)
+        name, places = str(described.file), described.folders
+    is_url = name.startswith("package://")
+    if not is_url and not _is_file(name):
+        raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
+    parser = Parser(plant)
+    missing: dict[str, str] = {}
+    copies = Copies({}, [])
+    with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
+        try:
+            packages = parser.package_map()
+            add_packages(robot.packages, packages)
+            folders, missing = find_packages(name, packages, places)
+            file = Path(packages.ResolveUrl(name) if is_url else name)
+            _check_one_robot(file)
+            models = add_models(file, parser, Path(scratch).resolve(), copies)
+        except ScenarioError:
+            raise
+        except (RuntimeError, ValueError, SystemExit) as error:
+            # Drake has all of them: SystemExit for what an assertion of its own finds.
+            text = copies.named(str(error))
+            unknown = {name: origin for name, origin in missing.items() if name in text}
+            raise ModelError(explained(unknown) if unknown else text) from None
+    if "constraints" in robot.leave_out:
+        for key in plant.GetConstraintIds():
+            plant.RemoveConstraint(key)
+    told = [text for text in dropped.warnings if not _is_answered(text, robot)]
+    if told:
+        raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
+    if scene_graph is not None:
+        own = [package_folder(file), FOLDER / "models", *map(Path, robot.packages.values())]
+        own += places[:2]  # The package and the repository of a description.
+        check_resources(scene_graph, [*own, *folders])
+        _tell_what_is_left_out(copies.left_out, scene_graph)
+    return read_efforts(models)
+
+
+def _is_answered(warning: str, robot: Robot) -> bool:
+    """Whether the scenario says what to do about a warning of Drake's parser."""
+    if "effort limit" in warning:
+        return robot.actuators is not None
+    if "inertia" in warning:
+        return "inertia" in robot.leave_out
+    if "equality" in warning or "mimic" in warning:
+        return "constraints" in robot.leave_out
+    return "friction" in warning and "joint_friction" in robot.leave_out
+
+
+def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
+    """Names the geometry that is not read, or not drawn, in one line each."""
+    if unread:
+        warnings.warn(
+            f"geometry that Drake cannot read is left out: {_listed(unread)}; no equation needs it",
+            GeometryWarning,
+            stacklevel=2,
+        )
+    inspector = scene_graph.model_inspector()
+    shapes = [
+        inspector.GetShape(geometry) for geometry in inspector.GetAllGeometryIds(Role.kIllustration)
+    ]
+    meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
+    sources = [Path(mesh.source().path()) for mesh in meshes if mesh.source().is_path()]
+    hidden = [source for source in sources if source.suffix.lower() not in _DRAWN]
+    if hidden:
+        warnings.warn(
+            f"geometry that Meshcat cannot draw is left out of the picture: {_listed(hidden)}; it "
+            f"draws {', '.join(_DRAWN)}",
+            GeometryWarning,
+            stacklevel=2,
+        )
+
+
+def _listed(files: list[Path]) -> str:
+    return ", ".join(dict.fromkeys(f"'{file.name}'" for file in files))
+
+
+@contextmanager
+def _drake_log(copies: Copies) -> Iterator["_Dropped"]:
+    """Listens to what Drake's parser tells."""
+    log = logging.getLogger("drake")
+    level, dropped = log.level, _Dropped(log.getEffectiveLevel(), copies)
+    log.addFilter(dropped)
+    log.setLevel(logging.WARNING)  # Whoever wants to see less must still be told.
+    try:
+        yield dropped
+    finally:
+        log.setLevel(level)
+        log.removeFilter(dropped)
+
+
+class _Dropped(logging.Filter):
+    """Collects what Drake's parser changes or leaves out, with no more than a warning."""
+
+    KINDS = ("inertia", "friction", "effort limit", "equality", "mimic")
+
+    def __init__(self, level: int, copies: Copies) -> None:
+        super().__init__()
+        self._level = level
+        self._copies = copies
+        self.warnings: list[str] = []
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        is_dropped = "warning: " in text and any(kind in text for kind in self.KINDS)
+        if is_dropped:
+            self.warnings.append(text)
+        ignored = _IGNORED.search(text)
+        if ignored and ignored[1] in _IDLE:
+            return False
+        record.msg, record.args = self._copies.named(text), ()
+        return not is_dropped and record.levelno >= self._level
+
+
+def _explained(warning: str) -> str:
+    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint."""
+    place, text = warning.split(": warning: ", 1)
+    kind = "link" if "inertia" in text else "joint"
+    if "inertia" in text:
+        text = (
+            "mass or inertia of no body: a mass is positive, moments of inertia are positive and "
+            "none exceeds the sum of the others. Mend it, or write leave_out: [inertia] under "
+            "robot, which takes a ball of water of that mass in its place"
+        )
+    elif "friction" in text:
+        text = (
+            "Coulomb friction of a joint is not supported; write leave_out: [joint_friction] under "
+            "robot, or take <dynamics friction> out of the file"
+        )
+    elif "effort limit" in text:
+        text += " Name the driven joints under robot.actuators"
+    elif "equality" in text:
+        return (
+            f"{place}: {' '.join(text.split())} Write leave_out: [constraints] under robot, and "
+            "the constraint under constraints; two joints that move together are a !JointCoupler"
+        )
+    file, _, line = place.rpartition(":")
+    owner = ""
+    if _is_file(file) and line.isdecimal():
+        with open(file, encoding="utf-8", errors="replace") as lines:
+            before = "".join(islice(lines, int(line)))
+        names = re.findall(rf"<{kind}\s[^>]*?name\s*=\s*[\"']([^\"']*)", before)
+        owner = f"{kind} '{names[-1]}': " if names else ""
+    return f"{place}: {owner}{' '.join(text.split())}"
+
+
+def _check_one_robot(file: Path) -> None:
+    """Refuses a second robot in a URDF, which Drake would not read."""
+    if file.suffix != ".urdf":
+        return
+    text = re.sub(r"<!--.*?-->", "", file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
+    names = re.findall(r"<robot\b[^>]*", text)
+    if len(names) > 1:
+        raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except (OSError, ValueError):  # A null byte.
+        return False

@@ -1,0 +1,54 @@
+"""The files that come with drake_dae; they are found and listed without Drake."""
+
+import re
+from pathlib import Path
+
+from drake_dae import diagrams
+from drake_dae.arrays import unknown_name
+from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.forms.typed_yaml import load_yaml
+
+FOLDER = Path(diagrams.__file__).resolve().parent
+DEFAULT_SCENARIO = "seven_joint_wall"
+
+
+def shipped_scenarios() -> dict[str, Path]:
+    """Name -> file of the scenarios that come with drake_dae."""
+    return {path.stem: path for path in sorted((FOLDER / "scenarios").glob("*.yaml"))}
+
+
+def find_scenario(name: str) -> Path:
+    """The file of a shipped scenario, or a path as it is.
+
+    Raises:
+        ScenarioError: There is neither such a scenario nor such a file.
+    """
+    shipped = shipped_scenarios()
+    if name in shipped:
+        return shipped[name]
+    path = Path(name)
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError):
+        pass  # Such as a null byte.
+    raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
+
+
+def shipped_model(name: str) -> Path:
+    """A robot's file that comes with drake_dae, as "two_link_arm.urdf".
+
+    Raises:
+        ModelError: There is no such file.
+    """
+    files = sorted((FOLDER / "models").iterdir())
+    shipped = {file.name: file for file in files if file.suffix in (".urdf", ".yaml")}
+    if str(name) not in shipped:
+        raise ModelError(unknown_name("model", str(name), shipped))
+    return shipped[str(name)]
+
+
+def description(path: Path) -> str:
+    """The description of a shipped scenario, which begins with it; the rest is not read."""
+    (entry,) = re.findall(r"\Adescription:.*\n(?:[ \n].*)*", path.read_text("utf-8"))
+    return str(load_yaml(entry, str(path))["description"])

@@ -1,0 +1,297 @@
+"""What a run leaves: every signal over time, with names and units."""
+
+import csv
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+from zipfile import BadZipFile
+
+import numpy as np
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import VectorLogSink
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, listed
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
+from drake_dae.systems.plants.unilateral.events import ContactEvent
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A vector signal over time.
+
+    Attributes:
+        values: The values, one row per time, shape (k, size).
+        signals: The name and unit of each column.
+    """
+
+    values: FloatArray
+    signals: tuple[Signal, ...]
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class Record:
+    """All signals of a run at the ends of the integrator's steps.
+
+    On disk it is one `record.npz` that NumPy alone reads: `numpy.load("record.npz")` has "time"
+    in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
+    Events stand in it as "events.time", "events.kind", "events.impulses" and others.
+
+    Velocities jump at impacts: the sample of that time is the one before it.
+
+    Attributes:
+        time: The times in s, shape (k,), strictly increasing.
+        signals: Name of a signal -> its values.
+        events: What happened to contacts that open and close, in the order of time.
+    """
+
+    time: FloatArray
+    signals: Mapping[str, Recorded]
+    events: tuple[ContactEvent, ...] = ()
+
+    def __post_init__(self) -> None:
+        lengths = {"time": np.shape(self.time)[:1]} | {
+            name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
+        }
+        if np.ndim(self.time) != 1 or len(set(lengths.values())) != 1:
+            found = ", ".join(f"{name} {size}" for name, size in lengths.items())
+            raise ModelError(f"a record has one sample of each signal at each time, got {found}")
+        if np.any(np.diff(self.time) <= 0.0):
+            raise ModelError("the times of a record must be strictly increasing")
+        for name, (values, signals) in (
+            (name, (recorded.values, recorded.signals)) for name, recorded in self.signals.items()
+        ):
+            if np.ndim(values) != 2 or np.shape(values)[1] != len(signals):
+                raise ModelError(
+                    f"'{name}' of a record has shape {np.shape(values)}, but {len(signals)} names"
+                )
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """The values of a signal, shape (k, size).
+
+        Raises:
+            ModelError: The record has no such signal.
+        """
+        if name not in self.signals:
+            raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
+        return self.signals[name].values
+
+    def __repr__(self) -> str:
+        found = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
+        return f"Record({self._extent()}, signals={found})"
+
+    def _repr_html_(self) -> str:
+        """A table of the signals, as a notebook shows it."""
+        rows = "".join(
+            f"<tr><td>{html.escape(name)}</td><td>{len(recorded.signals)}</td>"
+            f"<td>{html.escape(listed(map(_label, recorded.signals))[1:-1])}</td></tr>"
+            for name, recorded in self.signals.items()
+        )
+        return (
+            f"<p>Record: {self._extent()}</p><table><thead><tr><th>signal</th><th>size</th>"
+            f"<th>names and units</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+    def _extent(self) -> str:
+        if not self.time.size:
+            return "empty"
+        events = f", {len(self.events)} events" if self.events else ""
+        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s{events}"
+
+    def while_finite(self) -> Self:
+        """The record up to the first moment at which some signal is not finite."""
+        finite = [np.isfinite(recorded.values).all(axis=1) for recorded in self.signals.values()]
+        broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
+        if not broken.any():
+            return self
+        count = int(np.argmax(broken))
+        signals = {
+            name: Recorded(recorded.values[:count], recorded.signals)
+            for name, recorded in self.signals.items()
+        }
+        last = self.time[count - 1] if count else -np.inf
+        events = tuple(event for event in self.events if event.time <= last)
+        return type(self)(self.time[:count], signals, events)
+
+    def event_rows(self) -> list[dict[str, Any]]:
+        """The events as rows of plain values, for `pandas.DataFrame` or a `csv.DictWriter`.
+
+        Each has "time [s]", "event", "contacts" (to which it happened) and "closed" (which are so
+        after it), separated by commas, "impulse [N s]" (the sum of theirs) and "energy lost [J]".
+        """
+        return event_rows(self.events)
+
+    @classmethod
+    def from_logs(
+        cls,
+        loggers: Mapping[str, tuple[VectorLogSink, Sequence[Signal]]],
+        context: Context,
+        after: float | None = None,
+    ) -> Self:
+        """Collects per-step logs, whatever they hold up to now.
+
+        Args:
+            loggers: Name -> (sink, names and units of its input).
+            context: The context of the diagram.
+            after: Only what was logged later than this time is collected, in s; None for all.
+        """
+        logs = {name: sink.FindLog(context) for name, (sink, _) in loggers.items()}
+        times = [log.sample_times() for log in logs.values()]
+        # A run that failed in the middle of a step may have logged some of the signals only.
+        count = min((len(t) for t in times), default=0)
+        time = times[0][:count] if times else np.zeros(0)
+        first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
+        # Nor is what a run that failed left in its last step a number.
+        finite = [np.isfinite(log.data()[:, first:count]).all(axis=0) for log in logs.values()]
+        broken = ~np.all(finite, axis=0) if finite else np.zeros(0, bool)
+        count = first + int(np.argmax(broken)) if broken.any() else count
+        time = time[first:count]
+        # The last sample of a moment is the one after the projection.
+        last = np.append(np.diff(time) > 0.0, True)[: time.size]
+        return cls(
+            time[last].copy(),
+            {
+                name: Recorded(log.data()[:, first:count].T[last].copy(), tuple(loggers[name][1]))
+                for name, log in logs.items()
+            },
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Writes the record as one `.npz` file."""
+        arrays: dict[str, np.ndarray] = {"time": self.time}
+        for name, recorded in self.signals.items():
+            arrays[name] = recorded.values
+            arrays[f"{name}.names"] = np.array([s.name for s in recorded.signals], dtype=str)
+            arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
+        arrays |= event_arrays(self.events)
+        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+    def to_csv(self, path: str | Path) -> None:
+        """Writes the record as text: a line of names with units, then one line for each time.
+
+        The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
+        Events are not among them; see `event_rows`.
+        """
+        columns = [
+            f"{name}.{_label(signal)}"
+            for name, recorded in self.signals.items()
+            for signal in recorded.signals
+        ]
+        rows = np.column_stack([self.time, *(r.values for r in self.signals.values())])
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time [s]", *columns])
+            writer.writerows(rows.tolist())
+
+    def to_dataframe(self) -> Any:
+        """The record as a pandas DataFrame, one row for each time, "time [s]".
+
+        Its columns have two levels, the signal and the name with its unit:
+        `frame["control"]` are all controls, and `frame["control"].plot()` draws them.
+
+        Raises:
+            ModelError: pandas is not installed.
+        """
+        pandas = _needed("pandas", "to_dataframe")
+        pairs = [
+            (name, _label(signal))
+            for name, recorded in self.signals.items()
+            for signal in recorded.signals
+        ]
+        return pandas.DataFrame(
+            np.hstack([np.zeros((self.time.size, 0)), *(r.values for r in self.signals.values())]),
+            index=pandas.Index(self.time, name="time [s]"),
+            columns=pandas.MultiIndex.from_tuples(pairs, names=["signal", "name"]),
+        )
+
+    def to_xarray(self) -> Any:
+        """The record as an xarray Dataset, one variable for each signal.
+
+        Its dimensions are "time" in s and "<signal>.name"; the units stand beside the names, as the
+        coordinate "<signal>.unit": `data["control"].sel({"control.name": "joint1_motor"})`.
+
+        Raises:
+            ModelError: xarray is not installed.
+        """
+        xarray = _needed("xarray", "to_xarray")
+        variables: dict[str, Any] = {}
+        coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
+        for name, recorded in self.signals.items():
+            along = f"{name}.name"
+            variables[name] = (("time", along), recorded.values)
+            coordinates[along] = [signal.name for signal in recorded.signals]
+            coordinates[f"{name}.unit"] = (along, [signal.unit for signal in recorded.signals])
+        return xarray.Dataset(variables, coordinates)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads what `save` or a `RecordWriter` wrote, the latter as far as it came.
+
+        Raises:
+            ModelError: The file holds something else.
+        """
+        try:
+            with open(path, "rb") as rows:
+                if rows.read(1) == b"{":
+                    rows.seek(0)
+                    return cls(*_read_rows(rows))
+            with np.load(path, allow_pickle=False) as file:
+                names = [key for key in file.files if f"{key}.names" in file.files]
+                signals = {name: _read(file, name) for name in names}
+                return cls(file["time"], signals, events_of_arrays(file))
+        except (
+            AttributeError,
+            EOFError,
+            KeyError,
+            OSError,
+            TypeError,
+            ValueError,
+            BadZipFile,
+        ) as error:
+            raise ModelError(f"{path} is not a record of a run: {error}") from None
+
+
+def _label(signal: Signal) -> str:
+    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
+
+
+def _needed(module: str, asked: str) -> Any:
+    """A module that only some need.
+
+    Raises:
+        ModelError: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise ModelError(f"{asked} needs {module}: pip install 'drake_dae[data]'") from None
+
+
+def _read_rows(file: BinaryIO) -> tuple[FloatArray, dict[str, Recorded]]:
+    """What a `RecordWriter` appended; bytes after the last whole row are left out."""
+    labels = json.loads(file.readline())["signals"]
+    named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
+    stops = np.cumsum([1, *map(len, named.values())])
+    data = file.read()
+    width = int(stops[-1])
+    count = len(data) // (8 * width)
+    rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
+    # A machine that lost its power may leave zeros where nothing was synced.
+    whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
+    time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
+    pairs = zip(named.items(), columns, strict=True)
+    return time[:, 0], {name: Recorded(values, signals) for (name, signals), values in pairs}
+
+
+def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:
+    labels = zip(file[f"{name}.names"], file[f"{name}.units"], strict=True)
+    signals = tuple(Signal(str(label), str(unit)) for label, unit in labels)
+    return Recorded(file[name], signals)

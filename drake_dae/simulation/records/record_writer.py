@@ -1,0 +1,139 @@
+"""The record of a run on disk while the run goes on."""
+
+import json
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from drake_dae.arguments import checked, result_of
+from drake_dae.arrays import brief
+from drake_dae.errors import ModelError
+from drake_dae.simulation.records.record import Record
+
+PERIOD = 1.0
+"""Between two appends, in s."""
+
+_SHARE = 0.02
+"""Of the run that appending may take: on a slow disk it waits longer."""
+
+
+@checked(ModelError)
+class RecordWriter:
+    """Appends the record of a run to a file, about once a second, while the run goes on:
+
+        with RecordWriter("run.part", loop.record) as writer:
+            simulate(loop.diagram, context, 10.0, config, after_step=writer.update)
+
+    Whatever ends the process, `Record.load` reads the file up to the last append. It is one line of
+    JSON with names and units, and then rows of numbers (little-endian float64): the time in s and
+    the signals in the order of that line. A file that was cut off anywhere lacks its last row.
+    Events of contacts are not in it, but which contacts are closed is a signal.
+
+    The file is made with the first append, and never in the place of another one. Where appending
+    fails, as on a full disk, this warns and tries again a second later; the run goes on.
+
+    Args:
+        path: The file.
+        record: From a context and a time in s, or None, to what was recorded later, as
+            `ClosedLoop.record`.
+    """
+
+    def __init__(self, path: str | Path, record: Callable[[Context, float | None], Record]) -> None:
+        self.path = Path(path)
+        self._record = record
+        self._file: int | None = None
+        self._end = 0
+        self._time: float | None = None
+        self._next = time.perf_counter() + PERIOD
+        self._warned = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def update(self, context: Context) -> None:
+        """Appends what was recorded since the last time, if it is time to.
+
+        The last row stays behind: a run that ends here replaces it by the one after its projection.
+
+        Warns:
+            UserWarning: The file cannot be written to; once.
+        """
+        if time.perf_counter() < self._next:
+            return
+        record = self._made(context)
+        # What making it takes grows with the steps, and does not have to wait for a slow disk.
+        began = time.perf_counter()
+        try:
+            self._append(record, keep_last=True)
+        except OSError as error:
+            if not self._warned:
+                reason = error.strerror or error
+                warnings.warn(
+                    f"{self.path}: {reason}; the run goes on, its record is in memory only",
+                    stacklevel=2,
+                )
+                self._warned = True
+        done = time.perf_counter()
+        self._next = done + max(PERIOD, (done - began) / _SHARE)
+
+    def finish(self, context: Context) -> None:
+        """Appends all that was recorded since the last time.
+
+        Raises:
+            ModelError: What makes the record fails.
+            OSError: The file cannot be written to; it keeps what fits.
+        """
+        self._append(self._made(context), keep_last=False)
+
+    def _made(self, context: Context) -> Record:
+        """What was recorded since the last time."""
+        record = result_of("record", self._record, context, self._time)
+        if not isinstance(record, Record):
+            raise ModelError(f"record must return a Record, got {brief(record)}")
+        return record
+
+    def _append(self, record: Record, keep_last: bool) -> None:
+        stop = record.time.size - keep_last
+        if stop < 1:
+            return
+        columns = [record.time, *(recorded.values for recorded in record.signals.values())]
+        data = np.column_stack(columns)[:stop].astype("<f8").tobytes()
+        if self._file is None:
+            self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        if self._end == 0:
+            data = _head(record) + data
+        # At a place of its own: what a failed append left there is written over.
+        done = 0
+        while done < len(data):
+            done += os.pwrite(self._file, data[done:], self._end + done)
+        os.fsync(self._file)
+        self._end += done
+        self._time = float(record.time[stop - 1])
+
+
+def _head(record: Record) -> bytes:
+    layout = {
+        "rows": "little-endian float64: time in s, then the signals in this order",
+        "signals": {
+            name: [[signal.name, signal.unit] for signal in recorded.signals]
+            for name, recorded in record.signals.items()
+        },
+    }
+    return json.dumps(layout).encode() + b"\n"

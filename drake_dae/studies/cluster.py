@@ -1,0 +1,100 @@
+"""A Dask cluster that simulates the runs of a study."""
+
+import json
+from collections.abc import Generator, Sequence
+from concurrent.futures import CancelledError
+from typing import Any
+
+from drake_dae.arrays import brief
+from drake_dae.errors import ModelError
+from drake_dae.studies.runs import Batch, Outcome, RunResult, run_batch
+
+WAIT = 30.0
+"""How long a scheduler may take to answer, in s."""
+
+
+class Cluster:
+    """A connection to a scheduler; a context manager.
+
+    Args:
+        address: Its address, for example "tcp://head:8786".
+
+    Raises:
+        ModelError: `distributed` is not installed, nothing answers, or there are no workers.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            import distributed
+        except ImportError:
+            raise ModelError(
+                "a cluster needs Dask's scheduler: pip install 'drake_dae[cluster]'"
+            ) from None
+        self._address = address
+        self._dask: Any = distributed  # Its types are incomplete.
+        try:
+            self._client = self._dask.Client(address, timeout=WAIT, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise ModelError(
+                f"no Dask scheduler answers at {brief(address)}: {brief(str(error))}"
+            ) from None
+        self.workers = sum(self._client.nthreads().values())
+        if not self.workers:
+            self.close()
+            raise ModelError(f"the Dask cluster at {address} has no workers; start some")
+
+    def run(
+        self, settings: Sequence[Any], batches: Sequence[Batch]
+    ) -> Generator[list[RunResult], None, None]:
+        """The results of all runs, as their batches come.
+
+        A batch whose worker dies is given out again; where several die of it, its runs one by one.
+
+        Args:
+            settings: The arguments of `Runner`, as plain data.
+            batches: The runs.
+
+        Raises:
+            ModelError: The scheduler is gone, or a worker has another version of the library.
+        """
+        text = json.dumps(settings)
+
+        def submit(batch: Batch) -> Any:
+            future = self._client.submit(run_batch, text, list(batch), pure=False)
+            given[future.key] = batch
+            return future
+
+        given: dict[Any, Batch] = {}
+        futures = [submit(batch) for batch in batches]
+        awaited = self._dask.as_completed(futures, loop=self._client.loop)
+        for future in awaited:
+            batch = given.pop(future.key)
+            try:
+                found = [RunResult.from_dict(data) for data in future.result()]
+            except self._dask.KilledWorker as error:
+                if len(batch) > 1:
+                    awaited.update([submit([run]) for run in batch])
+                    continue
+                said = str(error).partition(". ")[0]
+                reason = f"the workers that had it ended: {said}"
+                found = [RunResult(batch[0][0], Outcome.CRASHED, reason)]
+            except CancelledError:
+                raise ModelError(
+                    f"the Dask scheduler at {self._address} is gone; runs that have ended are kept"
+                ) from None
+            except Exception as error:
+                raise ModelError(
+                    f"the Dask cluster at {self._address} failed, {type(error).__name__}: "
+                    f"{brief(str(error))}; its workers need the same drake_dae"
+                ) from error
+            yield found
+
+    def close(self) -> None:
+        """Gives up what is not yet simulated."""
+        self._client.close()
+
+    def __enter__(self) -> "Cluster":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,209 @@
+"""The file of a study: a first line that tells which study, then one line for each finished run.
+
+Lines are only ever appended, each synced to the disk before the next run counts as done. A process
+that was killed at any moment leaves whole lines and at most one that is cut off, which goes away
+when the study continues.
+"""
+
+import errno
+import fcntl
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from drake_dae.arrays import brief
+from drake_dae.errors import ModelError
+from drake_dae.studies.runs import RunResult
+from drake_dae.studies.variations import Variation
+
+FORMAT = 1
+
+
+def study_head(
+    version: str,
+    scenario: Mapping[str, Any],
+    variations: Sequence[Variation],
+    rollout: bool = False,
+) -> dict[str, Any]:
+    """The first line of a study's file: equal for equal studies."""
+    return {
+        "study": FORMAT,
+        "drake_dae": version,
+        **({"rollout": True} if rollout else {}),
+        "scenario": dict(scenario),
+        "variations": list(variations),
+    }
+
+
+class Journal:
+    """An open file of a study.
+
+    Attributes:
+        path: The file.
+        results: Number of a run -> its result, of all that are in the file.
+    """
+
+    def __init__(self, path: Path, file: int, results: dict[int, RunResult]) -> None:
+        self.path = path
+        self.results = results
+        self._file = file
+
+    def append(self, results: Iterable[RunResult]) -> None:
+        """Adds runs, and returns when they are on the disk.
+
+        Raises:
+            ModelError: They cannot be written, as on a full disk.
+        """
+        found = list(results)
+        try:
+            _write(self._file, b"".join(_line(result.to_dict()) for result in found))
+            os.fsync(self._file)
+        except OSError as error:
+            raise ModelError(
+                f"cannot write to '{self.path}': {error.strerror or error}; the study continues "
+                "from what it has when there is room again"
+            ) from None
+        self.results.update((result.run, result) for result in found)
+
+
+@contextmanager
+def open_journal(path: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
+    """Opens the file of a study, new or to continue it, and keeps others from writing to it.
+
+    Args:
+        path: The file; its folder is made.
+        head: What `study_head` returns.
+
+    Raises:
+        ModelError: The file belongs to another study, which differs as the message tells; or is
+            no file of a study; or another process writes to it; or it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = _open(path, head)
+    except ModelError:
+        raise
+    except (OSError, ValueError) as error:  # The latter for a null byte.
+        reason = getattr(error, "strerror", None) or error
+        raise ModelError(f"cannot write to {brief(str(path))}: {reason}") from None
+    try:
+        yield Journal(path, file, _continued(path, file, head))
+    finally:
+        os.close(file)
+
+
+def _open(path: Path, head: Mapping[str, Any]) -> int:
+    """The locked file, which has its first line."""
+    if not path.exists():
+        # Whole, or not there at all.
+        part = path.with_name(f".{path.name}.{os.getpid()}")
+        new = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            _write(new, _line(head))
+            os.fsync(new)
+            if not path.exists():
+                part.rename(path)
+        finally:
+            os.close(new)
+            part.unlink(missing_ok=True)
+        _sync_folder(path.parent)
+    if not path.is_file():
+        raise ModelError(f"'{path}' is no file")
+    file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES):
+            os.close(file)
+            raise ModelError(
+                f"another process writes to '{path}'; wait for its end or choose another file"
+            ) from None
+    return file
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes a new name in a folder last, too."""
+    entry = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(entry)
+    finally:
+        os.close(entry)
+
+
+def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunResult]:
+    """The runs that a file has; a last line that is cut off is removed."""
+    first, *lines = path.read_bytes().split(b"\n")
+    try:
+        found = json.loads(first)
+        known = found["study"]
+    except (ValueError, TypeError, LookupError):
+        raise ModelError(f"'{path}' is no file of a study; choose another name") from None
+    if known != FORMAT:
+        raise ModelError(f"'{path}' has format {brief(known)}, this version writes {FORMAT}")
+    told = differences(found, json.loads(_line(head)))
+    if told:
+        raise ModelError(
+            f"'{path}' belongs to another study: {'; '.join(told)}. Choose another folder, or "
+            "remove it"
+        )
+    rest = lines.pop() if lines else b""
+    results: dict[int, RunResult] = {}
+    for place, line in enumerate(lines, start=2):
+        try:
+            result = RunResult.from_dict(json.loads(line))
+        except (ValueError, TypeError, LookupError, AttributeError):
+            if place == len(lines) + 1:  # Zeros, where a machine lost its power.
+                rest = line + b"\n" + rest
+                break
+            raise ModelError(f"'{path}' was changed: line {place} is no run of a study") from None
+        results.setdefault(result.run, result)
+    if rest:
+        os.ftruncate(file, os.fstat(file).st_size - len(rest))
+        os.fsync(file)
+    return results
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """What two heads of studies have different, a few of it, in words."""
+    told = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
+    told += list(_different("rollout", there.get("rollout", False), here.get("rollout", False)))
+    told += list(_different("", there.get("scenario"), here.get("scenario")))
+    old, new = there.get("variations", []), here["variations"]
+    if len(old) != len(new):
+        told.append(f"{len(old)} runs there, {len(new)} here")
+    pairs = enumerate(zip(old, new, strict=False))
+    other = next(((i, a, b) for i, (a, b) in pairs if a != b), None)
+    if other is not None:
+        number, a, b = other
+        first = next(iter(_different("", a, b)))
+        told.append(f"run {number} has {first}")
+    return told if len(told) <= 6 else [*told[:6], f"and {len(told) - 6} more"]
+
+
+def _different(key: str, there: Any, here: Any) -> Iterator[str]:
+    if isinstance(there, dict) and isinstance(here, dict):
+        for name in {**there, **here}:
+            inner = f"{key}.{name}" if key else name
+            missing = object()
+            a, b = there.get(name, missing), here.get(name, missing)
+            if a is missing or b is missing:
+                yield f"{inner} only {'here' if a is missing else 'there'}"
+            else:
+                yield from _different(inner, a, b)
+    elif isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        for index, (a, b) in enumerate(zip(there, here, strict=True)):
+            yield from _different(f"{key}.{index}", a, b)
+    elif there != here:
+        yield f"{key} = {brief(there)} there, {brief(here)} here"
+
+
+def _line(data: Mapping[str, Any]) -> bytes:
+    return json.dumps(data, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def _write(file: int, data: bytes) -> None:
+    while data:
+        data = data[os.write(file, data) :]

@@ -1,0 +1,221 @@
+"""Processes of this machine that simulate the runs of a study.
+
+They are processes of their own rather than those of `concurrent.futures`: one that dies, as Drake's
+C++ may, is the outcome of the run that it had, and not the end of all; and no script needs a guard
+for its main module. Tasks and results are lines of JSON.
+"""
+
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import suppress
+from typing import IO, Any
+
+from drake_dae.errors import ModelError
+from drake_dae.simulation.records.interruption import ENDING_SIGNALS
+from drake_dae.studies.runs import Batch, Outcome, Runner, RunResult
+
+BUILDS = 200
+"""A process that has built so many loops is replaced: Drake does not free all of each."""
+
+PERIOD = 0.02
+"""Results are told this often, in s: those of short runs are synced to the disk together."""
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_ENDED = {128 + signal.SIGINT, *(-number for number in ENDING_SIGNALS)}
+"""Exit codes of a process that was asked to end."""
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def run_in_processes(
+    settings: Sequence[Any], batches: Sequence[Batch], workers: int
+) -> Generator[list[RunResult], None, None]:
+    """The results of all runs, as they come, whoever is first.
+
+    Args:
+        settings: The arguments of `Runner`, as plain data.
+        batches: The runs.
+        workers: How many processes.
+
+    Raises:
+        ModelError: A process does not start.
+    """
+    waiting, workers = deque(batches), min(workers, len(batches))
+    running: list[_Worker] = []
+    found: list[RunResult] = []
+    told = -PERIOD
+    with selectors.DefaultSelector() as selector:
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    worker = _Worker(settings)
+                    running.append(worker)
+                    selector.register(worker.output, selectors.EVENT_READ, worker)
+                due = told + PERIOD - time.monotonic()
+                for key, _ in selector.select(max(0.0, due) if found else None):
+                    worker = key.data
+                    is_open = worker.read()
+                    found += worker.take()
+                    if not is_open:
+                        selector.unregister(worker.output)
+                        running.remove(worker)
+                        lost = worker.close()
+                        found += [lost] if lost else []
+                        if worker.left:
+                            waiting.appendleft(worker.left)
+                    elif worker.is_idle and waiting and worker.builds < BUILDS:
+                        worker.give(waiting.popleft())
+                    elif worker.is_idle:
+                        worker.dismiss()
+                if found and (time.monotonic() >= told + PERIOD or not (waiting or running)):
+                    told = time.monotonic()
+                    yield found
+                    found = []
+        finally:
+            for worker in running:
+                worker.kill()
+
+
+class _Worker:
+    """A process, and what it is about.
+
+    Attributes:
+        output: Where its results come from.
+        left: The runs that it was given and has not told of.
+        is_idle: Whether it waits for runs.
+        builds: How many loops it has built.
+    """
+
+    def __init__(self, settings: Sequence[Any]) -> None:
+        # What is loaded stays: the garbage collector need not look through it, then or later.
+        code = (
+            f"import gc, sys; gc.disable(); sys.path[:] = {sys.path!r}; "
+            f"from {__name__} import serve; gc.freeze(); gc.enable(); sys.exit(serve())"
+        )
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", code],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env={**dict.fromkeys(_THREADS, "1"), **os.environ},
+            start_new_session=True,  # Ctrl-C is for the study, which ends them.
+        )
+        self.output: IO[bytes] = self._process.stdout  # type: ignore[assignment]
+        self.left: Batch = []
+        self.is_idle = False
+        self.builds = 0
+        self._is_ready = False
+        self._text = b""
+        self._results: list[RunResult] = []
+        self._send(settings)
+
+    def give(self, batch: Batch) -> None:
+        """Gives it runs."""
+        self.left, self.is_idle = list(batch), False
+        self._send(self.left)
+
+    def dismiss(self) -> None:
+        """Lets it end."""
+        with suppress(OSError):
+            self._process.stdin.close()  # type: ignore[union-attr]
+
+    def read(self) -> bool:
+        """Takes what it has told; False if nothing comes any more."""
+        data = os.read(self.output.fileno(), 1 << 16)
+        *lines, self._text = (self._text + data).split(b"\n")
+        for line in lines:
+            told = json.loads(line)
+            if "builds" in told:
+                self._is_ready = self.is_idle = True
+                self.builds = told["builds"]
+            else:
+                self._results.append(RunResult.from_dict(told))
+                self.left = self.left[1:]
+        return bool(data)
+
+    def take(self) -> list[RunResult]:
+        """The results since the last call."""
+        found, self._results = self._results, []
+        return found
+
+    def close(self) -> RunResult | None:
+        """Ends it; the outcome of the run that it has not ended, if it died.
+
+        Raises:
+            ModelError: It has never begun.
+            KeyboardInterrupt: It was asked to end, as all are when a machine goes down.
+        """
+        code = self._process.wait()
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").split("\n")
+        self._close()
+        said = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        reason = f"the process ended with {how}" + (f": {said[:200]}" if said else "")
+        if not self._is_ready:
+            raise ModelError(f"no process for the runs of a study starts; {reason}")
+        if code in _ENDED:
+            raise KeyboardInterrupt(signal.SIGTERM)
+        if not self.left:
+            return None
+        (number, _), *rest = self.left
+        self.left = rest
+        return RunResult(number, Outcome.CRASHED, reason)
+
+    def kill(self) -> None:
+        """Ends it at once."""
+        self._process.kill()
+        self._process.wait()
+        self._close()
+
+    def _send(self, data: Any) -> None:
+        with suppress(OSError):  # A process that is gone is found out by reading.
+            self._process.stdin.write(json.dumps(data).encode() + b"\n")  # type: ignore[union-attr]
+            self._process.stdin.flush()  # type: ignore[union-attr]
+
+    def _close(self) -> None:
+        with suppress(OSError):
+            self._process.stdin.close()  # type: ignore[union-attr]
+        self.output.close()
+        self._errors.close()
+
+
+def serve() -> int:
+    """What a process does: it reads the scenario, then runs, and tells of each when it has ended.
+
+    After each batch, and at first, it tells how many loops it has built.
+    """
+    results = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # Whatever else prints does not get between.
+
+    def tell(data: Mapping[str, Any]) -> None:
+        results.write(json.dumps(data).encode() + b"\n")
+        results.flush()
+
+    try:
+        runner = Runner(*json.loads(sys.stdin.buffer.readline()))
+        tell({"builds": 0})
+        for line in sys.stdin.buffer:
+            for result in runner.run_all(json.loads(line)):
+                tell(result.to_dict())
+            tell({"builds": runner.builds})
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except BrokenPipeError:  # The study was killed.
+        os._exit(0)
+    return 0

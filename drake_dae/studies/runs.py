@@ -1,0 +1,317 @@
+"""One run of a study after the other, in one process: what each comes to."""
+
+import json
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from functools import lru_cache
+from threading import Lock
+from typing import Any, Self, cast
+
+from pydrake.systems.framework import Context
+
+from drake_dae.arrays import brief
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.task_loop import TaskLoop
+from drake_dae.errors import (
+    AssumptionError,
+    DrakeDaeError,
+    InconsistentStateError,
+    ModelError,
+    ScenarioError,
+    SimulationError,
+)
+from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.scenario import Scenario, read_scenario, varied_data
+from drake_dae.simulation.figures import exceeded, run_figures
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.simulate import simulate
+from drake_dae.simulation.summary import Limits
+from drake_dae.studies.variations import Variation
+from drake_dae.systems.plants.robot_plant import RobotPlant
+
+
+class Outcome(StrEnum):
+    """How a run of a study ended."""
+
+    FINISHED = "finished"
+    FAILED = "failed"
+    """On the way; the figures are those up to there."""
+    NO_START = "no start"
+    """No state on the constraints has what the start asks for."""
+    REFUSED = "refused"
+    """The scenario does not fit together, or violates an assumption."""
+    CRASHED = "crashed"
+    """The process ended, or failed in a way that it should not."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run of a study came to.
+
+    Attributes:
+        run: Its number in the study.
+        outcome: How it ended.
+        reason: Why, if not by finishing.
+        figures: Name with unit -> value, as `run_figures` has them.
+        exceeded: Names of the signals that left their limits.
+        seconds: How long it took, building included.
+    """
+
+    run: int
+    outcome: Outcome
+    reason: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    exceeded: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The result of plain data.
+
+        Raises:
+            KeyError, TypeError, ValueError: The data are those of something else.
+        """
+        values = dict(data)
+        values["outcome"] = Outcome(values["outcome"])
+        values["exceeded"] = tuple(values["exceeded"])
+        return cls(**values)
+
+
+Batch = Sequence[tuple[int, Variation]]
+"""Runs of one structure, with their numbers."""
+
+
+def structure_key(data: Mapping[str, Any], base: Mapping[str, Any]) -> str:
+    """Text that is equal for scenarios which one closed loop simulates.
+
+    They differ in what a context holds: start, parameters of the plant, numbers of gains that
+    couple no outputs, the seed; or in how they are run.
+    """
+    return json.dumps(_built(data, base), sort_keys=True)
+
+
+def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's data where all that a context holds is as in the base of the study.
+
+    So what is built does not depend on which run comes first.
+    """
+    own = dict(data)
+    for key in ("description", "plant_parameters", "duration", "integrator", "write"):
+        own[key] = base[key]
+    if own["plant"].get(TAG) == "!MultibodyPlant":  # It is built with its numbers.
+        own["plant_parameters"] = data["plant_parameters"]
+    first, positions = base["start"], own["start"].get("positions", {})
+    if positions.keys() == first["positions"].keys():
+        positions = first["positions"]
+    own["start"] = {**first, "positions": positions}
+    # Without any they are advised, by what is built; and a task is built with its numbers.
+    if own["gains"] and base["gains"] and not own["task"]:
+        tag = own["gains"].get(TAG, "!Poles")
+        if tag == base["gains"][TAG] != "!Matrices":
+            own["gains"] = base["gains"]
+    if "seed" in own["force"]:
+        own["force"] = {**own["force"], "seed": 0}
+    if own["encoders"]:
+        own["encoders"] = {**own["encoders"], "seed": 0}
+    return own
+
+
+class Runner:
+    """Simulates runs of a study, and keeps the closed loop as long as their structure is the same.
+
+    Attributes:
+        builds: How many loops it has built; Drake does not free all of each.
+
+    Args:
+        base: The plain data of the study's scenario.
+        lasting: How long runs of one structure last together, in s, if they are rollouts; None if
+            Drake's Simulator runs them.
+    """
+
+    def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
+        self._base = base
+        self._lasting = lasting
+        self._key = ""
+        self._built: ClosedLoop | TaskLoop | DrakeDaeError | None = None
+        self.builds = 0
+
+    def loop(self, data: Mapping[str, Any]) -> ClosedLoop | TaskLoop:
+        """The closed loop of a scenario's data.
+
+        Raises:
+            ScenarioError: Something does not fit; the message names its key.
+        """
+        built = _built(data, self._base)
+        key = json.dumps(built, sort_keys=True)
+        if key != self._key:
+            self._key, self._built = "", None
+            self.builds += 1
+            try:
+                if self._lasting is not None and built["task"]:
+                    raise ScenarioError(("task", "rollouts know no tasks: run it by Drake"))
+                self._built = build_completed(read_scenario(built))[1]
+            except DrakeDaeError as error:
+                self._built = error
+            self._key = key
+        if isinstance(self._built, DrakeDaeError):
+            raise self._built
+        return cast(ClosedLoop | TaskLoop, self._built)
+
+    def why_not(self, variation: Variation) -> ScenarioError | None:
+        """What is wrong with the words of a variation; None if nothing is.
+
+        That a start is out of reach, or an assumption fails, is an outcome of a run.
+        """
+        try:
+            data = varied_data(self._base, variation)
+            loop = self.loop(data)
+            start_scenario(read_scenario(data), loop)
+        except ScenarioError as error:
+            return None if _is_about_states(error) else error
+        except DrakeDaeError:
+            return None
+        if self._lasting is not None and isinstance(loop, ClosedLoop):
+            from drake_dae.running.rollout.rollout import functions_of
+
+            try:
+                functions_of(loop)
+            except ModelError as error:
+                return ScenarioError(("", str(error)))
+        return None
+
+    def run_all(self, batch: Batch) -> Iterator[RunResult]:
+        """Simulates runs; each is told when it has ended."""
+        for number, variation in batch:
+            began = time.perf_counter()
+            try:
+                result = self._run(number, variation)
+            except Exception as error:  # A study of thousands goes on.
+                text = f"{type(error).__name__}: {brief(str(error))}"
+                result = RunResult(number, Outcome.CRASHED, text)
+            yield RunResult(**{**vars(result), "seconds": time.perf_counter() - began})
+
+    def _run(self, number: int, variation: Variation) -> RunResult:
+        try:
+            data = varied_data(self._base, variation)
+            scenario = read_scenario(data)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # Each worker would tell the same.
+                loop = self.loop(data)
+        except DrakeDaeError as error:
+            return RunResult(number, Outcome.REFUSED, str(error))
+        return _simulated(number, scenario, loop, self._lasting)
+
+
+def _is_about_states(error: BaseException | None) -> bool:
+    """Whether an error comes from states or assumptions, rather than from what a file says."""
+    while error is not None:
+        if isinstance(error, (AssumptionError, InconsistentStateError, SimulationError)):
+            return True
+        error = error.__cause__
+    return False
+
+
+def _simulated(
+    number: int, scenario: Scenario, loop: ClosedLoop | TaskLoop, lasting: float | None
+) -> RunResult:
+    """What a run comes to, from a new context of the loop."""
+    try:
+        context = start_scenario(scenario, loop)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if lasting is None or isinstance(loop, TaskLoop):
+                record, steps, failure = _stepped(scenario, loop, context)
+            else:
+                from drake_dae.scenario.rolled import roll_scenario
+
+                found = roll_scenario(scenario, loop, context, lasting)
+                record, steps, failure = found.record, found.steps, found.failure
+    except DrakeDaeError as error:
+        outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
+        return RunResult(number, outcome, str(error))
+    limits = Limits.of(cast(RobotPlant, loop.plant).model)
+    figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
+    if failure is not None:
+        return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
+    return RunResult(number, Outcome.FINISHED, "", {**figures, "steps": float(steps)}, beyond)
+
+
+def _stepped(
+    scenario: Scenario, loop: ClosedLoop | TaskLoop, context: Context
+) -> tuple[Record, int, SimulationError | None]:
+    """What Drake's Simulator makes of a run: its record, how many steps it took, why it failed."""
+    steps, failure = 0, None
+    try:
+        run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+        steps = run.steps
+        if run.interrupted:
+            raise KeyboardInterrupt(run.interrupted)
+    except SimulationError as error:
+        failure = error
+    return loop.record(context), steps, failure
+
+
+_ALONE = Lock()
+"""Threads of one process share what is built."""
+
+
+def run_batch(base: str, batch: Batch) -> list[dict[str, Any]]:
+    """Simulates runs in this process, for a cluster's workers.
+
+    Args:
+        base: The arguments of `Runner` as JSON.
+        batch: The runs.
+    """
+    with _ALONE:
+        return [result.to_dict() for result in _runner(base).run_all(batch)]
+
+
+@lru_cache(maxsize=1)
+def _runner(base: str) -> Runner:
+    return Runner(*json.loads(base))
+
+
+def lasting(base: Mapping[str, Any], variations: Iterable[Variation]) -> float:
+    """How long the runs of one structure last together on average, in s of their time.
+
+    Args:
+        base: The plain data of the study's scenario.
+        variations: All runs of the study.
+    """
+    total, keys = 0.0, set()
+    for variation in variations:
+        data = varied_data(base, variation)
+        total += data["duration"]
+        keys.add(structure_key(data, base))
+    return total / len(keys)
+
+
+def batches(
+    base: Mapping[str, Any], runs: Iterable[tuple[int, Variation]], workers: int
+) -> list[Batch]:
+    """The runs by structure, in portions: a worker builds a loop once for each portion at most.
+
+    Args:
+        base: The plain data of the study's scenario.
+        runs: The runs.
+        workers: Among how many they are shared.
+    """
+    groups: dict[str, list[tuple[int, Variation]]] = {}
+    for number, variation in runs:
+        key = structure_key(varied_data(base, variation), base)
+        groups.setdefault(key, []).append((number, variation))
+    total = sum(map(len, groups.values()))
+    size = max(1, min(32, total // (32 * workers)))
+    return [
+        group[first : first + size]
+        for group in groups.values()
+        for first in range(0, len(group), size)
+    ]

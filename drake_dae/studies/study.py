@@ -1,0 +1,146 @@
+"""What the runs of a study came to, as a table and in words."""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_dae.analysis.tables import Part, Table, count_of, to_text
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.errors import ModelError
+from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.variations import Variation
+
+FILES = ("runs.csv", "summary.txt", "histograms.png", "map.png")
+"""What `Study.save` writes."""
+
+MOST_REASONS = 5
+"""So many reasons of runs that did not finish are told."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A study: its variations, and what each of them came to.
+
+    Attributes:
+        variations: For each run, dotted key of the scenario -> value.
+        results: For each run its outcome, its figures and the signals that left their limits.
+    """
+
+    variations: tuple[Variation, ...]
+    results: tuple[RunResult, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.variations) != len(self.results):
+            raise ModelError(
+                f"a study has a result for each variation, got {len(self.results)} for "
+                f"{len(self.variations)}"
+            )
+
+    def __repr__(self) -> str:
+        return f"Study({count_of(len(self.results), 'run')}: {_counts(self.results)})"
+
+    def __str__(self) -> str:
+        return to_text(self._parts())
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys that vary."""
+        return tuple(dict.fromkeys(key for changes in self.variations for key in changes))
+
+    @property
+    def figures(self) -> tuple[str, ...]:
+        """Names of all figures, with units."""
+        return tuple(dict.fromkeys(name for result in self.results for name in result.figures))
+
+    def values(self, figure: str) -> FloatArray:
+        """A figure of every run, shape (number of runs,); nan where a run has none.
+
+        Raises:
+            ModelError: There is no such figure.
+        """
+        if figure not in self.figures:
+            raise ModelError(unknown_name("figure", figure, self.figures))
+        return np.array([result.figures.get(figure, np.nan) for result in self.results])
+
+    def table(self) -> dict[str, list[Any]]:
+        """The whole study: name of a column -> its entries; None where a run has none.
+
+        Columns are the number of the run, the keys that vary, the outcome with its reason, the
+        signals that left their limits, and the figures. It is the same whoever ran it, and however
+        often it was interrupted.
+        """
+        return {
+            "run": [result.run for result in self.results],
+            **{key: [changes.get(key) for changes in self.variations] for key in self.keys},
+            "outcome": [str(result.outcome) for result in self.results],
+            "reason": [result.reason for result in self.results],
+            "beyond limits": [" ".join(result.exceeded) for result in self.results],
+            **{name: [r.figures.get(name) for r in self.results] for name in self.figures},
+        }
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Writes `runs.csv`, `summary.txt`, and the plots that the study has figures for.
+
+        Args:
+            folder: The folder to write to; it is made.
+        """
+        from drake_dae.studies.study_plots import save_study_plots
+
+        place = Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        table, summary = place / FILES[0], place / FILES[1]
+        columns = self.table()
+        with open(table, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            writer.writerows(
+                [_cell(entry) for entry in row] for row in zip(*columns.values(), strict=True)
+            )
+        summary.write_text(f"{self}\n", encoding="utf-8")
+        return [table, summary, *save_study_plots(self.table(), self.keys, self.figures, place)]
+
+    def _parts(self) -> list[Part]:
+        parts: list[Part] = [[f"{count_of(len(self.results), 'run')}: {_counts(self.results)}"]]
+        others = [result for result in self.results if result.outcome is not Outcome.FINISHED]
+        if others:
+            shown = [f"run {r.run} {r.outcome}: {r.reason}" for r in others[:MOST_REASONS]]
+            more = len(others) - len(shown)
+            parts.append([*shown, f"and {more} more, see runs.csv"] if more else shown)
+        beyond = Counter(name for result in self.results for name in result.exceeded)
+        if beyond:
+            told = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
+            parts.append([f"beyond their limits: {', '.join(told)}"])
+        if self.figures:
+            head = ["figure", "least", "at run", "median", "largest", "at run"]
+            parts.append(Table(head, [self._row(name) for name in self.figures]))
+        return parts
+
+    def _row(self, figure: str) -> list[str]:
+        values = self.values(figure)
+        least, largest = int(np.nanargmin(values)), int(np.nanargmax(values))
+        return [
+            figure,
+            f"{values[least]:.4g}",
+            f"{least}",
+            f"{np.nanmedian(values):.4g}",
+            f"{values[largest]:.4g}",
+            f"{largest}",
+        ]
+
+
+def _counts(results: Sequence[RunResult]) -> str:
+    counts = Counter(result.outcome for result in results)
+    return ", ".join(f"{counts[outcome]} {outcome}" for outcome in Outcome if counts[outcome])
+
+
+def _cell(entry: Any) -> Any:
+    """Lists and tags as JSON, all else as it is."""
+    return json.dumps(entry) if isinstance(entry, (dict, list)) else entry

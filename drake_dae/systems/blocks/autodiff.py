@@ -1,0 +1,181 @@
+"""A block on AutoDiffXd.
+
+Drake's Linearize, FirstOrderTaylorApproximation, DirectCollocation and DirectTranscription convert
+a system to AutoDiffXd and read gradients. CasADi has the derivatives already: a converted block
+evaluates the same traced functions as before, and multiplies their traced Jacobians with the
+gradients of its inputs, state and parameters.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector_,
+    Context,
+    ContinuousState,
+    LeafSystem,
+    LeafSystem_,
+    PortDataType,
+)
+
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.feedback import Immutable, nothing
+from drake_dae.systems.blocks.formulas import Formula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+
+
+class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
+    """A block on AutoDiffXd, with the same ports, state and parameters.
+
+    Args:
+        original: The block.
+        formulas: Name of an output port -> what it computes; "derivative" -> the time derivative.
+        places: Where parameters stand that come from an input port `exogenous`.
+        references: What the input port `reference` has where it has no wire; None if it needs one.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        original: LeafSystem,
+        formulas: Mapping[str, Formula],
+        places: Sequence[int] = (),
+        references: Formula | None = None,
+    ) -> None:
+        super().__init__()
+        self.set_name(original.get_name())
+        context = original.CreateDefaultContext()
+        for i in range(context.num_numeric_parameter_groups()):
+            values = context.get_numeric_parameter(i).CopyToVector()
+            self.DeclareNumericParameter(BasicVector_[AutoDiffXd](values))
+        if context.num_continuous_states():
+            state = context.get_continuous_state_vector().CopyToVector()
+            self.DeclareContinuousState(BasicVector_[AutoDiffXd](state))
+            self._rate = formulas["derivative"]
+        self._places, self._references = list(places), references
+        tickets = {
+            "time": {self.time_ticket()},
+            "state": {self.xc_ticket()},
+            "parameters": {self.all_parameters_ticket()},
+        }
+        for i in range(original.num_input_ports()):
+            port = original.get_input_port(i)
+            name = port.get_name()
+            if port.get_data_type() == PortDataType.kAbstractValued:
+                self.DeclareAbstractInputPort(name, nothing())
+            else:
+                self.DeclareVectorInputPort(name, port.size())
+            tickets[name] = {self.input_port_ticket(port.get_index())}
+        of_reference = set(tickets.get("reference", ()))
+        if references is not None:
+            tickets["reference"] |= tickets["time"]
+        if "feedback" in tickets:
+            tickets["control"] |= tickets["feedback"] | tickets["time"] | tickets["state"]
+        for i in range(original.num_output_ports()):
+            port = original.get_output_port(i)
+            name = port.get_name()
+            if port.get_data_type() == PortDataType.kAbstractValued:
+                self._law = formulas["control"]
+                self.DeclareAbstractOutputPort(
+                    name,
+                    nothing,
+                    weakly(self._calc_feedback),
+                    tickets["parameters"] | of_reference,
+                )
+                continue
+            if name not in formulas:
+                raise ModelError(
+                    f"{original.get_name()} does not convert to AutoDiffXd: nothing tells how to "
+                    f"differentiate its output port '{name}'; add it to _formulas()"
+                )
+            self.DeclareVectorOutputPort(
+                name,
+                port.size(),
+                weakly(self._calc_output, formulas[name]),
+                set().union(*(tickets[s] for s in _read(formulas[name].sources, self._places))),
+            )
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        if context.num_continuous_states():
+            derivatives.get_mutable_vector().SetFromVector(self._evaluate(self._rate, context))
+
+    def _calc_output(self, formula: Formula, context: Context, output: Any) -> None:
+        output.SetFromVector(self._evaluate(formula, context))
+
+    def _source(self, name: str, context: Context) -> Any:
+        if name == "time":
+            return np.array([context.get_time()])
+        if name == "state":
+            return context.get_continuous_state_vector().CopyToVector()
+        if name == "parameters":
+            values = context.get_numeric_parameter(0).CopyToVector()
+            if self._places and self.GetInputPort("exogenous").HasValue(context):
+                values[self._places] = self.GetInputPort("exogenous").Eval(context)
+            return values
+        port, time = self.GetInputPort(name), context.get_time()
+        if name == "reference" and self._references is not None and not port.HasValue(context):
+            return _chained(self._references, time, [np.array([time])])
+        if name == "control" and self.HasInputPort("feedback") and not port.HasValue(context):
+            feedback = self.GetInputPort("feedback").Eval(context)
+            return feedback.control(time, self._source("state", context))
+        return port.Eval(context)
+
+    def _evaluate(self, formula: Formula, context: Context) -> Any:
+        """The value with its gradient, an array of AutoDiffXd."""
+        given = [self._source(name, context) for name in formula.sources]
+        return _chained(formula, context.get_time(), given)
+
+    def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
+        port, known = self.GetInputPort("reference"), {}
+        if port.HasValue(context):
+            known["reference"] = port.Eval(context)
+        known["parameters"] = self._source("parameters", context)
+        value.set_value(_Feedback(self._law, self._references, known))
+
+
+class _Feedback(Immutable):
+    """A law as a value on a wire, as `Feedback`.
+
+    Args:
+        law: The law.
+        references: What its references are.
+        known: Its parameters; and its references, if they are fixed.
+    """
+
+    def __init__(self, law: Formula, references: Formula | None, known: Mapping[str, Any]) -> None:
+        self._law, self._references, self._known = law, references, known
+
+    def control(self, time: AutoDiffXd, state: Any) -> Any:
+        """u at a time and a state, an array of AutoDiffXd."""
+        given = {"estimated_state": state, **self._known}
+        if "reference" not in given and self._references is not None:
+            given["reference"] = _chained(self._references, time, [np.array([time])])
+        return _chained(self._law, time, [given[name] for name in self._law.sources])
+
+
+def _chained(formula: Formula, time: AutoDiffXd, given: Sequence[Any]) -> Any:
+    """A formula's value with its gradient, by the chain rule; an array of AutoDiffXd.
+
+    Args:
+        formula: The formula.
+        time: The time, in s.
+        given: Its arguments, arrays of AutoDiffXd.
+    """
+    arguments = [ExtractValue(values).reshape(-1) for values in given]
+    gradients = [ExtractGradient(values) for values in given]
+    value = formula.value(time.value(), *arguments)
+    moving = tuple(i for i, gradient in enumerate(gradients) if gradient.size)
+    total = np.zeros((value.size, 0))
+    if moving:
+        slope = formula.slope(moving, time.value(), *arguments)
+        total = slope @ np.vstack([gradients[i] for i in moving])
+    return InitializeAutoDiff(value, total).reshape(-1)
+
+
+def _read(sources: Sequence[str], places: Sequence[int]) -> set[str]:
+    """What a formula's sources read: where parameters move, they come from a port as well."""
+    return {*sources, *(["exogenous"] if places and "parameters" in sources else [])}

@@ -1,0 +1,274 @@
+"""What our LeafSystems share: parameters, checked functions, and conversion to AutoDiffXd."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    InputPort,
+    LeafSystem,
+    LeafSystem_,
+    OutputPort,
+    PortDataType,
+    SystemScalarConverter,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, listed, numbers, vector
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError, SimulationError
+from drake_dae.systems.blocks.autodiff import AutoDiffSystem
+from drake_dae.systems.blocks.failures import simulation_error
+from drake_dae.systems.blocks.formulas import Formula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.trials import StepWatch
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class DifferentiableSystem(LeafSystem):
+    """A LeafSystem with vector ports that converts to AutoDiffXd, alone or in a diagram.
+
+    The converted system has the same ports, continuous state and numeric parameters, and exact
+    gradients. It has no events: a converted plant does not project its state onto N*, nor does it
+    refuse a start that is off N*.
+
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self) -> None:
+        converter = SystemScalarConverter()
+        converter._AddConstructor[AutoDiffXd, float](_converted)
+        super().__init__(converter)
+
+    def __repr__(self) -> str:
+        inputs = [self.get_input_port(i) for i in range(self.num_input_ports())]
+        outputs = [self.get_output_port(i) for i in range(self.num_output_ports())]
+        ports = [
+            f"{kind}={listed([_shown(port) for port in found])}"
+            for kind, found in (("inputs", inputs), ("outputs", outputs))
+        ]
+        return f"{type(self).__name__}('{self.get_name()}', {', '.join(ports)})"
+
+    @cached_property
+    def formulas(self) -> dict[str, Formula]:
+        """Name of an output port -> what it computes; "derivative" -> the time derivative.
+
+        Raises:
+            ModelError: The system does not convert to AutoDiffXd.
+        """
+        return self._formulas()
+
+    def _formulas(self) -> dict[str, Formula]:
+        raise NotImplementedError
+
+    @property
+    def references_by_time(self) -> Formula | None:
+        """What an input port `reference` has where it has no wire; None if it needs one."""
+        return None
+
+    def check_context(self, context: Context) -> None:
+        """Refuses the context of another system.
+
+        Raises:
+            ModelError: It is none of this system.
+        """
+        try:
+            self.ValidateContext(context)
+        except RuntimeError:
+            raise ModelError(
+                f"the context is not that of '{self.get_name()}'; of a diagram's context take "
+                "system.GetMyMutableContextFromRoot(context)"
+            ) from None
+
+    def ToAutoDiffXd(self) -> LeafSystem_[AutoDiffXd]:
+        """The converted system. Drake's own method would wrap it and rename its ports.
+
+        Raises:
+            ModelError: The system does not convert to AutoDiffXd.
+        """
+        return _converted(self)
+
+
+@checked(ModelError)
+class ParameterizedSystem(DifferentiableSystem):
+    """A LeafSystem whose numeric parameter 0 begins with all parameters of a DaeSystem.
+
+    So a study changes numbers in a context without tracing again, and a controller can be given
+    other numbers than its plant. Those parameters that move, the exogenous signals w, come through
+    an input port `exogenous` with the derivatives that the block needs, stacked as references are:
+    w_1, w_1', ..., w_2, ...; `exogenous_layout` tells how many. Without a wire they stand still at
+    their parameters' values.
+
+    Attributes:
+        exogenous_layout: How the port's entries are stacked.
+        exogenous_places: Where they stand among the parameters.
+
+    Args:
+        dae: The system.
+        values: The default: `dae.parameter_values`, and what else the block appends.
+        signals: Name of an input of the block's functions -> names of its entries, for messages.
+        sees_steps: Whether it sees the steps of a simulation; without, no state is a trial.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        dae: DaeSystem,
+        values: FloatArray,
+        signals: Mapping[str, Sequence[Signal]],
+        sees_steps: bool = True,
+    ) -> None:
+        super().__init__()
+        self.dae = dae
+        self._signals = signals
+        self._exogenous: InputPort | None = None
+        self.exogenous_layout = Layout(())
+        self.exogenous_places: list[int] = []
+        self._steps = StepWatch(self, sees_steps)
+        self.DeclareNumericParameter(BasicVector(values))
+
+    def _declare_exogenous(self, degrees: Sequence[int]) -> set[DependencyTicket]:
+        """Declares the input port of the exogenous signals, if there are any.
+
+        Args:
+            degrees: How many derivatives of each entry of w the block's functions need.
+
+        Returns:
+            What all parameters depend on.
+        """
+        tickets = {self.all_parameters_ticket()}
+        if degrees:
+            self.exogenous_layout = Layout(tuple(degrees))
+            self.exogenous_places = self.dae.exogenous.places(degrees)
+            size = self.exogenous_layout.reference_size
+            self._exogenous = self.DeclareVectorInputPort("exogenous", size)
+            tickets.add(self.input_port_ticket(self._exogenous.get_index()))
+        return tickets
+
+    def _values(self, context: Context) -> FloatArray:
+        """All parameters, those that move as the input port says; not to be changed."""
+        values = context.get_numeric_parameter(0).value()
+        if self._exogenous is not None and self._exogenous.HasValue(context):
+            values = values.copy()
+            values[self.exogenous_places] = self._exogenous.Eval(context)
+        return values
+
+    def _checked(
+        self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
+    ) -> tuple[FloatArray, ...]:
+        """The values of a function of (state, inputs, parameters); nan where a trial fails.
+
+        Raises:
+            SingularityError: A matrix in it is singular; the exception has time and state.
+            NonFiniteError: A value is not finite, likewise.
+        """
+        if self._exogenous is None:  # Without a call more, in each evaluation.
+            parameters = context.get_numeric_parameter(0).value()
+        else:
+            parameters = self._values(context)
+        values = function.evaluate(state, *inputs, parameters)
+        if function.is_valid:
+            return values
+        known = self._otherwise(function, state, inputs, parameters)
+        if known is not None:
+            return known
+        time, state = context.get_time(), state.copy()
+        error = simulation_error(function.failure(), time, state, self._signals)
+        self._steps.tolerate(context, self._explained(error, parameters, *inputs))
+        return function.nowhere()
+
+    def _otherwise(
+        self,
+        function: TracedFunction,
+        state: FloatArray,
+        inputs: Sequence[FloatArray],
+        parameters: FloatArray,
+    ) -> tuple[FloatArray, ...] | None:
+        """The values of a function by another way, where its own are not valid; None if none."""
+        return None
+
+    def _explained(
+        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    ) -> SimulationError:
+        """The error, or a better one for what a function of such inputs has no value."""
+        return error
+
+    def parameters(self, context: Context) -> FloatArray:
+        """All parameters in the order of `dae.parameters`, shape (k,)."""
+        self.check_context(context)
+        values = context.get_numeric_parameter(0).value()
+        return np.array(values[: self.dae.parameter_values.size])
+
+    def current_parameters(self, context: Context) -> FloatArray:
+        """All parameters as `parameters`, those that move as they are at the context's time."""
+        self.check_context(context)
+        return np.array(self._values(context)[: self.dae.parameter_values.size])
+
+    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
+        """What the block's functions take as parameters, as it was at the accepted times of a run.
+
+        Parameters that move stand still at their values; see `exogenous_places`.
+
+        Args:
+            context: The context of the run.
+            times: The times, in s, shape (k,), increasing.
+
+        Returns:
+            One row for each time.
+        """
+        self.check_context(context)
+        return self._steps.parameters_along(context, vector("times", times, None))
+
+    def get_parameter(self, context: Context, name: str) -> FloatArray:
+        """A parameter by name, shape (k,).
+
+        Raises:
+            ModelError: No parameter has that name.
+        """
+        return self.parameters(context)[self.dae.parameter_slice(name)]
+
+    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
+        """Changes a parameter in a context.
+
+        Args:
+            context: The context of this system.
+            name: The name of the parameter in `dae.parameters`.
+            value: The new value, shape (k,), or a number for all entries.
+
+        Raises:
+            ModelError: No parameter has that name, or the value does not fit.
+        """
+        self.check_context(context)
+        values = context.get_numeric_parameter(0).CopyToVector()
+        place = self.dae.parameter_slice(name)
+        given = numbers(f"parameter '{name}'", value)
+        size = place.stop - place.start
+        if given.shape not in ((), (size,)):
+            raise ModelError(f"parameter '{name}' has {size} entries, got {value!r}")
+        values[place] = given
+        for parameter in self.dae.parameters:
+            if parameter.name == name:
+                parameter.check(values[place])
+        context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+
+def _shown(port: InputPort | OutputPort) -> str:
+    """A port with its size, if it has vectors."""
+    is_vector = port.get_data_type() == PortDataType.kVectorValued
+    return f"{port.get_name()} ({port.size()})" if is_vector else port.get_name()
+
+
+def _converted(original: DifferentiableSystem) -> AutoDiffSystem:
+    """A block on AutoDiffXd."""
+    places = original.exogenous_places if isinstance(original, ParameterizedSystem) else []
+    return AutoDiffSystem(original, original.formulas, places, original.references_by_time)

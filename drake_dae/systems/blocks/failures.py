@@ -1,0 +1,239 @@
+"""How a simulation tells that a function has no value."""
+
+from collections.abc import Mapping, Sequence
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.contacts import jam
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import (
+    InconsistentStateError,
+    JammedContactError,
+    NonFiniteError,
+    SimulationError,
+    SingularityError,
+)
+from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, Fault
+
+
+def simulation_error(
+    failure: Failure,
+    time: float,
+    state: FloatArray,
+    signals: Mapping[str, Sequence[Signal]],
+) -> SimulationError:
+    """The exception for a function that has no value in a simulation.
+
+    Args:
+        failure: What was wrong with the values.
+        time: The time, in s.
+        state: The state, shape (n,).
+        signals: Name of an input -> names of its entries; the name of the input serves otherwise.
+    """
+    where = f"at t = {time:.6g} s, state {show(state)}"
+    bad = ", ".join(
+        signals[name][i].name if name in signals else name
+        for name, entries in failure.inputs.items()
+        for i in (entries if name in signals else entries[:1])
+    )
+    match failure.fault:
+        case Fault.INPUT:
+            return NonFiniteError(
+                f"{failure.function}: its input {bad} is not finite {where}", time, state
+            )
+        case Fault.OVERFLOW:
+            return NonFiniteError(
+                f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
+                "without bound. Look at the gains, and at what the model has wrong",
+                time,
+                state,
+            )
+        case Fault.VALUE:
+            return NonFiniteError(
+                f"{failure.function} is not finite {where}: a function left its domain or is not "
+                "differentiable there, or a matrix that is inverted is singular",
+                time,
+                state,
+            )
+        case Fault.SINGULAR:
+            return SingularityError(
+                f"{failure.singular} is singular {where}, so {failure.function} is not determined "
+                "there: a singular configuration, through which smaller steps do not lead. A plant "
+                "passes one only where its velocity leads across, along one branch. Keep away from "
+                "this state, or choose other constraints or outputs",
+                time,
+                state,
+            )
+
+
+def no_step_leads_on(
+    name: str, time: float, state: FloatArray, reason: SimulationError, text: str
+) -> SimulationError:
+    """The exception where every trial failed, of the kind of the reason, however short the step.
+
+    Args:
+        name: The block.
+        time: The time of the last accepted state, in s.
+        state: That state.
+        reason: A trial's failure.
+        text: What the earliest trial said.
+    """
+    return reason.retold(
+        f"{name}: no step leads on from t = {time:.6g} s{_at(state)} since each that was tried "
+        f"failed, however short: {text}",
+        time,
+        state if state.size else reason.state,
+    )
+
+
+def spoilt_step(
+    name: str, start: float, end: float, state: FloatArray, text: str
+) -> NonFiniteError:
+    """The exception where an integrator without error control accepted a trial that failed.
+
+    Args:
+        name: The block.
+        start, end: The times of the step, in s.
+        state: Where it began.
+        text: What the earliest trial said; empty if none failed.
+    """
+    reason = f": {text}" if text else ""
+    return NonFiniteError(
+        f"{name}: the step from t = {start:.6g} s{_at(state)} to t = {end:.6g} s led to a state "
+        f"that is not finite{reason}. Take smaller steps, or an integrator with error control",
+        start,
+        state,
+    )
+
+
+def endless_steps(
+    name: str, steps: int, start: float, end: float, state: FloatArray
+) -> SimulationError:
+    """The exception where many steps hardly led on.
+
+    Args:
+        name: The block.
+        steps: How many.
+        start, end: The times that they led from and to, in s.
+        state: Where they led.
+    """
+    return SimulationError(
+        f"{name}: the last {steps} steps led from t = {start:.12g} s only to {end:.12g} s"
+        f"{_at(state)} where it grows without bound, or jumps. Look at the gains and at what the "
+        "model has wrong; where that is in order, choose a fixed step",
+        end,
+        state,
+    )
+
+
+def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError) -> SimulationError:
+    """The exception where a state cannot be projected onto N*.
+
+    Args:
+        time: The time, in s.
+        state: The state, shape (n,).
+        reason: What the projection said.
+    """
+    return SimulationError(
+        f"the state left the constraint too far at t = {time:.6g} s, state {show(state)}: "
+        f"{reason}. Take smaller steps or a better accuracy",
+        time,
+        state,
+    )
+
+
+def _at(state: FloatArray) -> str:
+    return f", state {show(state)}," if state.size else ""
+
+
+def off_start(name: str, manifold: Manifold, residual: FloatArray) -> InconsistentStateError:
+    """The exception for a run that starts off N*.
+
+    Args:
+        name: The system's name.
+        manifold: N*.
+        residual: How far each of its equations is from holding, shape (k,).
+    """
+    table = ", ".join(
+        f"{signal.name} = {value:.3g} {signal.unit}"
+        for signal, value in zip(manifold.residual_signals, residual, strict=True)
+        if not abs(value) <= 1e-3 * np.max(np.abs(residual))
+    )
+    return InconsistentStateError(
+        f"{name}: the start state is not on the constraint: {table}. Call "
+        "set_consistent_state(context, guess) to start from the nearest consistent state",
+        residual,
+    )
+
+
+def assembled_otherwise(
+    name: str, left_out: Manifold, state: FloatArray, residual: FloatArray
+) -> InconsistentStateError:
+    """The exception for a start at which redundant constraints that were left out do not hold.
+
+    Args:
+        name: The system's name.
+        left_out: What these constraints hold.
+        state: The start, shape (n,).
+        residual: How far each of their equations is from holding, shape (k,).
+    """
+    worst = int(np.argmax(np.abs(residual)))
+    signal = left_out.residual_signals[worst]
+    return InconsistentStateError(
+        f"{name}: the constraints that stay hold at state {show(state)}, but not "
+        f"the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
+        f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
+        "one of these constraints and not the others; start nearer to where all hold",
+        residual,
+    )
+
+
+def jammed_contact(
+    structure: ConstraintStructure,
+    error: SimulationError,
+    control: FloatArray,
+    parameters: FloatArray,
+    force: FloatArray,
+) -> JammedContactError | None:
+    """Where friction jams a contact, that, and whether any motion fits; None where it does not.
+
+    Args:
+        structure: The structure of the system that rubs.
+        error: What says that A(x) is singular, with time and state.
+        control: u, shape (p,).
+        parameters: Values of all parameters.
+        force: v there, shape (m,).
+    """
+    dae, elimination = structure.system, structure.elimination
+    rubbing, matrix = dae.rubbing, elimination.constraint_matrix
+    outputs = {
+        "A": ca.densify(matrix),
+        "A_0": ca.densify(rubbing.without_friction(matrix)),
+        "gradient": elimination.constraint_gradient,
+        "reserve": rubbing.reserve(matrix),
+    }
+    values = dae.trace("A(x)", outputs, often=False)(error.state, parameters)
+    m, reserve = dae.num_constraints, values[3].item()
+    if not reserve < SINGULAR_PIVOT:
+        return None
+    A, A_0, gradient = (value.reshape(m, -1) for value in values[:3])
+    fields = dict(zip(dae.fields.output_names, dae.fields(error.state, parameters), strict=True))
+    free = np.abs(fields["f"])
+    if control.size:
+        free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(control)
+    found = jam(A, A_0, force, np.abs(gradient) @ free, rubbing.rows)
+    names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in rubbing.rows)
+    outcome = f". What becomes of it is {found.value}" if found else ""
+    return JammedContactError(
+        f"{dae.name}: friction jams the contact of {names} at t = {error.time:.6g} s, "
+        f"state {show(error.state)} (Painleve): a principal minor of A(x) has come to "
+        f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
+        "other way, or hold the robot less steeply to the surface",
+        error.time,
+        error.state,
+        found,
+    )

@@ -1,0 +1,324 @@
+"""The tracking law as a LeafSystem."""
+
+import warnings
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    ContinuousState,
+    DependencyTicket,
+    EventStatus,
+    State,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import ModelError, NonMinimumPhaseWarning
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.blocks.feedback import Feedback, nothing
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class TrackingController(ParameterizedSystem):
+    """The law (28) of any `TrackingLaw`: u = B(x)^-1 (-a(x) + ubar(x, R)).
+
+    Input ports:
+        estimated_state: x, shape (n,).
+        reference: R, output-major, r_i, ..., r_i^(mu_i); shape (sum (mu_i + 1),).
+        measured_force: The constraint force from a sensor, shape (m,); if the law takes it.
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
+
+    Output ports:
+        control: u, shape (p,).
+        tracking_error: e = z - r (29) by the controller's own model, one entry per output.
+
+        integral: The integrals of errors, shape (k,), if the law has any; its state. They start at
+            zero, or where `set_integral` puts them. Where an entry of `hold` is not 0, or an
+            integral has come to its limit and its error would carry it on, it stays (anti-windup).
+
+        feedback: The law with its references and parameters as a value, for the port `feedback` of
+            a `DaePlant`; if asked for.
+
+    A law with integrals also has an input port `hold`, shape (k,): where it is not 0 that error is
+    not integrated, as while a drive is at its limit or a contact is lost. Without a wire it is 0.
+
+    The first two output ports have direct feedthrough from all input ports, but for `hold`, and for
+    `measured_force` where the law does but integrate it. The context holds the model's
+    parameters and then the gains as one numeric parameter; see `set_parameter` and `set_gains`.
+    The block converts to AutoDiffXd.
+
+    Args:
+        law: The law.
+        outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
+        integral_limits: The largest |integral| of each error in its unit times s, a number or shape
+            (k,), positive. Converted to AutoDiffXd it has neither limits nor holds, and a force
+            that it integrates has direct feedthrough, so that it must come from a sensor.
+        sample_period: Integrals are sums of the errors at the multiples of this time in s, as those
+            of a `Sampling`, and do not convert; 0 for integrals by the integrator. An integrator
+            has no use for a discrete plant, whose state jumps while time goes on.
+        references: What R is where the port `reference` has no wire; None if it needs one.
+        feedback: Whether there is an output port `feedback`, for a law that takes the state and
+            `references` alone. The plant then sees what is a trial, and which parameters the law
+            had; the other ports are there to be looked at, and raise at trials too.
+
+    Warns:
+        NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
+
+    Raises:
+        ModelError: The law cannot be fed back, or a limit or period makes no sense.
+        SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
+        NonFiniteError: A value is not finite on the way, likewise.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        law: TrackingLaw,
+        outputs: ArrayLike | None = None,
+        integral_limits: ArrayLike = np.inf,
+        sample_period: float = 0.0,
+        references: ReferenceGenerator | None = None,
+        feedback: bool = False,
+    ) -> None:
+        dae = law.system
+        signals = {
+            "state": dae.state_signals,
+            "reference": law.reference_signals,
+            "measured_force": dae.constraint_input_signals,
+        }
+        super().__init__(dae, law.all_parameters(), signals, sees_steps=not feedback)
+        _warn_of_zero_dynamics(law, outputs)
+        self.law = law
+        self.set_name("tracking_controller")
+        sizes = {"estimated_state": dae.num_states, "reference": law.layout.reference_size}
+        if law.measured_force:
+            sizes["measured_force"] = dae.num_constraints
+        self._evaluators = [self.DeclareVectorInputPort(*item).Eval for item in sizes.items()]
+        self._references = references
+        if references is not None:
+            self._reference_at = references.function
+            self._reference_port = self.GetInputPort("reference")
+            self._evaluators[1] = weakly(self._reference)
+        self._declare_exogenous(law.exogenous_degrees)
+        sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+        if law.integral.outputs:
+            sources = self._add_integrals(integral_limits, sample_period)
+        self._is_plain = len(self._evaluators) == 2 and self._exogenous is None
+        if references is not None:
+            sources.add(self.time_ticket())
+        if feedback:
+            self._declare_feedback()
+        self.DeclareVectorOutputPort(
+            "control", dae.num_controls, weakly(self._calc_control), sources
+        )
+        self.DeclareVectorOutputPort(
+            "tracking_error", dae.num_outputs, weakly(self._calc_tracking_error), sources
+        )
+
+    def _add_integrals(self, limits: ArrayLike, sample_period: float) -> set[DependencyTicket]:
+        """Declares the integrals, and returns what the control depends on."""
+        count = len(self.law.integral.outputs)
+        given = np.asarray(limits, dtype=float)
+        if given.shape not in ((), (count,)) or not np.all(given > 0.0):
+            raise ModelError(
+                f"integral_limits must be a positive number or shape ({count},), got {limits!r}"
+            )
+        if not sample_period >= 0.0:
+            raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
+        self._limits, self.sample_period = np.broadcast_to(given, (count,)), sample_period
+        self._hold = self.DeclareVectorInputPort("hold", count)
+        if sample_period:
+            self.DeclareDiscreteState(count)
+            # Unrestricted, as the step of a discrete MultibodyPlant: so both see one instant.
+            self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sum))
+            tickets = {self.xd_ticket()}
+        else:
+            self.DeclareContinuousState(count)
+            self.__class__ = _integrating(type(self))  # type: ignore[arg-type]
+            tickets = state_tickets(self)
+        self._evaluators.append(weakly(self._integrals))
+        self._rate_evaluators = list(self._evaluators)
+        if self.law.measured_force and not self.law.control_takes_force:
+            # Whatever it is: reading it would close an algebraic loop.
+            nothing = np.zeros(self.dae.num_constraints)
+            self._evaluators[2] = lambda context: nothing
+        self.DeclareVectorOutputPort("integral", count, weakly(self._copy_integrals), tickets)
+        read = ["estimated_state", "reference", "exogenous"]
+        read += ["measured_force"] if self.law.control_takes_force else []
+        ports = [self.GetInputPort(name) for name in read if self.HasInputPort(name)]
+        tickets |= {self.input_port_ticket(port.get_index()) for port in ports}
+        return tickets | {self.all_parameters_ticket()}
+
+    def set_integral(self, context: Context, integral: ArrayLike) -> None:
+        """Starts the integrals of the errors at values, shape (k,).
+
+        Raises:
+            ModelError: The shape is wrong, or the law has no integrals.
+        """
+        self.check_context(context)
+        size = len(self.law.integral.outputs)
+        if not size:
+            raise ModelError(f"{self.get_name()}: its law integrates nothing")
+        values = vector("integral", integral, size)
+        if self.sample_period:
+            context.SetDiscreteState(values)
+        else:
+            context.SetContinuousState(values)
+
+    def _sum(self, context: Context, state: State) -> EventStatus:
+        summed = self._integrals(context) + self.sample_period * self._integral_rate(context)
+        state.get_mutable_discrete_state().set_value(0, summed)
+        return EventStatus.Succeeded()
+
+    def _integral_rate(self, context: Context) -> FloatArray:
+        inputs = [evaluate(context) for evaluate in self._rate_evaluators]
+        rate = self._checked(self.law.function, context, *inputs)[2].copy()
+        sigma = self._integrals(context)
+        rate[(np.abs(sigma) >= self._limits) & (rate * sigma > 0.0)] = 0.0
+        if self._hold.HasValue(context):
+            rate[self._hold.Eval(context) != 0.0] = 0.0
+        return rate
+
+    def _copy_integrals(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._integrals(context))
+
+    def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
+        """Changes the gains in a context.
+
+        Args:
+            context: The context of this system.
+            gains: A design such as `poles(-8.0)`, or finished gains.
+
+        Raises:
+            GainError: The gains do not fit, are not Hurwitz, or couple outputs that the law does
+                not.
+        """
+        values = self.law.all_parameters(self.parameters(context), gains)
+        context.get_mutable_numeric_parameter(0).SetFromVector(values)
+
+    def all_parameters(self, context: Context) -> FloatArray:
+        """What the law's function takes as parameters: the model's at the context's time, and K."""
+        self.check_context(context)
+        return np.array(self._values(context))
+
+    def _calc_control(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluate(context)[0])
+
+    def _calc_tracking_error(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluate(context)[1])
+
+    def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
+        function = self.law.function
+        if self._is_plain:  # The same without a call more, where it has values.
+            of_state, of_reference = self._evaluators
+            state, reference = of_state(context), of_reference(context)
+            x, r, parameters = function.arguments
+            x[...] = state
+            r[...] = reference
+            parameters[...] = context.get_numeric_parameter(0).value()
+            if function.run():
+                return function.outputs
+        inputs = [evaluate(context) for evaluate in self._evaluators]
+        return self._checked(function, context, *inputs)
+
+    def _declare_feedback(self) -> None:
+        if self._references is None or not self._is_plain:
+            raise ModelError(
+                f"{self.dae.name}: a law that is fed back needs references, and takes no measured "
+                "force, integral or exogenous signals"
+            )
+        port = self.input_port_ticket(self._reference_port.get_index())
+        self.DeclareAbstractOutputPort(
+            "feedback", nothing, weakly(self._calc_feedback), {self.all_parameters_ticket(), port}
+        )
+
+    def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
+        parameters = np.array(context.get_numeric_parameter(0).value())
+        reference = self._reference_at
+        if self._reference_port.HasValue(context):
+            fixed = self._reference_port.Eval(context)
+
+            def reference(time: float) -> FloatArray:
+                return fixed
+
+        value.set_value(Feedback(self.law.function, reference, parameters, self._signals))
+
+    def _reference(self, context: Context) -> FloatArray:
+        """R: what is wired or fixed, or what the references are at the context's time."""
+        if self._reference_port.HasValue(context):
+            return self._reference_port.Eval(context)
+        return self._reference_at(context.get_time())
+
+    @property
+    def references_by_time(self) -> Formula | None:
+        """What R is where the input port `reference` has no wire; None if it needs one."""
+        return None if self._references is None else self._references.formulas["reference"]
+
+    def _integrals(self, context: Context) -> FloatArray:
+        if self.sample_period:
+            return context.get_discrete_state(0).CopyToVector()
+        return context.get_continuous_state_vector().CopyToVector()
+
+    def _formulas(self) -> dict[str, Formula]:
+        function = self.law.function
+        named = {"state": "estimated_state", "integral": "state"}
+        sources = [named.get(name, name) for name in function.input_names]
+        formulas: dict[str, Formula] = {
+            name: TracedFormula(function, name, sources, self._signals)
+            for name in ("control", "tracking_error")
+        }
+        if self.law.integral.outputs:
+            if self.sample_period:
+                raise ModelError(
+                    f"{self.get_name()} does not convert to AutoDiffXd: its integrals are sampled, "
+                    "and a sample has no derivative by the time. Give it no sample_period"
+                )
+            formulas["derivative"] = TracedFormula(
+                function, "integral_rate", sources, self._signals
+            )
+            sigma = self.law.integral.symbol
+            own = TracedFunction("integral", {"state": sigma}, {"value": sigma})
+            formulas["integral"] = TracedFormula(own)
+        return formulas
+
+
+@cache
+def _integrating(kind: type[TrackingController]) -> type[TrackingController]:
+    """A class of controllers with a time derivative.
+
+    Drake would ask those for one too that have no state: a tenth of a short step.
+    """
+
+    def rate(self: TrackingController, context: Context, derivatives: ContinuousState) -> None:
+        derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
+
+    return type(kind.__name__, (kind,), {"__slots__": (), "DoCalcTimeDerivatives": rate})
+
+
+def _warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:
+    if not law.structure.zero_dynamics_dimension:
+        return
+    dynamics = ZeroDynamics(law.system, structure=law.structure)
+    stability = dynamics.stability(law.structure.states[0], outputs=outputs)
+    if stability.verdict is Verdict.UNSTABLE:
+        warnings.warn(
+            f"{law.system.name}: {stability.reason}. The outputs follow the reference "
+            "while other states, or the control, run off; choose other outputs",
+            NonMinimumPhaseWarning,
+            stacklevel=3,
+        )

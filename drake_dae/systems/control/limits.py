@@ -1,0 +1,56 @@
+"""Drives that give no more than their limits."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_dae.arguments import checked
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+
+
+@checked(ModelError)
+class ControlLimits(LeafSystem):
+    """Cuts each control at its limit, and tells what it cut off.
+
+    Input port:
+        control: What is wanted, shape (p,).
+
+    Output ports:
+        control: What the drives give, max(-limit, min(limit, control)), shape (p,).
+        excess: What is missing, wanted less given, shape (p,): 0 within the limits. A log of it
+            tells when.
+        is_limited: 1 while something is missing, else 0, shape (1,); for the `hold` of a
+            `TrackingController` with integrals.
+
+    Args:
+        limits: The largest |control|, shape (p,), positive; infinite where there is none.
+
+    Raises:
+        ModelError: A limit is not positive, or there is none at all.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, limits: ArrayLike) -> None:
+        super().__init__()
+        self.set_name("control_limits")
+        self.limits = np.array(limits, dtype=float)
+        if self.limits.ndim != 1 or not self.limits.size or not np.all(self.limits > 0.0):
+            raise ModelError(f"limits must be positive numbers of shape (p,), got {limits!r}")
+        size = self.limits.size
+        self._port = self.DeclareVectorInputPort("control", size)
+        source = {self.input_port_ticket(self._port.get_index())}
+        self.DeclareVectorOutputPort("control", size, weakly(self._calc_control), source)
+        self.DeclareVectorOutputPort("excess", size, weakly(self._calc_excess), source)
+        self.DeclareVectorOutputPort("is_limited", 1, weakly(self._calc_is_limited), source)
+
+    def _calc_control(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(np.clip(self._port.Eval(context), -self.limits, self.limits))
+
+    def _calc_excess(self, context: Context, output: BasicVector) -> None:
+        wanted = self._port.Eval(context)
+        output.SetFromVector(wanted - np.clip(wanted, -self.limits, self.limits))
+
+    def _calc_is_limited(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector([float(np.any(np.abs(self._port.Eval(context)) > self.limits))])

@@ -1,0 +1,334 @@
+"""An observer of what a model lacks: a disturbance, and coefficients of friction."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, EventStatus, State
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import Booleans, FloatArray, numbers, positive
+from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation, beside, shares
+from drake_dae.dae.beyond.lags import Lags
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.blocks.failures import simulation_error
+from drake_dae.systems.blocks.formulas import Formula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.trace.functions import TracedFunction
+
+_SHARP = 10.0
+"""Friction here is that of a motion so many times as fast: full from v_s / 10 on."""
+
+
+@checked(ModelError)
+class DisturbanceObserver(ParameterizedSystem):
+    """Observes the disturbance d of E x' = f + S d + g v + h u, and identifies friction.
+
+    At each sample, T apart, the momentum p = S^T E x tells what acted besides what is known,
+
+        d_k = (p_k - p_(k-1)) / T - mean((S^T E)' x + S^T f) - S^T (h u + g v),
+
+    of which r is low-passed with the rate k_o, r_k = e^(-k_o T) r_(k-1) + (1 - e^(-k_o T)) d_k: a
+    constant d is found as 1 - e^(-k_o t), and noise n of the velocities, with M the mass, leaves
+    about k_o M n of noise in r. That part of d which the constraints answer, d - Q d with Q of
+    `Observation`, is found with the rate k_n = `force_rate`: it makes no motion, but its noise
+    makes force.
+
+    Behind springs, motors or valves a law needs n derivatives of d, of which the differences of
+    d_k would be noise. There r is what n + 1 such lags leave, one behind the other, r =
+    (k_o / (s + k_o))^(n+1) d, which has them exactly; see `Lags`.
+
+    A coefficient of friction takes the share that r has of the force of friction c = S^T dg/dmu v,
+
+        mu' = k_f (c . r) / (c . c),    r' = k_o (d - r) - c mu',
+
+    in the metric of kinetic energy, in the directions that the constraint leaves. So r + c mu
+    follows what acts with the rate k_o, whatever k_f is, and no motion tells when the share is
+    handed over: nor do the derivatives that are told, r', r'', ... without the share and mu' = 0,
+    of whose errors c mu' and -c mu' the sum is zero. Friction that is identified acts at once where
+    the force or the direction changes; r is late by 1 / k_o. mu stays between 0 and
+    `largest_friction`, and stands still where the contact is pressed by less than `least_force`;
+    also while the input `hold` is not 0. r needs no hold: it has the control that acts, also at its
+    limits, and the force that is measured, also where a contact is open.
+
+    Below `least_speed` a contact may stick, and its friction is a reaction like the constraint's:
+    no motion tells it, nor its coefficient. Then mu stands still, and so does r in the directions
+    in which the contact slides; in the others it goes on. Else r would take up what holds a tool
+    that turns, 2 mu lambda within a sample or two, and give it back for 1 / k_o. The integrals of
+    the law go on, so that what friction holds off its place comes there in the end.
+
+    Friction acts against the motion that the reference wants, c_w = c(x_w), where x_w is x with the
+    velocities that follow from the reference and the constraints: where a motion turns or begins
+    the contact sticks, and its own velocity tells no direction. It is that motion at the time at
+    which the control acts, tau = `control_delay` later: r' + tau r''. A reference has no noise, and
+    what slides slowly is not believed; so c_w, and c where d is observed, are those of ten times
+    the velocity: full from v_s / 10 on. Since the law's model has mu c(x), what it is told to
+    cancel is r + mu (c_w - c(x)), of one and the same x. Where outputs and constraints do not
+    determine the velocities, or `reference` has no wire, x_w = x. The speed of sliding is that by
+    the power of friction, for surfaces that stand still.
+
+    Input ports:
+        estimated_state: x, shape (n,).
+        control: u as it acts, shape (p,).
+        measured_force: v, shape (m,).
+        hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire.
+        reference: R, as that of the controller; may be without a wire.
+
+    Output ports:
+        exogenous: What to cancel, and mu, each with the derivatives that the law needs, for the
+            port of a `TrackingController` with the same law, in the order of its system's.
+        disturbance: r, shape (k,).
+        friction: mu, shape (c,).
+        hold: 1 while the input `hold` is not 0 or a contact that rubs is lost, else 0, shape (1,):
+            for the integrals of the controller.
+
+    `disturbance` and `friction` are held between samples; r starts at 0, and mu at the model's
+    coefficients.
+
+    Args:
+        law: The law, for a system that `with_disturbance` made.
+        observing: The rates, and when friction is believed.
+        sample_period: T in s.
+        control_lag: For which part of T the plant goes on with the control that the port had at a
+            sample, from 0 to 1: all of it for a discrete plant of that step, none for a
+            `ControlHold` without delay before a continuous one.
+        control_delay: tau in s, how much later than its sample a control acts in the mean: the
+            delay, and half of T, for which it is held.
+
+    Attributes:
+        observation, observing, sample_period: What is observed, and the arguments.
+        disturbance_signals, friction_signals: Names and units of the output ports.
+
+    Raises:
+        ModelError: The law's system has no disturbance, or a number makes no sense.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        law: TrackingLaw,
+        observing: Observing,
+        sample_period: float,
+        control_lag: float = 0.0,
+        control_delay: float = 0.0,
+    ) -> None:
+        system = law.system
+        signals = {
+            "state": system.state_signals,
+            "control": system.control_signals,
+            "constraint_input": system.constraint_input_signals,
+        }
+        super().__init__(system, system.parameter_values, signals, sees_steps=False)
+        self.set_name("disturbance_observer")
+        self.observing, self.sample_period = observing, positive("sample_period", sample_period)
+        if not 0.0 <= control_lag <= 1.0:
+            raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
+        if not control_delay >= 0.0:
+            raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
+        self._lag, self._delay = control_lag, control_delay
+        self.observation = found = Observation.of(law.structure)
+        size, names = len(found.rows), list(found.frictions)
+        rates = observing.rate, observing.force_rate or observing.rate
+        self._lags, self._force_lags = (
+            Lags.of(rate, sample_period, max(law.exogenous_degrees)) for rate in rates
+        )
+        self.disturbance_signals = tuple(
+            Signal(f"disturbance of {system.state_signals[i].name}") for i in found.rows
+        )
+        self.friction_signals = tuple(Signal(name) for name in names)
+        self._mu = [system.parameter_slice(name) for name in names]
+        self._contacts = list(found.frictions.values())
+        self._order = self._told(names, law.exogenous_degrees)
+        self._ports = [
+            self.DeclareVectorInputPort("estimated_state", system.num_states),
+            self.DeclareVectorInputPort("control", system.num_controls),
+            self.DeclareVectorInputPort("measured_force", system.num_constraints),
+        ]
+        self._hold = self.DeclareVectorInputPort("hold", 1)
+        self._reference = self.DeclareVectorInputPort("reference", law.layout.reference_size)
+        # r, mu, the derivatives of r, 0, and what r lags behind; then, of the sample before, p, its
+        # rate without inputs, u.
+        start = [system.parameter_values[place] for place in self._mu]
+        count = self._lags.degree * size
+        self._estimate = self.DeclareDiscreteState(
+            np.concatenate([np.zeros(size), *start, np.zeros(count + 1 + count)])
+        )
+        self._before = self.DeclareDiscreteState(np.full(2 * size + system.num_controls, np.nan))
+        # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
+        self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
+        sources = {self.discrete_state_ticket(self._estimate)}
+        read = (self._ports[0], self._ports[2], self._reference)
+        self.DeclareVectorOutputPort(
+            "exogenous",
+            len(self._order),
+            weakly(self._calc_exogenous),
+            sources | {self.input_port_ticket(port.get_index()) for port in read},
+        )
+        for name, places_of in (
+            ("disturbance", list(range(size))),
+            ("friction", list(range(size, size + len(names)))),
+        ):
+            calc = weakly(self._copy, places_of)
+            self.DeclareVectorOutputPort(name, len(places_of), calc, sources)
+        ports = (self._ports[2], self._hold)
+        self.DeclareVectorOutputPort(
+            "hold",
+            1,
+            weakly(self._calc_hold),
+            {self.input_port_ticket(port.get_index()) for port in ports},
+        )
+
+    def _told(self, names: Sequence[str], degrees: Sequence[int]) -> list[int]:
+        """Where the estimate has what the port `exogenous` tells."""
+        size = len(self.observation.rows)
+        following = size + len(names)
+        still = following + self._lags.degree * size
+        heads = {DISTURBANCE: list(range(size))}
+        heads |= {name: [size + j] for j, name in enumerate(names)}
+        order, left = list[int](), iter(degrees)
+        for p in self.dae.exogenous.moving:
+            for i, head in enumerate(heads[p.name]):
+                of_d = [following + j * size + i for j in range(self._lags.degree)]
+                known = of_d if p.name == DISTURBANCE else [still] * self._lags.degree
+                order += [head, *known[: next(left)]]
+        return order
+
+    def set_friction(self, context: Context, friction: ArrayLike) -> None:
+        """Starts the coefficients of friction at values, shape (c,), or a number for all.
+
+        Raises:
+            ModelError: The shape is wrong, or a value is negative or above the largest.
+        """
+        self.check_context(context)
+        given, most = numbers("friction", friction), self.observing.largest_friction
+        if given.shape not in ((), (len(self._mu),)) or not np.all((given >= 0) & (given <= most)):
+            raise ModelError(
+                f"friction must be from 0 to {most:g}, a number or shape ({len(self._mu)},), got "
+                f"{friction!r}"
+            )
+        values = context.get_discrete_state(self._estimate).CopyToVector()
+        size = len(self.observation.rows)
+        values[size : size + len(self._mu)] = given
+        context.SetDiscreteState(self._estimate, values)
+
+    def _sample(self, context: Context, state: State) -> EventStatus:
+        observation, observing, period = self.observation, self.observing, self.sample_period
+        size = len(observation.rows)
+        x, u, force = (port.Eval(context) for port in self._ports)
+        estimate = context.get_discrete_state(self._estimate).CopyToVector()
+        count = self._lags.degree * size
+        head = size + len(self._mu)
+        r, mu, rates, _, lags = np.split(estimate, [size, head, head + count, head + count + 1])
+        chain = np.vstack([lags.reshape(-1, size), r])
+        parameters = self._parameters(context, 0.0 * mu)
+        before = context.get_discrete_state(self._before).CopyToVector()
+        p_0, rate_0, u_0 = np.split(before, [size, 2 * size])
+        is_first = np.isnan(p_0[0])
+        acted = u if is_first else self._lag * u_0 + (1.0 - self._lag) * u
+        p, rate, inputs = self._run(observation.momentum, context, x, acted, force, parameters)
+        rubbing, speeds = self._friction(context, self._faster(x), force, parameters)
+        is_slow, is_lost = speeds < _SHARP * observing.least_speed, self._is_lost(force)
+        found = self._run(observation.directions, context, x, force, parameters)
+        metric, free, planes = (one.reshape((size, -1), order="F").copy() for one in found)
+        if not is_first:
+            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu
+            steps = [one.after(chain, d) - chain for one in (self._lags, self._force_lags)]
+            sticks = is_slow & ~is_lost
+            if sticks.any():
+                held = planes[:, np.repeat(sticks, size)]
+                steps = [beside(held, metric, step.T).T for step in steps]
+            fast, slow = steps
+            chain += slow + (fast - slow) @ free.T
+        if mu.size and not self._is_limited(context):
+            is_sure = ~(is_slow | is_lost)
+            part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, chain[-1])
+            change = np.clip(mu + is_sure * part, 0.0, observing.largest_friction) - mu
+            mu += change
+            chain -= rubbing @ change
+        lags[:], r[:] = chain[:-1].ravel(), chain[-1]
+        moves = chain @ free.T
+        told = self._lags.derivatives(moves) + self._force_lags.derivatives(chain - moves)
+        rates[:] = told.ravel()
+        discrete = state.get_mutable_discrete_state()
+        discrete.set_value(self._estimate, estimate)
+        discrete.set_value(self._before, np.concatenate([p, rate, u]))
+        return EventStatus.Succeeded()
+
+    def _parameters(self, context: Context, friction: FloatArray) -> FloatArray:
+        """The model's parameters with other coefficients of friction."""
+        parameters = context.get_numeric_parameter(0).CopyToVector()
+        for place, value in zip(self._mu, friction, strict=True):
+            parameters[place] = value
+        return parameters
+
+    def _friction(
+        self, context: Context, state: FloatArray, force: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The friction of coefficients of 1 in a state, and the speeds of sliding."""
+        forces, speeds = self._run(self.observation.friction, context, state, force, parameters)
+        return forces.reshape(len(self.observation.rows), -1).copy(), speeds.copy()
+
+    def _faster(self, state: FloatArray) -> FloatArray:
+        """The state in a motion that is so fast that friction is full."""
+        found, rows = state.copy(), list(self.observation.rows)
+        found[rows] *= _SHARP
+        return found
+
+    def _wanted(self, context: Context, state: FloatArray, parameters: FloatArray) -> FloatArray:
+        """The state with the velocities that the reference wants, as far as it is told."""
+        function = self.observation.wanted
+        if function is None or not self._reference.HasValue(context):
+            return state
+        wanted, delay = self._reference.Eval(context), np.array([self._delay])
+        return self._run(function, context, state, wanted, delay, parameters)[0]
+
+    def _run(
+        self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
+    ) -> tuple[FloatArray, ...]:
+        """The values of a function.
+
+        Raises:
+            SingularityError, NonFiniteError: There are none, at this time and state.
+        """
+        values = function.evaluate(state, *inputs)
+        if function.is_valid:
+            return values
+        time, found = context.get_time(), function.failure()
+        raise simulation_error(found, time, state.copy(), self._signals)
+
+    def _is_limited(self, context: Context) -> bool:
+        return bool(self._hold.HasValue(context) and self._hold.Eval(context).any())
+
+    def _is_lost(self, force: FloatArray) -> Booleans:
+        return np.asarray(force[self._contacts] < self.observing.least_force)
+
+    def _calc_hold(self, context: Context, output: BasicVector) -> None:
+        is_lost = bool(self._is_lost(self._ports[2].Eval(context)).any())
+        output.SetFromVector([float(is_lost or self._is_limited(context))])
+
+    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
+        values = context.get_discrete_state(self._estimate).CopyToVector()
+        size = len(self.observation.rows)
+        r, mu, _ = np.split(values, [size, size + len(self._mu)])
+        if mu.any():
+            x, force = self._ports[0].Eval(context), self._ports[2].Eval(context)
+            parameters = self._parameters(context, mu)
+            own, _ = self._friction(context, x, force, parameters)
+            goal = self._faster(self._wanted(context, x, parameters))
+            wanted, _ = self._friction(context, goal, force, parameters)
+            r += (wanted - own) @ mu
+        output.SetFromVector(values[self._order])
+
+    def _copy(self, places: list[int], context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._estimate).value()[places])
+
+    def _formulas(self) -> dict[str, Formula]:
+        raise ModelError(
+            f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has no "
+            "derivative by the time"
+        )

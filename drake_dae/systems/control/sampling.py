@@ -1,0 +1,140 @@
+"""Laws that run on a computer: read at samples, act late, and held between."""
+
+from dataclasses import dataclass
+from math import ceil, floor, isfinite
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from drake_dae.arguments import checked
+from drake_dae.errors import ModelError, NonFiniteError, WiringError
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+
+_SAME = 1e-9
+"""Times that differ by less than this, in periods, are one."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Sampling:
+    """A law reads at t_k = k period, and what it computes from that acts from t_k + delay on.
+
+    Attributes:
+        period: T in s, positive.
+        delay: How long it takes to compute and to send, in s, 0 or more; more than a period where
+            several computations are on the way at once.
+
+    Raises:
+        ModelError: The period is not positive, or the delay is negative.
+    """
+
+    period: float
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.period) and self.period > 0.0):
+            raise ModelError(f"a sampling's period must be positive, got {self.period:g} s")
+        if not (isfinite(self.delay) and self.delay >= 0.0):
+            raise ModelError(f"a sampling's delay must be 0 or more, got {self.delay:g} s")
+
+    @property
+    def whole_periods(self) -> int:
+        """How many whole periods the delay has."""
+        return floor(self.delay / self.period + _SAME)
+
+    @property
+    def rest(self) -> float:
+        """What the delay has besides, in s: at least 0, and less than a period."""
+        rest = self.delay - self.whole_periods * self.period
+        return rest if rest > _SAME * self.period else 0.0
+
+    @property
+    def late_samples(self) -> int:
+        """How many samples later what was read has acted, at the latest."""
+        return ceil(self.delay / self.period - _SAME)
+
+
+@checked(ModelError)
+class ControlHold(LeafSystem):
+    """Makes any controller a sampled one: between samples the control is held,
+
+        u(t) = control(t_k)    for    t_k + delay <= t < t_(k+1) + delay,    t_k = k period.
+
+    A controller is evaluated at the samples alone. Before the first control acts, that of the start
+    is held, as if the robot had stood there.
+
+    The updates are unrestricted ones, which Drake makes before those of discrete states, and all of
+    an instant at once: so the controller sees the time, the state and the reference of t_k also
+    where a discrete MultibodyPlant steps at t_k, which is such an update, too. That plant takes
+    what was held before, and sees a delay that is longer by one step of its own.
+
+    Input port:
+        control: What the controller wants now, shape (p,).
+
+    Output port:
+        control: What is held, shape (p,); no direct feedthrough.
+
+    Args:
+        size: The number of controls, p.
+        sampling: Period and delay.
+
+    Raises:
+        WiringError: When a run begins: the first control depends on itself.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, size: int, sampling: Sampling) -> None:
+        super().__init__()
+        self.set_name("control_hold")
+        self.sampling = sampling
+        self._port = self.DeclareVectorInputPort("control", size)
+        # What is held; then what was read and does not act yet, the oldest first.
+        waiting = sampling.whole_periods + (sampling.rest > 0.0)
+        self._state = self.DeclareDiscreteState(np.full((1 + waiting) * size, np.nan))
+        self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
+        read = self._read if sampling.rest else self._read_and_act
+        self.DeclarePeriodicUnrestrictedUpdateEvent(sampling.period, 0.0, weakly(read))
+        if sampling.rest:
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
+                sampling.period, sampling.rest, weakly(self._act)
+            )
+        self.DeclareVectorOutputPort("control", size, weakly(self._calc), {self.xd_ticket()})
+
+    def _begin(self, context: Context, state: State) -> EventStatus:
+        rows = self._rows(context)
+        if not np.isnan(rows).any():
+            return EventStatus.DidNothing()  # A run that goes on.
+        try:
+            rows[:] = self._port.Eval(context)
+        except NonFiniteError as error:
+            raise WiringError(
+                "the first control cannot be found, as where a law reads the force that its own "
+                "control makes: put a ForceSensor with a sample_period between, which has a force "
+                "at the start, or set what control_hold holds before the first sample by "
+                "SetDiscreteState"
+            ) from error
+        return self._set(state, rows)
+
+    def _read_and_act(self, context: Context, state: State) -> EventStatus:
+        return self._set(state, np.vstack([self._rows(context)[1:], self._port.Eval(context)]))
+
+    def _read(self, context: Context, state: State) -> EventStatus:
+        rows = self._rows(context)
+        return self._set(state, np.vstack([rows[:1], rows[2:], self._port.Eval(context)]))
+
+    def _act(self, context: Context, state: State) -> EventStatus:
+        rows = self._rows(context)
+        rows[0] = rows[1]
+        return self._set(state, rows)
+
+    def _rows(self, context: Context) -> np.ndarray:
+        vector = context.get_discrete_state(self._state).CopyToVector()
+        return vector.reshape(-1, self._port.size())
+
+    def _set(self, state: State, rows: np.ndarray) -> EventStatus:
+        state.get_mutable_discrete_state().set_value(self._state, rows.ravel())
+        return EventStatus.Succeeded()
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._rows(context)[0])

@@ -1,0 +1,85 @@
+"""What a robot must be for Drake's own contact to be its plant, and what it has otherwise."""
+
+from collections.abc import Mapping
+
+from numpy.typing import ArrayLike
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.robots.model import RobotModel
+
+
+def check_model(model: RobotModel) -> None:
+    """Refuses what Drake's contact cannot stand for.
+
+    Raises:
+        ModelError: What that is.
+    """
+    if model.links.plant is None:
+        raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
+    if model.dae.exogenous or model.loads:
+        raise ModelError(
+            "Drake's contact as the plant takes no exogenous signals and no loads; forces that the "
+            "law does not know are pushes (plant_pushes)"
+        )
+    if not model.constraints:
+        raise ModelError("the robot has no constraints, so there is nothing to touch")
+    for constraint in model.constraints:
+        values = own_values(constraint, model.dae, model.dae.parameter_values)
+        if constraint.solid(values) is None:
+            raise ModelError(
+                f"'{constraint.name}' is no contact with a solid: take a PointOnSurface on a "
+                "Plane, or on the outside of a Sphere, or an ideal plant"
+            )
+
+
+def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
+    """The values of all parameters, of which a plant has some otherwise.
+
+    Args:
+        model: The robot.
+        parameters: Name -> value, of what the robot touches, of masses, and of stages.
+
+    Raises:
+        ModelError: There is no such parameter, or a value does not fit.
+    """
+    values = model.dae.parameter_values
+    own = [parameter for constraint in model.constraints for parameter in constraint.parameters]
+    own += model.links.parameters
+    own += [parameter for stage in model.stages for parameter in stage.parameters]
+    known = {parameter.name: parameter for parameter in own}
+    for name, value in parameters.items():
+        if name not in known:
+            raise ModelError(
+                f"of Drake's contact as the plant {unknown_name('parameter', name, known)}; give "
+                "the law's model others instead"
+            )
+        given = numbers(f"parameter '{name}'", value)
+        if given.shape not in ((), known[name].value.shape):
+            raise ModelError(
+                f"parameter '{name}' has {known[name].value.size} entries, got {value!r}"
+            )
+        values[model.dae.parameter_slice(name)] = given
+        known[name].check(values[model.dae.parameter_slice(name)])
+    return values
+
+
+def check_same(plant: MultibodyPlant, model: RobotModel) -> None:
+    """Refuses another robot than that of the model.
+
+    Raises:
+        ModelError: It is another.
+    """
+    drawn = model.links.plant
+    assert drawn is not None  # check_model.
+    own, other = (
+        (one.GetPositionNames(), one.GetVelocityNames(), one.GetActuatorNames())
+        for one in (plant, drawn)
+    )
+    if own != other:
+        raise ModelError(
+            f"add_robot must add the robot of the model, with positions {', '.join(other[0])}; it "
+            f"has {', '.join(own[0]) or 'none'}"
+        )

@@ -1,0 +1,142 @@
+"""What Drake's contact results are as constraint forces."""
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.geometry import GeometryId
+from pydrake.multibody.plant import ContactResults
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.signals import Signal
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.trace.functions import TracedFunction
+
+
+class ContactForces(LeafSystem):
+    """Reads Drake's contact of a robot as its `RobotModel` speaks of it.
+
+    A constraint force is the contact force along the normal of its surface, lambda = n(q) . F,
+    where n is the gradient of phi and F is what all contacts of the constraint's two geometries,
+    points and patches, exert on the robot. A contact that is open has lambda = 0 and phi > 0.
+
+    Input ports:
+        state: x, shape (n,).
+        contact_results: Those of the MultibodyPlant.
+
+    Output ports:
+        constraint_force: lambda, N, shape (m,).
+        contact_force: F in the world, N, shape (3 m,), constraint by constraint: with its friction.
+        constraint_residual: phi and phi', as `DaePlant` has them; not zero, since a compliant
+            surface is pressed in.
+        controlled_output: z = l(x) + m(x) lambda.
+
+    Args:
+        model: The robot; each constraint is a contact with one force.
+        structure: The structure of its system.
+        pairs: For each constraint, the geometry of the robot and that of what it touches.
+        parameters: Values of all parameters.
+
+    Attributes:
+        contact_force_signals: Names and units of `contact_force`.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        model: RobotModel,
+        structure: ConstraintStructure,
+        pairs: Sequence[tuple[GeometryId, GeometryId]],
+        parameters: FloatArray,
+    ) -> None:
+        super().__init__()
+        self.set_name("contact_forces")
+        dae = model.dae
+        self._pairs = [tuple(pair) for pair in pairs]
+        self.contact_force_signals = tuple(
+            Signal(f"{constraint.name}.contact_f{axis}", "N")
+            for constraint in model.constraints
+            for axis in "xyz"
+        )
+        self._manifold, self._parameters = structure.manifold, parameters
+        self._normals = normals(model)
+        force = ca.SX.sym("force", dae.num_constraints)
+        output = dae.l + ca.mtimes(dae.m, force)
+        self._output = dae.trace("controlled output", {"value": output}, {"force": force})
+        self._state = self.DeclareVectorInputPort("state", dae.num_states)
+        self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
+        # What the other ports take from it is found once.
+        contact = self.DeclareVectorOutputPort(
+            "contact_force", 3 * len(self._pairs), weakly(self._calc_contact)
+        )
+        self._contact = contact
+        sizes = {
+            "constraint_force": (dae.num_constraints, self._calc_force),
+            "constraint_residual": (
+                len(structure.manifold.residual_signals),
+                self._calc_residual,
+            ),
+            "controlled_output": (dae.num_outputs, self._calc_output),
+        }
+        for name, (size, calc) in sizes.items():
+            self.DeclareVectorOutputPort(name, size, weakly(calc))
+
+    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+        results: ContactResults = self._results.Eval(context)
+        total = np.zeros((len(self._pairs), 3))
+        for i in range(results.num_point_pair_contacts()):
+            point = results.point_pair_contact_info(i)
+            pair = point.point_pair()
+            # The force is that on B.
+            self._add(total, pair.id_B, pair.id_A, point.contact_force())
+        for i in range(results.num_hydroelastic_contacts()):
+            patch = results.hydroelastic_contact_info(i)
+            surface = patch.contact_surface()
+            # The force is that on the body of M.
+            self._add(total, surface.id_M(), surface.id_N(), patch.F_Ac_W().translational())
+        output.SetFromVector(total.ravel())
+
+    def _add(
+        self, total: FloatArray, felt_by: GeometryId, other: GeometryId, force: FloatArray
+    ) -> None:
+        if (felt_by, other) in self._pairs:
+            total[self._pairs.index((felt_by, other))] += force
+        elif (other, felt_by) in self._pairs:
+            total[self._pairs.index((other, felt_by))] -= force
+
+    def _force(self, context: Context) -> FloatArray:
+        contact = self._contact.Eval(context).reshape(-1, 3)
+        state = self._state.Eval(context)
+        found = self._normals(state, self._parameters)[0].reshape(-1, 3)
+        return np.asarray(np.sum(found * contact, axis=1))
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._force(context))
+
+    def _calc_residual(self, context: Context, output: BasicVector) -> None:
+        state = self._state.Eval(context)
+        output.SetFromVector(self._manifold.residual(state, self._parameters))
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        state, force = self._state.Eval(context), self._force(context)
+        output.SetFromVector(self._output(state, force, self._parameters)[0])
+
+
+def normals(model: RobotModel) -> TracedFunction:
+    """(x, parameters) -> the normal of each constraint of one force, toward the robot, (3 m, 1)."""
+    links, bound = model.links, ConstraintSet(model.constraints)
+    kinematics = links.kinematics()
+    axes = [
+        application.force_axes
+        for constraint in bound.constraints
+        for application in constraint.applications(kinematics)[:1]
+    ]
+    # At rest nothing rubs.
+    found = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), links.v, 0 * links.v)
+    return model.dae.trace("normals", {"normals": ca.densify(found)})

@@ -1,0 +1,294 @@
+"""Drake's own contact as the plant: a discrete MultibodyPlant in place of the ideal constraint."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    HalfSpace,
+    Role,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import GetScopedFrameByName
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import BodyIndex, Frame, RigidBody
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.layout import Layout
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
+from drake_dae.robots.links.frames import frame_named
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.plants.contact.contact_checks import (
+    changed_parameters,
+    check_model,
+    check_same,
+)
+from drake_dae.systems.plants.contact.contact_forces import ContactForces
+from drake_dae.systems.plants.contact.contact_material import (
+    ContactMaterial,
+    ball_properties,
+    surface_properties,
+)
+from drake_dae.systems.plants.contact.pushes import AppliedPushes, Push
+from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
+
+
+def _is_of_use(record: logging.LogRecord) -> bool:
+    """Each context would tell that half spaces have no deformable contact, which none here has."""
+    return "half spaces are not currently supported for deformable" not in record.getMessage()
+
+
+@checked(ModelError)
+class ContactPlant(Diagram):
+    """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
+
+    What an ideal constraint keeps exactly, compliant contact with friction keeps nearly, and it may
+    open. A ball on the robot stands for the point of each constraint, and its surface for what it
+    touches; nothing else of the robot collides.
+
+    The plant steps at t_n = n time_step: what is at its ports then is x(t_n), before the step to
+    t_(n+1), for which it takes the control that it finds at t_n. The force is that of the step that
+    led to t_n.
+
+    Stages of actuation step beside it, and drive its joints: see `SteppedStages`. Rotors that turn
+    with a stage do not turn with the links.
+
+    Input port:
+        control: u, shape (p,): the torques and forces of the actuators, N m (N), or what drives the
+            last stage.
+
+    Output ports:
+        state: x = (q, v), and the states of the stages; shape (n,).
+        link_state: (q, v), shape (nq + nv,).
+        joint_torque, and those of the stages, as `motor_state`: as of a `RobotPlant`.
+        constraint_force, contact_force, constraint_residual, controlled_output: As of
+            `ContactForces`.
+        contact_results: Drake's.
+        query_object: Drake's, of the scene with the contact geometry.
+
+    Args:
+        model: The robot: each constraint a `PointOnSurface` that stands still, on a surface that
+            has a `solid`.
+        add_robot: Adds the robot to a plant as it was added to the one that the model is made of.
+        material: How it touches.
+        structure: The structure of the model's system.
+        parameters: Parameter name -> what the plant has otherwise: positions and friction of
+            surfaces, masses of bodies, and the numbers of stages.
+        pushes: Forces on the robot that its law does not know.
+
+    Attributes:
+        dae, model, structure, time_step: Of the plant.
+        multibody: Drake's plant.
+        contact_force_signals: Names and units of `contact_force`.
+
+    Raises:
+        ModelError: The robot cannot touch in this way, or the step is too long for its stages;
+            why.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        model: RobotModel,
+        add_robot: Callable[[MultibodyPlant, SceneGraph], None],
+        material: ContactMaterial,
+        *,
+        structure: ConstraintStructure,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        pushes: Sequence[Push] = (),
+    ) -> None:
+        super().__init__()
+        check_model(model)
+        self.model, self.dae, self.structure = model, model.dae, structure
+        self.time_step = material.time_step
+        self.exogenous_layout, self.exogenous_places = Layout(()), list[int]()
+        self._values = changed_parameters(model, parameters or {})
+        if model.stages:
+            check_step(model, material.time_step, self._values)
+        logging.getLogger("drake").addFilter(_is_of_use)
+        builder = DiagramBuilder()
+        config = MultibodyPlantConfig(
+            time_step=material.time_step, contact_model=material.contact_model
+        )
+        plant, scene_graph = AddMultibodyPlant(config, builder)
+        self.multibody = plant
+        add_robot(plant, scene_graph)
+        if any(stage.carries_rotors for stage in model.stages):
+            for index in plant.GetJointActuatorIndices():
+                plant.get_mutable_joint_actuator(index).set_default_rotor_inertia(0.0)
+        pairs = self._add_contacts(plant, scene_graph, material)
+        plant.Finalize()
+        check_same(plant, model)
+        self._masses = self._other_masses()
+        if pushes:
+            frames = [frame_named(plant, push.frame) for push in pushes]
+            applied = builder.AddSystem(AppliedPushes(plant, pushes, frames))
+            port = plant.get_applied_spatial_force_input_port()
+            builder.Connect(applied.get_output_port(), port)
+
+        forces = builder.AddSystem(ContactForces(model, structure, pairs, self._values))
+        self.contact_force_signals = forces.contact_force_signals
+        results = plant.get_contact_results_output_port()
+        builder.Connect(results, forces.GetInputPort("contact_results"))
+        links = state = plant.get_state_output_port()
+        self._stages = None
+        if model.stages:
+            stages = builder.AddSystem(SteppedStages(model, self.time_step, self._values))
+            self._stages, state = stages, stages.GetOutputPort("state")
+            builder.Connect(links, stages.GetInputPort("link_state"))
+            torque = stages.GetOutputPort("joint_torque")
+            builder.Connect(torque, plant.get_actuation_input_port())
+            builder.ExportInput(stages.GetInputPort("control"), "control")
+            for name in ("joint_torque", *stages.stage_ports):
+                builder.ExportOutput(stages.GetOutputPort(name), name)
+        else:
+            builder.ExportInput(plant.get_actuation_input_port(), "control")
+        builder.Connect(state, forces.GetInputPort("state"))
+        builder.ExportOutput(state, "state")
+        builder.ExportOutput(links, "link_state")
+        for name in (
+            "constraint_force",
+            "contact_force",
+            "constraint_residual",
+            "controlled_output",
+        ):
+            builder.ExportOutput(forces.GetOutputPort(name), name)
+        builder.ExportOutput(results, "contact_results")
+        builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")
+        builder.BuildInto(self)
+        self.set_name(model.dae.name)
+
+    def _add_contacts(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, material: ContactMaterial
+    ) -> list[tuple[GeometryId, GeometryId]]:
+        """A ball on the robot and a solid in the world for each constraint, and nothing else."""
+        pairs = []
+        for constraint, (frame, center) in zip(
+            self.model.constraints, self._balls(plant, material.radius), strict=True
+        ):
+            solid = constraint.solid(own_values(constraint, self.dae, self._values))
+            assert solid is not None  # check_model.
+            friction = material.friction
+            if friction is None:
+                name = constraint.friction_parameter
+                friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
+            ball = plant.RegisterCollisionGeometry(
+                frame.body(),
+                RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
+                Sphere(material.radius),
+                f"{constraint.name}_ball",
+                ball_properties(material, friction),
+            )
+            touched = plant.RegisterCollisionGeometry(
+                plant.world_body(),
+                solid.pose,
+                solid.form,
+                f"{constraint.name}_surface",
+                surface_properties(material, friction, isinstance(solid.form, HalfSpace)),
+            )
+            pairs.append((ball, touched))
+        # A robot's own shapes collide with nothing, and a ball with its own surface alone.
+        every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
+        manager = scene_graph.collision_filter_manager()
+        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(every)))
+        for ball, touched in pairs:
+            allowed = GeometrySet([ball]), GeometrySet([touched])
+            manager.Apply(CollisionFilterDeclaration().AllowBetween(*allowed))
+        return pairs
+
+    def _balls(self, plant: MultibodyPlant, radius: float) -> list[tuple[Frame, FloatArray]]:
+        """The frame of the robot that each constraint holds, and where in it the ball stands."""
+        model, values, drawn = self.model, self._values, self.model.links.plant
+        assert drawn is not None  # check_model.
+        state = self.structure.manifold.project(self.dae.nominal_state, values)
+        context = drawn.CreateDefaultContext()
+        drawn.SetPositionsAndVelocities(context, state[: drawn.num_multibody_states()])
+        loads = ConstraintWrenches(model, values)
+        # A unit of force shows the normal, where nothing rubs.
+        state[model.links.q.numel() :] = 0.0
+        found = loads(state, np.ones(self.dae.num_constraints))
+        kinematics = model.links.kinematics()
+        balls = []
+        for constraint, point, normal in zip(
+            loads.constraints, found.points, found.forces, strict=True
+        ):
+            name = constraint.applications(kinematics)[0].frame_b
+            pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
+            center = pose.inverse() @ (point + radius * normal)
+            balls.append((GetScopedFrameByName(plant, name), center))
+        return balls
+
+    def _other_masses(self) -> list[tuple[RigidBody, float]]:
+        """The bodies with another mass than in the model, each with its own."""
+        drawn = self.model.links.plant
+        assert drawn is not None  # check_model.
+        bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
+        found = []
+        with_mass = (body for body in bodies if body.default_mass() > 0.0)
+        for body, parameter in zip(with_mass, self.model.links.parameters, strict=True):
+            value = self._values[self.dae.parameter_slice(parameter.name)].item()
+            if value != body.default_mass():
+                found.append((self.multibody.get_body(body.index()), value))
+        return found
+
+    def parameters(self, context: Context) -> FloatArray:
+        """All parameters in the order of `dae.parameters`, shape (k,)."""
+        return self._values.copy()
+
+    def current_parameters(self, context: Context) -> FloatArray:
+        """The same: nothing moves."""
+        return self._values.copy()
+
+    def state(self, context: Context) -> FloatArray:
+        """The state x in a context, shape (n,)."""
+        own = self.GetSubsystemContext(self.multibody, context)
+        links = np.array(self.multibody.GetPositionsAndVelocities(own))
+        if self._stages is None:
+            return links
+        stages = self._stages.state(self.GetSubsystemContext(self._stages, context))
+        return np.concatenate([links, stages])
+
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Sets the state x in a context, shape (n,), in contact or not.
+
+        Bodies get the masses that the plant has otherwise: Drake has these in its context.
+
+        Raises:
+            ModelError: The shape is wrong.
+        """
+        own = self.GetMutableSubsystemContext(self.multibody, context)
+        count = self.multibody.num_multibody_states()
+        links, stages = np.split(self.dae.state_vector(state), [count])
+        self.multibody.SetPositionsAndVelocities(own, links)
+        for body, mass in self._masses:
+            body.SetMass(own, mass)
+        if self._stages is not None:
+            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
+
+    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
+        """Sets the state on N* next to a guess, shape (n,), and returns it.
+
+        The robot then touches without a force, and sinks in when the run begins.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
+        state = self.structure.manifold.settle(guess, self._values)
+        self.set_state(context, state)
+        return state

@@ -1,0 +1,112 @@
+"""Pushes on a robot that its law does not know."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+from pydrake.common.value import Value
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.tree import Frame
+from pydrake.systems.framework import Context, LeafSystem
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import brief, number, positive
+from drake_dae.dae.references import ExpressionReference
+from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Push:
+    """A force F on a point of a frame for some time, which grows and fades smoothly:
+
+        F(t) = F (s((t - start_time) / rise) - s((t - end_time) / rise)),    s(x) = 3 x^2 - 2 x^3
+
+    between x = 0 and 1, before it 0 and after it 1.
+
+    Attributes:
+        frame: Name of the frame.
+        force: F in the world, N, shape (3,).
+        start_time: When it begins, s.
+        end_time: When it begins to fade, s; None for never.
+        rise: How long it grows, and fades, s.
+        point: The point in the frame, m, shape (3,).
+
+    Raises:
+        ModelError: It ends before it begins, or a number makes no sense.
+    """
+
+    frame: str
+    force: Vector
+    start_time: float = 0.0
+    end_time: float | None = None
+    rise: float = 0.01
+    point: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        positive("the rise of a push", self.rise)
+        start = number("the start_time of a push", self.start_time)
+        if self.end_time is not None and not self.end_time > start:
+            raise ModelError(
+                f"a push must end after it begins, at {start:g} s; its end_time is "
+                f"{brief(self.end_time)}"
+            )
+
+    @property
+    def reference(self) -> ExpressionReference:
+        """F(t) as three rows."""
+
+        def force(time: ca.SX) -> list[ca.SX]:
+            share = self._grown(time - self.start_time)
+            if self.end_time is not None:
+                share -= self._grown(time - self.end_time)
+            return [component * share for component in self.force]
+
+        return ExpressionReference(force)
+
+    def _grown(self, since: ca.SX) -> ca.SX:
+        x = ca.fmin(ca.fmax(since / self.rise, 0.0), 1.0)
+        return x * x * (3.0 - 2.0 * x)
+
+
+class AppliedPushes(LeafSystem):
+    """Gives pushes to Drake's MultibodyPlant.
+
+    Output port:
+        spatial_forces: For its port `applied_spatial_force`.
+
+    Args:
+        plant: The plant, finalized.
+        pushes: The pushes.
+        frames: The frame of each.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self, plant: MultibodyPlant, pushes: Sequence[Push], frames: Sequence[Frame]
+    ) -> None:
+        super().__init__()
+        self.set_name("pushes")
+        self._forces = [push.reference.derivatives([0, 0, 0]) for push in pushes]
+        self._applied = []
+        for push, frame in zip(pushes, frames, strict=True):
+            applied = ExternallyAppliedSpatialForce()
+            applied.body_index = frame.body().index()
+            applied.p_BoBq_B = frame.GetFixedPoseInBodyFrame() @ push.point
+            self._applied.append(applied)
+        self.DeclareAbstractOutputPort(
+            "spatial_forces",
+            lambda: Value[list[ExternallyAppliedSpatialForce]](),
+            weakly(self._calc),
+            {self.time_ticket()},
+        )
+
+    def _calc(self, context: Context, output: Value) -> None:
+        time = context.get_time()
+        for applied, force in zip(self._applied, self._forces, strict=True):
+            applied.F_Bq_W = SpatialForce([0.0, 0.0, 0.0], force(time))
+        output.set_value(self._applied)

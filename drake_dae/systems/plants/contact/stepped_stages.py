@@ -1,0 +1,203 @@
+"""Stages of actuation that step beside a discrete MultibodyPlant."""
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.failures import simulation_error
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+
+_GROWTH = 1e-7
+"""By how much more than 1 a step may multiply what swings: round-off of motions without a force."""
+
+_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]
+"""The parts of a step that is too long of which one may be short enough."""
+
+
+class SteppedStages(LeafSystem):
+    """The stages between control and joints, E s' = drift(q, v, s) + drive u, step by step.
+
+    A discrete MultibodyPlant takes the forces on its joints as it finds them at t_n, makes the new
+    velocities with them, and the new positions with these. So do the stages: positions of shafts
+    are new by their new velocities, and everything else is new by what was at t_n,
+
+        E (s_(n+1) - s_n) = h (drift(q_n, v_n, s_n) + drive u_n),    but p_(n+1) = p_n + h p'_(n+1).
+
+    For springs, links and shafts together take the symplectic Euler method: where nothing damps, a
+    swing of rate w keeps its size as long as w h < 2, with the rate w_h of sin(w_h h / 2) = w h / 2
+    in place of w. Everything is of first order in h, as the step of the MultibodyPlant. A step that
+    lets something grow is refused: see `check_step`.
+
+    Input ports:
+        link_state: (q, v) of the links, shape (nq + nv,).
+        control: What drives the last stage, shape (p,).
+
+    Output ports:
+        joint_torque: tau(q, v, s), N m (N), shape (p,).
+        state: x = (q, v, s), shape (n,).
+        And those of the stages, as `motor_state`; see their classes.
+
+    Args:
+        model: The robot, with any stage.
+        time_step: h in s, that of the MultibodyPlant.
+        parameters: Values of all parameters.
+
+    Attributes:
+        stage_ports: The names of the stages' own ports.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, model: RobotModel, time_step: float, parameters: FloatArray) -> None:
+        super().__init__()
+        self.set_name("stages")
+        dae = model.dae
+        assert model.joint_force is not None
+        self._signals = {"state": dae.state_signals, "control": dae.control_signals}
+        self._parameters = parameters
+        self._size = size = _num_link_states(model)
+        control = ca.SX.sym("u", dae.num_controls)
+        driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
+        # No stage shares a mass with the links.
+        rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
+        after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rate)
+        for position, velocity in _shafts(model).items():
+            after[position] = dae.state[position] + time_step * after[velocity]
+        self._step = dae.trace("step of the stages", {"s": after[size:]}, {"control": control})
+        self._torque = dae.trace("joint torque", {"torque": model.joint_force})
+
+        self._links = self.DeclareVectorInputPort("link_state", size)
+        self._control = self.DeclareVectorInputPort("control", dae.num_controls)
+        self._state = self.DeclareDiscreteState(dae.nominal_state[size:])
+        # Unrestricted, as the step of a discrete MultibodyPlant: so both see one instant.
+        self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, weakly(self._advance))
+        own = {self.discrete_state_ticket(self._state)}
+        both = own | {self.input_port_ticket(self._links.get_index())}
+        count = model.joint_force.numel()
+        self.DeclareVectorOutputPort("joint_torque", count, weakly(self._calc_torque), both)
+        self.DeclareVectorOutputPort("state", dae.num_states, weakly(self._calc_state), both)
+        self.stage_ports: list[str] = []
+        start = 0
+        for stage in model.stages:
+            for name, part in stage.ports.items():
+                places = slice(start + part.start, start + part.stop)
+                calc = weakly(self._calc_part, places)
+                self.DeclareVectorOutputPort(name, part.stop - part.start, calc, own)
+                self.stage_ports.append(name)
+            start += stage.state.numel()
+
+    def state(self, context: Context) -> FloatArray:
+        """s in a context, shape (k,)."""
+        return context.get_discrete_state(self._state).CopyToVector()
+
+    def set_state(self, context: Context, state: FloatArray) -> None:
+        """Sets s in a context, shape (k,)."""
+        context.SetDiscreteState(self._state, state)
+
+    def _whole(self, context: Context) -> FloatArray:
+        return np.concatenate([self._links.Eval(context), self.state(context)])
+
+    def _advance(self, context: Context, state: State) -> EventStatus:
+        after = self._run(self._step, context, self._control.Eval(context))
+        state.get_mutable_discrete_state().set_value(self._state, after)
+        return EventStatus.Succeeded()
+
+    def _calc_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._run(self._torque, context))
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._whole(context))
+
+    def _calc_part(self, places: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self.state(context)[places])
+
+    def _run(self, function: TracedFunction, context: Context, *inputs: FloatArray) -> FloatArray:
+        """The value of a function.
+
+        Raises:
+            NonFiniteError: There is none, at this time and state.
+        """
+        state = self._whole(context)
+        values = function.evaluate(state, *inputs, self._parameters)
+        if function.is_valid:
+            return values[0]
+        raise simulation_error(function.failure(), context.get_time(), state, self._signals)
+
+
+def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:
+    """Refuses a step that is too long for the stages of a robot.
+
+    About rest, and with what the links are at the nominal state, one step multiplies small
+    deviations of (q, v, s) by a matrix; none of its eigenvalues must be beyond the unit circle. For
+    springs without damping that is w h <= 2; for the electric part of a motor R h / L <= 2, and
+    less where it swings with the inertia.
+
+    Args:
+        model: The robot, with any stage.
+        time_step: h in s.
+        parameters: Values of all parameters.
+
+    Raises:
+        ModelError: The step is too long; which one would do.
+    """
+    slope, is_position = _linear(model, parameters)
+
+    def growth(step: float) -> float:
+        moved = np.where(is_position[:, None], slope, 0.0)
+        matrix = np.linalg.solve(
+            np.eye(len(slope)) - step * moved, np.eye(len(slope)) + step * (slope - moved)
+        )
+        return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+    if growth(time_step) <= 1.0 + _GROWTH:
+        return
+    fastest = float(np.abs(np.linalg.eigvals(slope)).max())
+    what = (
+        f"a time_step of {time_step:g} s is too long for what drives the joints, which has motions "
+        f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step) - 1.0:.2g}"
+    )
+    for part in _SHORTER:
+        shorter = float(f"{part * time_step:.1e}")
+        if growth(shorter) <= 1.0 + _GROWTH:
+            raise ModelError(
+                f"{what}. Take {shorter:g} s or less; the law may keep its period with `sampling`"
+            )
+    raise ModelError(f"{what}, and so is one of {shorter:g} s; damp it, or take an ideal plant")
+
+
+def _linear(model: RobotModel, parameters: FloatArray) -> tuple[FloatArray, Booleans]:
+    """C of x' = C x for links and stages without weight, and which entries are positions."""
+    dae, links = model.dae, model.links
+    assert model.joint_force is not None
+    nq, size = links.q.numel(), _num_link_states(model)
+    B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+    velocity = ca.mtimes(links.velocity_map, links.v)
+    forces = ca.vertcat(velocity, ca.mtimes(B, model.joint_force), dae.f[size:])
+    outputs = {"mass": dae.mass_matrix, "slope": ca.jacobian(forces, dae.state)}
+    function = dae.trace("linear motion", outputs, often=False)
+    mass, slope = function(dae.nominal_state, parameters)
+    is_position = np.arange(dae.num_states) < nq
+    is_position[list(_shafts(model))] = True
+    return np.asarray(np.linalg.solve(mass, slope)), is_position
+
+
+def _num_link_states(model: RobotModel) -> int:
+    return int(model.links.q.numel() + model.links.v.numel())
+
+
+def _shafts(model: RobotModel) -> dict[int, int]:
+    """Where positions of shafts stand in x -> where their velocities do."""
+    found: dict[int, int] = {}
+    for stage in model.stages:
+        if stage.shaft is not None:
+            columns = [
+                ca.DM(ca.jacobian(symbols, model.dae.state)).full().argmax(axis=1).tolist()
+                for symbols in stage.shaft
+            ]
+            found.update(zip(*columns, strict=True))
+    return found

@@ -1,0 +1,489 @@
+"""Any DaeSystem as a LeafSystem."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+from weakref import ref
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    CacheEntry,
+    CacheIndex,
+    Context,
+    ContinuousState,
+    EventStatus,
+    State,
+    ValueProducer,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name, vector
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
+from drake_dae.dae.structure.passage import Passage
+from drake_dae.dae.structure.shared_forces import manifold_of_left_out
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+    SimulationError,
+    SingularityError,
+)
+from drake_dae.systems.blocks.along import function_along
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.blocks.failures import (
+    assembled_otherwise,
+    jammed_contact,
+    off_manifold,
+    off_start,
+)
+from drake_dae.systems.blocks.feedback import Feedback, motion_under, nothing
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.trace.functions import TracedFunction
+
+_CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
+
+
+class _FedBack(NamedTuple):
+    """What a plant's derivative needs besides time and state; it never changes.
+
+    Attributes:
+        feedback: The law that is fed back; None where the control has a wire or a fixed value.
+        parameters: Values of all parameters.
+        motion: x' under that law as a function of time and state, whose array the next call
+            overwrites, None where it has no value; None without a law.
+        entry: The cache entry that this is the value of: to find it again takes longer.
+    """
+
+    feedback: Feedback | None
+    parameters: FloatArray
+    motion: Callable[[float, FloatArray], FloatArray | None] | None
+    entry: CacheEntry
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
+        return self
+
+
+@checked(ModelError)
+class DaePlant(ParameterizedSystem):
+    """The solution of a differential-algebraic system (1)-(3) on its manifold N*:
+
+        x' = f(x) + g(x) v + h(x) u,    v = alpha(x) + beta(x) u,    z = l(x) + m(x) v.
+
+    The state stays on N*: after each step it is projected to round-off. Drake does that at the
+    start of the next step, so a log or a monitor sees it before its projection;
+    `Simulator.AdvancePendingEvents()` projects the last state of a run.
+
+    Assumptions (1)-(3) are all it asks for: there may be no controls, no controlled outputs, other
+    numbers of them, or outputs that the control does not reach. A port of size 0 needs no wire.
+
+    Input ports:
+        control: u, shape (p,).
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
+        feedback: A law, as the port `feedback` of a `TrackingController` gives it; if asked for.
+            Where `control` has no wire, u is what the law says of x. That is the same as by wires
+            for `state` and `control`, in half the time: an integrator calls one block, and not two.
+
+    Output ports:
+        state: x, shape (n,).
+        constraint_force: v, shape (m,); direct feedthrough from `control` where beta is not zero.
+            Where redundant constraints share their forces, those of all, in the order of
+            `system.force_signals`: their sum is determined, the split by least squares; see
+            `share_forces`.
+        constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, constraint-major, shape
+            (sum r_i,); zero on N*.
+        controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
+            zero.
+
+    Through a singular configuration, where gradients of constraints depend on each other at one
+    state alone, it goes along the branch of N* that its velocity leads along, whether or not a step
+    ends there; see `Passage`. Within 1e-3 of it, as the sine of an angle between gradients,
+    `constraint_force` and `controlled_output` are without the part that grows there without bound.
+    Where nothing leads through, as at rest, and always with friction, exogenous signals or shared
+    forces, A(x) is singular.
+
+    At a state that an integrator only tries, what has no value is nan, and error control takes a
+    shorter step; at a state that was reached, and where no step leads on, it raises.
+
+    The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
+    The default state is the consistent one next to `system.nominal_state`.
+
+    The block converts to AutoDiffXd, for Drake's Linearize and DirectCollocation; it then has no
+    projection.
+
+    Args:
+        system: The system (1)-(3).
+        structure: The structure of the system, by `find_constraint_structure` or
+            `find_structure`; the former if None.
+        project: False leaves the drift off N* uncorrected, to study it.
+        feedback: Whether there is an input port `feedback`; then nothing may be exogenous.
+
+    Attributes:
+        structure: The structure.
+        projects: Whether the state is projected onto N* after each step.
+        functions: Name of an output port -> its function of state, parameters and, for some, the
+            control.
+
+    Raises:
+        AssumptionError: The system violates one of Assumptions (1)-(3).
+        ModelError: This is no system, the structure is that of another one, or a law cannot be fed
+            back.
+        InconsistentStateError: A simulation starts from a state that is off N*.
+        SingularityError: A(x) is singular on the way; the exception has time and state. Where
+            friction jams a contact it is a JammedContactError, which tells what becomes of it.
+        NonFiniteError: A value is not finite on the way, likewise.
+        SimulationError: The state cannot be projected onto N* on the way, likewise.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+    #: The step of a discrete plant in s; 0 for one that is continuous, as this is.
+    time_step = 0.0
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        *,
+        structure: ConstraintStructure | None = None,
+        project: bool = True,
+        feedback: bool = False,
+    ) -> None:
+        structure = constraint_structure_of(type(self).__name__, system, structure)
+        signals = {"state": system.state_signals, "control": system.control_signals}
+        super().__init__(system, system.parameter_values, signals)
+        self.structure = structure
+        self.set_name(system.name)
+        elimination, derivatives = structure.elimination, structure.derivatives
+        constraint_input = derivatives.expand(derivatives.constraint_input)
+        output = system.l + ca.mtimes(system.m, constraint_input)
+        force = system.forces(constraint_input)
+        self._force_needs_control = elimination.beta.nnz() > 0
+        self._output_needs_control = elimination.n_star.nnz() > 0
+        self._is_controlled = system.num_controls > 0
+        rate = derivatives.expand(derivatives.rate)
+        self._passage = Passage(structure)
+        doubt = self._passage.doubt
+        self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
+        self._force = structure.trace("constraint force", force, self._force_needs_control, doubt)
+        self._output = structure.trace(
+            "controlled output", output, self._output_needs_control, doubt
+        )
+        self.functions = {
+            "constraint_force": self._force,
+            "constraint_residual": structure.manifold.residual_function,
+            "controlled_output": self._output,
+        }
+
+        v = {"v": derivatives.constraint_input}
+        shown = {"force": system.forces(v["v"]), "output": system.l + ca.mtimes(system.m, v["v"])}
+        self._force_of, self._output_of = (
+            system.trace(name, {"value": value}, v, often=False) for name, value in shown.items()
+        )
+        self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
+        self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
+        residual = structure.manifold.residual_expression
+        self._left_out = manifold_of_left_out(system)
+        degrees = system.exogenous.degrees(rate, force, output, residual)
+        by_state = self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
+        self._declare_feedback(feedback)
+        self._by_control = by_state | self._control_tickets
+        self.DeclareVectorOutputPort(
+            "state", system.num_states, weakly(self._copy_state), state_tickets(self)
+        )
+        self.DeclareVectorOutputPort(
+            "constraint_force",
+            len(system.force_signals),
+            weakly(self._calc_force),
+            self._by_control if self._force_needs_control else by_state,
+        )
+        self.DeclareVectorOutputPort(
+            "constraint_residual",
+            len(structure.manifold.residual_signals),
+            weakly(self._calc_residual),
+            by_state,
+        )
+        self.DeclareVectorOutputPort(
+            "controlled_output",
+            system.num_outputs,
+            weakly(self._calc_output),
+            self._by_control if self._output_needs_control else by_state,
+        )
+        self.DeclareInitializationPublishEvent(weakly(self._check_start))
+        self.projects = bool(project and system.num_constraints)
+        if self.projects:
+            self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
+
+    def _declare_feedback(self, wanted: bool) -> None:
+        """Declares the input port `feedback`, and what u depends on besides time and state."""
+        self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
+        self._fed_back: CacheIndex | None = None
+        # Whoever holds an entry holds its system: a context may, but not the system itself.
+        self._entry: Callable[[], CacheEntry | None] = lambda: None
+        self._motion: tuple[TracedFunction, TracedFunction] | None = None
+        self._latest = [np.zeros(0)]
+        if not wanted:
+            return
+        if not self._is_controlled or self._exogenous is not None:
+            missing = "has exogenous signals" if self._is_controlled else "has no control"
+            raise ModelError(f"{self.dae.name} {missing}: no law can be fed back to it")
+        self._feedback_port = self.DeclareAbstractInputPort("feedback", nothing())
+        self._control_tickets.add(self.input_port_ticket(self._feedback_port.get_index()))
+        # Both are the same for many states: one look at the context, and not three.
+        self._fed_back = self.DeclareCacheEntry(
+            "feedback and parameters",
+            ValueProducer(nothing, weakly(self._calc_fed_back)),
+            self._control_tickets | {self.all_parameters_ticket()},
+        ).cache_index()
+
+    def _calc_fed_back(self, context: Context, value: AbstractValue) -> None:
+        is_fed_back = not self._control_port.HasValue(context)
+        feedback = self._feedback_port.Eval(context) if is_fed_back else None
+        motion = None
+        parameters = np.array(self._values(context))
+        if feedback is not None:
+            self._steps.note_law(context, feedback.parameters)
+            function = self.motion_under(feedback.function)
+            motion = feedback.motion(function, parameters, self._latest)
+        entry = self.get_cache_entry(self._fed_back)
+        self._entry = ref(entry)
+        value.set_value(_FedBack(feedback, parameters, motion, entry))
+
+    def motion_under(self, law: TracedFunction) -> TracedFunction:
+        """Law and plant as one function; see `feedback.motion_under`."""
+        if self._motion is None or self._motion[0] is not law:
+            self._motion = law, motion_under(law, self.dynamics, self.dae.compiled)
+            self._latest[0] = np.zeros(0)
+        return self._motion[1]
+
+    def state(self, context: Context) -> FloatArray:
+        """The state x in a context, shape (n,)."""
+        self.check_context(context)
+        return context.get_continuous_state_vector().CopyToVector()
+
+    def set_state(self, context: Context, state: ArrayLike) -> None:
+        """Sets x as given, shape (n,); a run from there is refused if it is off N*.
+
+        Raises:
+            ModelError: The shape is wrong.
+        """
+        self.check_context(context)
+        context.SetContinuousState(self.dae.state_vector(state))
+
+    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
+        """Sets the state on N* next to a guess, shape (n,), and returns it.
+
+        Raises:
+            InconsistentStateError: None is found near the guess.
+        """
+        self.check_context(context)
+        values = self._values(context)
+        state = self.structure.manifold.settle(guess, values)
+        self._check_left_out(state, values)
+        self.set_state(context, state)
+        return state
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        # What an integrator calls most: without a call more where the values are of use.
+        if self._fed_back is not None:
+            entry = self._entry() or self.get_cache_entry(self._fed_back)
+            motion = entry.Eval(context).motion
+            if motion is not None:
+                state = context.get_continuous_state_vector().value()
+                rate = motion(context.get_time(), state)
+                if rate is not None:
+                    derivatives.SetFromVector(rate)
+                    return
+        elif self._is_controlled and self._exogenous is None:
+            control = self._control_port.Eval(context)
+            x, u, parameters = self.dynamics.arguments
+            x[...] = context.get_continuous_state_vector().value()
+            u[...] = control
+            parameters[...] = context.get_numeric_parameter(0).value()
+            if self.dynamics.run():
+                derivatives.SetFromVector(self.dynamics.outputs[0])
+                return
+        derivatives.SetFromVector(self._evaluate(self.dynamics, context, self._is_controlled))
+
+    def _evaluate(
+        self, function: TracedFunction, context: Context, needs_control: bool
+    ) -> FloatArray:
+        x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
+        if needs_control:
+            control = self._control(context)
+            if control is None:
+                return function.nowhere()[0]
+            return self._checked(function, context, x, control)[0]
+        return self._checked(function, context, x)[0]
+
+    def _control(self, context: Context) -> FloatArray | None:
+        """u; None where the law that is fed back has no value at a trial."""
+        feedback = self._feedback(context)
+        if feedback is None:
+            given: FloatArray = self._control_port.Eval(context)
+            return given
+        time, state = context.get_time(), self.state(context)
+        control = feedback.control(time, state)
+        if control is None:
+            self._steps.tolerate(context, feedback.error(time, state))
+            return None
+        return control.copy()
+
+    def _feedback(self, context: Context) -> Feedback | None:
+        """The law that is fed back; None where the control has a wire or a fixed value."""
+        if self._fed_back is None:
+            return None
+        found: _FedBack = self.get_cache_entry(self._fed_back).Eval(context)
+        return found.feedback
+
+    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
+        """The parameters of the law that was fed back, as `parameters_along`; None if none was."""
+        self.check_context(context)
+        return self._steps.laws_along(context, vector("times", times, None))
+
+    def _otherwise(
+        self,
+        function: TracedFunction,
+        state: FloatArray,
+        inputs: Sequence[FloatArray],
+        parameters: FloatArray,
+    ) -> tuple[FloatArray, ...] | None:
+        own = tuple(value.copy() for value in function.evaluate(state, *inputs, parameters))
+        if not all(np.isfinite(given).all() for given in (state, *inputs)):
+            return None
+        is_regular = function.is_regular
+        control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
+        found = self._passage.motion(state, control, parameters)
+        if found is None:
+            return own if is_regular else None
+        if function is self.dynamics:
+            return found[:1]
+        given = {self._force: self._force_of, self._output: self._output_of}.get(function)
+        return None if given is None else (given(state, found[1], parameters)[0],)
+
+    def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
+        """What a port of `functions` showed at moments, one row for each; nan where nothing.
+
+        Args:
+            port: The port's name.
+            given: "state", "parameters" and "control" at each moment, one row for each.
+
+        Raises:
+            ModelError: There is no such port, or something is not given, or of another size.
+        """
+        if port not in self.functions:
+            raise ModelError(f"{self.dae.name}: {unknown_name('port', port, self.functions)}")
+        function = self.functions[port]
+        sizes = {
+            "state": self.dae.num_states,
+            "control": self.dae.num_controls,
+            "parameters": self.dae.parameter_symbol.numel(),
+        }
+        for name in function.input_names:
+            if name not in given or np.shape(given[name])[1:] != (sizes[name],):
+                raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
+        return function_along(
+            function, given, lambda at: self._otherwise(function, at[0], at[1:-1], at[-1])
+        )
+
+    def _crosses(self, state: FloatArray, context: Context) -> bool:
+        """Whether the system crosses a singular configuration at a state next to one."""
+        control = self._control(context) if self._is_controlled else np.zeros(0)
+        return (
+            control is not None
+            and self._passage.motion(state, control, self._values(context)) is not None
+        )
+
+    def _explained(
+        self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
+    ) -> SimulationError:
+        """Where friction jams a contact, that, and whether any motion fits."""
+        if not (self.dae.rubbing and isinstance(error, SingularityError)):
+            return error
+        control = inputs[0] if self._is_controlled else np.zeros(0)
+        given = (control,) if self._force_needs_control else ()
+        force = self._force(error.state, *given, parameters)[0]
+        return jammed_contact(self.structure, error, control, parameters, force) or error
+
+    def _formulas(self) -> dict[str, Formula]:
+        dae, residual = self.dae, self.structure.manifold.residual_expression
+        functions = {
+            "derivative": self.dynamics,
+            "state": dae.trace("state", {"value": dae.state}),
+            "constraint_force": self._force,
+            "constraint_residual": dae.trace("residual", {"value": residual}),
+            "controlled_output": self._output,
+        }
+        return {
+            name: TracedFormula(function, signals=self._signals)
+            for name, function in functions.items()
+        }
+
+    def _copy_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFrom(context.get_continuous_state_vector())
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluate(self._force, context, self._force_needs_control))
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._evaluate(self._output, context, self._output_needs_control))
+
+    def _calc_residual(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(
+            self.structure.manifold.residual(
+                context.get_continuous_state_vector().CopyToVector(), self._values(context)
+            )
+        )
+
+    def _check_start(self, context: Context) -> EventStatus:
+        self.check_start(self.state(context), self._values(context))
+        feedback = self._feedback(context)
+        if feedback is not None:
+            self._steps.note_law(context, feedback.parameters, begins=True)
+        return EventStatus.DidNothing()
+
+    def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a start that is off N*.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters.
+
+        Raises:
+            InconsistentStateError: It is.
+        """
+        manifold = self.structure.manifold
+        if manifold.is_consistent(state, parameters):
+            self._check_left_out(state, parameters)
+            return
+        raise off_start(self.dae.name, manifold, manifold.residual(state, parameters))
+
+    def _check_left_out(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a state at which redundant constraints that were left out do not hold."""
+        left_out = self._left_out
+        if left_out is None or left_out.is_consistent(state, parameters):
+            return
+        raise assembled_otherwise(
+            self.dae.name, left_out, state, left_out.residual(state, parameters)
+        )
+
+    def _project(self, context: Context, state: State) -> EventStatus:
+        x = context.get_continuous_state_vector().value()
+        if self._exogenous is None:
+            parameters = context.get_numeric_parameter(0).value()
+        else:
+            parameters = self._values(context)
+        manifold = self.structure.manifold
+        found = manifold.first_steps(x, parameters)
+        if found is None:
+            try:
+                found = manifold.searched(x, parameters, lambda near: self._crosses(near, context))
+            except InconsistentStateError as error:
+                raise off_manifold(context.get_time(), x.copy(), error) from error
+        if found is x:
+            return _UNCHANGED
+        state.get_mutable_continuous_state().SetFromVector(found)
+        return _CHANGED

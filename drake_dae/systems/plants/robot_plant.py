@@ -1,0 +1,90 @@
+"""A RobotModel as a LeafSystem."""
+
+import casadi as ca
+from pydrake.systems.framework import Context
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.plants.robot_ports import RobotPorts
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class RobotPlant(DaePlant):
+    """A constrained robot (37)-(40) with the ports of `DaePlant` and:
+
+    Output ports:
+        link_state: (q, v) of the links, shape (nq + nv,), as Drake's MultibodyPlant orders it.
+        joint_torque: What the stages deliver to the joints, N m (N), shape (nu,); with any stage.
+        constraint_wrenches: What each constraint does to each of its frames: 6 numbers, the moment
+            in N m and the force in N as in Drake's SpatialForce, in the world, the force at the
+            frame's origin. Frame B comes before A, and feels what the class of the constraint
+            calls positive; A feels the opposite at the same point. Their power is zero where the
+            constraint is ideal. `wrench_signals` tells the names,
+            "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
+        loop_state: The coordinates of the joints that close loops, and then their rates, named by
+            `model.loop_joints.signals`; if there are such joints.
+
+    A stage of actuation shows its state at ports of its own, which its class names: `motor_state`
+    of `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
+
+    `constraint_force` is lambda of (37), in N for contacts. With rigid joints it has direct
+    feedthrough from `control`; with any stage it is a function of the state alone.
+
+    Args:
+        model: The robot.
+        structure: The structure of `model.dae`; found if None.
+        project: False leaves the drift off N* uncorrected, to study it.
+        feedback: Whether there is an input port `feedback`, as for `DaePlant`.
+
+    Attributes:
+        model: The robot.
+        wrench_signals: Names and units of `constraint_wrenches`.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        model: RobotModel,
+        *,
+        structure: ConstraintStructure | None = None,
+        project: bool = True,
+        feedback: bool = False,
+    ) -> None:
+        super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
+        self.model = model
+        own = weakly(self._values), weakly(self._shown_force)
+        by_force = self._by_control if self._force_needs_control else self._by_state
+        self._ports = RobotPorts(self, model, model.dae, *own, self._by_state, by_force)
+        self.wrench_signals = self._ports.wrench_signals
+        if self._ports.loops is not None:
+            self.functions["loop_state"] = self._ports.loops
+
+    def _shown_force(self, context: Context) -> FloatArray:
+        return self._evaluate(self._force, context, self._force_needs_control)
+
+    def _formulas(self) -> dict[str, Formula]:
+        state = self.dae.state
+        formulas = super()._formulas()
+        ports = self._ports
+        derivatives = self.structure.derivatives
+        constraint_input = derivatives.expand(derivatives.constraint_input)
+        acting = ca.substitute(ports.wrenches, ports.force, self.dae.forces(constraint_input))
+        formulas["constraint_wrenches"] = TracedFormula(
+            self.structure.trace("constraint wrenches", acting, self._force_needs_control),
+            signals=self._signals,
+        )
+        for name, part in ports.parts.items():
+            function = TracedFunction(name, {"state": state}, {"value": state[part]})
+            formulas[name] = TracedFormula(function)
+        for name, known in (("loop_state", ports.loops), ("joint_torque", ports.joint_force)):
+            if known is not None:
+                formulas[name] = TracedFormula(known)
+        return formulas

@@ -1,0 +1,89 @@
+"""The ports that every plant of a RobotModel has beside those of its system."""
+
+from collections.abc import Callable
+
+import casadi as ca
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.lifetime import weakly
+from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.trace.functions import TracedFunction
+
+
+class RobotPorts:
+    """What a plant shows of a robot, from its state and its constraint force; see `RobotPlant`.
+
+    Not a base of the plant: a class of Python has one base of Drake's, by one way.
+
+    Args:
+        plant: The plant, with x as its continuous state; gets the ports, and keeps this.
+        model: The robot.
+        dae: The robot's system.
+        values: All parameters in a context; not one that keeps the plant alive.
+        force: lambda in a context, as the port `constraint_force` shows it; likewise.
+        by_state: What a function of the state depends on.
+        by_force: What the constraint force depends on.
+
+    Attributes:
+        parts: Name of a port -> the part of the state that it shows.
+        wrench_signals: Names and units of `constraint_wrenches`.
+        wrenches, force: That port as expressions, and the symbols of lambda in it.
+        loops, joint_force: What the ports `loop_state` and `joint_torque` compute; None without.
+    """
+
+    def __init__(
+        self,
+        plant: LeafSystem,
+        model: RobotModel,
+        dae: DaeSystem,
+        values: Callable[[Context], FloatArray],
+        force: Callable[[Context], FloatArray],
+        by_state: set[DependencyTicket],
+        by_force: set[DependencyTicket],
+    ) -> None:
+        self._values, self._force = values, force
+        size = model.links.q.numel() + model.links.v.numel()
+        self.parts, start = {"link_state": slice(0, size)}, size
+        for stage in model.stages:
+            for name, part in stage.ports.items():
+                self.parts[name] = slice(start + part.start, start + part.stop)
+            start += stage.state.numel()
+        for name, part in self.parts.items():
+            calc = weakly(self._calc_part, part)
+            plant.DeclareVectorOutputPort(name, part.stop - part.start, calc, state_tickets(plant))
+
+        bound = ConstraintSet(model.constraints)
+        self.force = ca.SX.sym("force", bound.size)
+        self.wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), self.force)
+        inputs = {"state": dae.state, "force": self.force, "parameters": dae.parameter_symbol}
+        self._wrenches = TracedFunction("constraint wrenches", inputs, {"value": self.wrenches})
+        size, calc = len(self.wrench_signals), weakly(self._calc_wrenches)
+        plant.DeclareVectorOutputPort("constraint_wrenches", size, calc, by_force)
+
+        self.loops = self.joint_force = None
+        if model.loop_joints.signals:
+            self.loops = dae.trace("loop state", {"value": model.loop_joints.state})
+            size, calc = len(model.loop_joints.signals), weakly(self._calc_of, self.loops)
+            plant.DeclareVectorOutputPort("loop_state", size, calc, by_state)
+        if model.joint_force is not None:
+            self.joint_force = dae.trace("joint torque", {"value": model.joint_force})
+            size, calc = model.joint_force.numel(), weakly(self._calc_of, self.joint_force)
+            plant.DeclareVectorOutputPort("joint_torque", size, calc, by_state)
+
+    def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
+        force, state = self._force(context), _state(context)
+        output.SetFromVector(self._wrenches.evaluate(state, force, self._values(context))[0])
+
+    def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(_state(context)[part])
+
+    def _calc_of(self, function: TracedFunction, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(function(_state(context), self._values(context))[0])
+
+
+def _state(context: Context) -> FloatArray:
+    return context.get_continuous_state_vector().CopyToVector()

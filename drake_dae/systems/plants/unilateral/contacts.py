@@ -1,0 +1,288 @@
+"""The contacts of a robot that open and close, and their numbers at a state."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray, number, show, unknown_name
+from drake_dae.dae.system.contacts import Jam, jam
+from drake_dae.dae.system.layout import Indices
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import JammedContactError, ModelError
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plants.unilateral.frictional import Rubbing
+from drake_dae.systems.plants.unilateral.impacts import Touch, is_p_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """What decides of contacts at one state, for all constraints, shape (m,) each.
+
+    Attributes:
+        all_rates: The rates c of the constraints, phi' or what restricts velocities alone, and
+            below them the velocities at which contacts slide that rub, shape (m + s,).
+        accelerations: c' without constraint forces.
+        force_matrix: How constraint forces enter c', shape (m, m).
+        all_impulses: How impulses enter `all_rates`, shape (m + s, m + s).
+        velocity_change: How impulses enter x, shape (n, m + s).
+        size: How large the terms are that `accelerations` are the sums of.
+    """
+
+    all_rates: FloatArray
+    accelerations: FloatArray
+    force_matrix: FloatArray
+    all_impulses: FloatArray
+    velocity_change: FloatArray
+    size: FloatArray
+
+    @property
+    def rates(self) -> FloatArray:
+        """Those of the constraints alone, shape (m,)."""
+        return self.all_rates[: self.accelerations.size]
+
+    @property
+    def impulse_matrix(self) -> FloatArray:
+        """How impulses of constraints enter their rates, shape (m, m)."""
+        m = self.accelerations.size
+        return self.all_impulses[:m, :m]
+
+    def jam(self, kept: Sequence[int], normals: Sequence[int]) -> Jam | None:
+        """What becomes of contacts that touch and rub; None where one set of forces fits.
+
+        Args:
+            kept: The rows that nothing opens.
+            normals: The rows of the contacts.
+        """
+        rows = [*kept, *normals]
+        part = np.ix_(rows, rows)
+        matrix, without, offset = (
+            self.force_matrix[part],
+            self.impulse_matrix[part],
+            self.accelerations[rows],
+        )
+        places = list(range(len(kept), len(rows)))
+        if is_p_matrix(matrix, without, places):
+            return None
+        force = np.full(len(rows), np.inf)
+        with suppress(np.linalg.LinAlgError):
+            force[:] = np.linalg.solve(matrix, -offset)
+        return jam(matrix, without, force, self.size[rows], places)
+
+
+class UnilateralContacts:
+    """Those constraints of a robot that open and close.
+
+    Args:
+        model: The robot.
+        restitution: Name of a constraint -> its coefficient of restitution e, 0 to 1.
+
+    Attributes:
+        names: The names of the contacts, in the order of the model's constraints.
+        dae: The system with all contacts closed.
+        restitution: e of each contact, shape (k,).
+        touches: The rows of each contact.
+        along: Where the velocities of each contact stand along which it rubs, among `all_rates`.
+        kept: The rows of all other constraints.
+        normals: The row of each contact that can only push.
+        gaps: A function of state and parameters: phi of each contact, and phi'.
+        rates: The rates of all constraints, shape (m, 1), and `drift`, that part of their
+            derivatives which exogenous signals make.
+        residual: phi_i, phi_i' of each, or what restricts velocities alone.
+
+    Raises:
+        ModelError: There is no such constraint, or it is none that can only push.
+    """
+
+    def __init__(self, model: RobotModel, restitution: Mapping[str, float]) -> None:
+        parts = {c.name: (c, part) for c, part in ConstraintSet(model.constraints).parts()}
+        fitting = [
+            name
+            for name, (constraint, _) in parts.items()
+            if sum(constraint.can_only_push) == 1
+            and constraint.can_only_push.index(True) < constraint.residual(model.links).numel()
+        ]
+        if not restitution:
+            raise ModelError(
+                f"{model.name}: no contact that opens and closes is given; those that can are "
+                f"{fitting}. Where none shall, take a RobotPlant"
+            )
+        for name in restitution:
+            if name not in parts:
+                raise ModelError(f"{model.name}: {unknown_name('constraint', name, parts)}")
+            if name not in fitting:
+                raise ModelError(
+                    f"{model.name}: '{name}' cannot open, since it has no single force that can "
+                    f"only push; those that have are {fitting}"
+                )
+        if model.dae.sharing is not None:
+            raise ModelError(
+                f"{model.name}: redundant constraints share their forces, which contacts that open "
+                "and close cannot; leave `compliances` out"
+            )
+        self.names = tuple(name for name in parts if name in restitution)
+        self.touches = []
+        for name in self.names:
+            constraint, part = parts[name]
+            normal = part.start + constraint.can_only_push.index(True)
+            self.touches.append(Touch(normal, np.arange(part.start, part.stop)))
+        own = {int(row) for touch in self.touches for row in touch.rows}
+        self.kept: Indices = np.array(
+            [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
+        )
+        self.normals = [touch.normal for touch in self.touches]
+        self.restitution = np.array(
+            [coefficient(f"{model.name}: {n}.restitution", restitution[n]) for n in self.names]
+        )
+        dae, links = model.dae, model.links
+        self.dae = dae
+        rate = ca.jtimes(dae.k, dae.state, dae.f) + dae.exogenous.rate(dae.k)
+        rows = [
+            dae.k[i] if ca.depends_on(dae.k[i], links.v) else rate[i]
+            for i in range(dae.num_constraints)
+        ]
+        self.rates = ca.vertcat(ca.SX(0, 1), *rows)
+        self.drift = dae.exogenous.rate(self.rates)
+        holds = [
+            dae.k[i] if ca.depends_on(dae.k[i], links.v) else ca.vertcat(dae.k[i], rate[i])
+            for i in range(dae.num_constraints)
+        ]
+        self.residual = ca.vertcat(ca.SX(0, 1), *holds)
+        self._sizes = [held.numel() for held in holds]
+        found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
+        self.gaps = dae.trace("gaps", found)
+        positions, velocities = links.q.numel(), links.v.numel()
+        self._moved = slice(positions, positions + velocities)
+        sliding = self._sliding(model, parts)
+        every = ca.vertcat(self.rates, sliding)
+        control = ca.SX.sym("u", dae.num_controls)
+        self._control = bool(dae.num_controls)
+        self._terms = dae.trace(
+            "contacts",
+            {
+                "rates": every,
+                "slope": ca.jacobian(every, dae.state),
+                "drift": self.drift,
+                "mass": dae.mass_matrix,
+                "free": dae.f + ca.mtimes(dae.h, control),
+                "force": dae.g,
+            },
+            {"control": control},
+            often=False,
+        )
+
+    def _sliding(self, model: RobotModel, parts: Mapping[str, tuple[Constraint, slice]]) -> ca.SX:
+        """The velocities of contacts that rub, shape (s, 1); notes where they stand, and mu."""
+        kinematics, rows = model.links.kinematics(), [ca.SX(0, 1)]
+        start = self.dae.num_constraints
+        self.along: list[Indices] = []
+        self._friction: list[int | None] = []
+        for name in self.names:
+            constraint = parts[name][0]
+            sliding, mu = constraint.sliding(kinematics), constraint.friction_parameter
+            size = 0 if sliding is None or mu is None else sliding.numel()
+            self.along.append(np.arange(start, start + size))
+            self._friction.append(self.dae.parameter_slice(mu).start if size and mu else None)
+            if sliding is not None and size:
+                rows.append(sliding)
+            start += size
+        return kinematics.value(ca.vertcat(*rows))
+
+    def rubbing(self, place: int, parameters: FloatArray, restitution: float) -> Rubbing:
+        """How a contact rubs in an impact.
+
+        What restricts its velocities besides, as where it sticks, holds as far as it pushes.
+        """
+        touch, mu = self.touches[place], self._friction[place]
+        others = touch.rows[touch.rows != touch.normal]
+        if mu is None or others.size:
+            return Rubbing(touch.normal, others, np.inf, restitution)
+        return Rubbing(touch.normal, self.along[place], float(parameters[mu]), restitution)
+
+    def holds(self, closed: Sequence[bool]) -> FloatArray:
+        """For each entry of the residual 1, or 0 where it is that of a contact that is open."""
+        rows = np.ones(self.dae.num_constraints)
+        for touch, shut in zip(self.touches, closed, strict=True):
+            rows[touch.rows] = shut
+        return np.repeat(rows, self._sizes)
+
+    def terms(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> Terms:
+        """The numbers at a state; nan where a function has no value."""
+        values = self._terms.evaluate(state, control, parameters)
+        n, m = state.size, self.dae.num_constraints
+        rates, slope, drift, mass, free, force = (value.copy() for value in values)
+        slope, mass, force = slope.reshape(-1, n), mass.reshape(n, n), force.reshape(n, m)
+        push = np.zeros((n, rates.size))
+        push[self._moved] = slope[:, self._moved].T
+        try:
+            solved = np.asarray(np.linalg.solve(mass, np.column_stack([free, force, push])), float)
+        except np.linalg.LinAlgError:
+            solved = np.full((n, 1 + m + rates.size), np.nan)
+        moved = slope @ solved
+        return Terms(
+            all_rates=rates,
+            accelerations=moved[:m, 0] + drift,
+            force_matrix=moved[:m, 1 : m + 1],
+            all_impulses=moved[:, m + 1 :],
+            velocity_change=solved[:, m + 1 :],
+            size=np.abs(slope[:m]) @ np.abs(solved[:, 0]) + np.abs(drift),
+        )
+
+    def jammed(
+        self, time: float, state: FloatArray, names: Sequence[str], found: Jam | None
+    ) -> JammedContactError:
+        """The error where friction jams contacts."""
+        outcome = f". What becomes of it is {found.value}" if found else ""
+        return JammedContactError(
+            f"{self.dae.name}: friction jams the contact of {', '.join(names)} at t = {time:.6g} "
+            f"s, state {show(state)} (Painleve){outcome}. Lower the friction, slide the other way, "
+            "or hold the robot less steeply to the surface",
+            time,
+            state,
+            found,
+        )
+
+
+def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
+    """The system in which some constraints hold and the others are not there.
+
+    Args:
+        contacts: The contacts.
+        rows: The constraints that hold.
+        state: A state near which it is examined, shape (n,).
+    """
+    dae, rows = contacts.dae, list(rows)
+    embed = ca.SX.eye(dae.num_constraints)[:, rows]
+    whole = dae.implicit
+
+    def implicit(rate: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        assert whole is not None
+        balance, constraint_rate = whole(rate, ca.mtimes(embed, force))
+        return balance, constraint_rate[rows]
+
+    return replace(
+        dae,
+        g=dae.g[:, rows],
+        k=dae.k[rows],
+        m=dae.m[:, rows],
+        constraint_input_signals=tuple(dae.constraint_input_signals[i] for i in rows),
+        constraint_output_signals=tuple(dae.constraint_output_signals[i] for i in rows),
+        implicit=None if whole is None or not rows else implicit,
+        nominal_state=state,
+    )
+
+
+def coefficient(name: str, value: float) -> float:
+    """A coefficient of restitution.
+
+    Raises:
+        ModelError: It is none.
+    """
+    e = number(name, value)
+    if not 0.0 <= e <= 1.0:
+        raise ModelError(f"{name} must be between 0, no bounce, and 1, no loss; got {e:g}")
+    return e

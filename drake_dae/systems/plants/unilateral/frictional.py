@@ -1,0 +1,214 @@
+"""Impacts of contacts that rub: Newton's law across surfaces, Coulomb's along them; numbers alone.
+
+With c the rates, A = J M^-1 J^T over all rows, and Lambda the impulses, c+ = c- + A Lambda; kept
+rows have c+ = 0, and each contact with its normal n and its rows t along the surface
+
+    0 <= Lambda_n,    0 <= c+_n + e c-_n,    Lambda_n (...) = 0,
+    c+_t = 0 and |Lambda_t| <= mu Lambda_n,    or    Lambda_t = -mu Lambda_n c+_t / |c+_t|
+
+(Moreau 1988, Glocker 2001, with no restitution along the surface). With bounces it can gain energy
+(Kane 1984), without it cannot: Lambda_n c+_n = 0 and Lambda_t . c+_t <= 0 leave
+
+    T+ - T- = Lambda . c+ - Lambda . A Lambda / 2 <= 0.
+
+So where energy would be gained all coefficients of restitution are less, by the factor at which
+none is; and likewise where contacts wedge a body, so that no impulses bring what they want. One
+contact is solved in closed form, several by `in_cones`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.layout import Indices
+from drake_dae.systems.plants.unilateral.cones import Cone, in_cones
+from drake_dae.systems.plants.unilateral.impacts import DEPENDENT
+
+NEAR, POLISHED = 1e-3, 5
+"""So far from one may the length of a zero be before it is polished, by so many Newton steps."""
+
+NOTHING = 1e-14
+"""What is less, relative to all, is round-off."""
+
+FITS = 1e-11
+"""What may be violated, relative to what there is."""
+
+HALVINGS = 40
+"""So often the factor of restitution is halved in between: to 1e-12."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rubbing:
+    """The rows of one contact that rubs.
+
+    Attributes:
+        normal: The row that must not be pierced.
+        along: The rows along the surface, in any axes of length one; they may depend on each other.
+        friction: mu, zero or more.
+        restitution: e, 0 to 1.
+    """
+
+    normal: int
+    along: Indices
+    friction: float
+    restitution: float
+
+
+def impact(
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+) -> FloatArray | None:
+    """The impulses Lambda of contacts that rub, shape (k,).
+
+    Args:
+        matrix: A over all rows, positive semidefinite, shape (k, k).
+        before: c-, shape (k,).
+        kept: The rows that nothing opens.
+        contacts: The contacts that touch.
+
+    Returns:
+        The impulses; None if none are found.
+    """
+    found = _impulses(matrix, before, kept, contacts)
+    if found is not None and _gained(matrix, before, found) <= 0.0:
+        return found
+    least, most = 0.0, 1.0
+    best = _impulses(matrix, before, kept, _bouncing(contacts, 0.0))
+    for _ in range(HALVINGS if best is not None else 0):
+        middle = 0.5 * (least + most)
+        tried = _impulses(matrix, before, kept, _bouncing(contacts, middle))
+        if tried is not None and _gained(matrix, before, tried) <= 0.0:
+            least, best = middle, tried
+        else:
+            most = middle
+    return best
+
+
+def _bouncing(contacts: Sequence[Rubbing], factor: float) -> list[Rubbing]:
+    return [replace(one, restitution=factor * one.restitution) for one in contacts]
+
+
+def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> float:
+    """What the kinetic energy gains, less round-off."""
+    twice = impulses @ (2.0 * before + matrix @ impulses)
+    size = np.abs(impulses) @ np.abs(before)
+    return float(0.5 * twice - 1e-14 * size)
+
+
+def _impulses(
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+) -> FloatArray | None:
+    # What is kept follows from the contacts: c_k = 0.
+    inverse = np.linalg.pinv(matrix[np.ix_(kept, kept)], DEPENDENT, hermitian=True)
+    A = matrix - matrix[:, kept] @ inverse @ matrix[kept]
+    b = before - matrix[:, kept] @ inverse @ before[kept]
+    wanted = b.copy()
+    blocks = []
+    for one in contacts:
+        wanted[one.normal] += one.restitution * before[one.normal]
+        blocks.append(_axes(A, one))
+    make = np.hstack(blocks)
+    W, q = make.T @ A @ make, make.T @ wanted
+    ends = np.cumsum([axes.shape[1] for axes in blocks]).tolist()
+    cones = [
+        Cone(slice(end - axes.shape[1], end), one.friction)
+        for axes, end, one in zip(blocks, ends, contacts, strict=True)
+    ]
+    found = in_cones(W, q, cones) if len(cones) > 1 else _of_one(W, q, cones[0].friction)
+    if found is None:
+        return None
+    total = make @ found
+    total[kept] = -inverse @ (before[kept] + matrix[kept] @ total)
+    return total
+
+
+def _axes(matrix: FloatArray, one: Rubbing) -> FloatArray:
+    """The normal, and those directions along the surface that it rubs along, as columns."""
+    rows = one.along if one.friction else one.along[:0]
+    values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])
+    moved = vectors[:, values > DEPENDENT * max(values.max(initial=0.0), 0.0)]
+    axes = np.zeros((matrix.shape[0], 1 + moved.shape[1]))
+    axes[one.normal, 0] = 1.0
+    axes[rows, 1:] = moved
+    return axes
+
+
+def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray | None:
+    """The impulses of one contact, its normal first: it opens, sticks or slides."""
+    if wanted[0] >= 0.0:
+        return np.zeros(wanted.size)
+    if wanted.size == 1:
+        return -wanted / matrix[0]
+    sticking = _sticking(matrix, wanted)
+    if sticking is not None and np.linalg.norm(sticking[1:]) <= friction * sticking[0]:
+        return sticking
+    if np.isinf(friction):
+        return None
+    # Where no impulse would do there are numbers that are none, and fit nothing.
+    with np.errstate(invalid="ignore"):
+        ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
+        impulses, after = _slid(matrix, wanted, friction, ways)
+        onward = np.sum(after * ways, axis=0)
+    fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (onward >= 0.0)
+    if not fits.any():
+        return None
+    # Where several fit, that which goes on most as it came.
+    left = np.flatnonzero(fits)
+    best = int(np.argmax(wanted[1:] @ after[:, left]))
+    return np.asarray(impulses[:, left[best]])
+
+
+def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
+    """Impulses that push and leave w = 0, of several those that rub least; None if none do.
+
+    Of a robot with fewer freedoms than a contact has rows these depend on each other.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    is_moved = values > NOTHING * values[-1]
+    moved, idle = vectors[:, is_moved], vectors[:, ~is_moved]
+    if not idle.size:
+        found = np.linalg.solve(matrix, -wanted)
+    else:
+        found = -moved @ ((moved.T @ wanted) / values[is_moved])
+        if np.abs(idle.T @ wanted).max() > FITS * np.abs(wanted).max():
+            return None
+        found += idle @ np.linalg.lstsq(idle[1:], -found[1:])[0]
+    return np.asarray(found) if found[0] > 0.0 else None
+
+
+def _slid(
+    matrix: FloatArray, wanted: FloatArray, friction: float, ways: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Impulses that rub against ways along the surface, and what of c+ is along it; columns."""
+    push = np.vstack([np.ones((1, ways.shape[1])), -friction * ways])
+    mobility = matrix[0] @ push
+    impulses = push * np.divide(
+        -wanted[0], mobility, out=np.full(mobility.shape, np.inf), where=mobility > 0.0
+    )
+    return impulses, wanted[1:, None] + matrix[1:] @ impulses
+
+
+def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:
+    """The directions in a plane against which impulses rub that leave it sliding along them.
+
+    Of c+ along the surface, times the mobility across it, what is across a direction of angle a is
+    a trigonometric polynomial of degree two: sum c_k z^k, |k| <= 2, whose zeros are of length one.
+    """
+    angles = 2.0 * np.pi * np.arange(5) / 5.0
+    ways = np.array([np.cos(angles), np.sin(angles)])
+    push = np.vstack([np.ones(5), -friction * ways])
+    after = wanted[1:, None] * (matrix[0] @ push) - wanted[0] * (matrix[1:] @ push)
+    factors = np.fft.fft(ways[0] * after[1] - ways[1] * after[0])[[2, 1, 0, 4, 3]] / 5.0
+    size = np.abs(factors).sum()
+    factors[np.abs(factors) < NOTHING * size] = 0.0
+    roots = np.roots(factors)
+    found = np.angle(roots[np.abs(np.abs(roots) - 1.0) < NEAR])
+    orders = 1j * np.arange(2, -3, -1)
+    for _ in range(POLISHED):
+        waves = np.exp(np.outer(found, orders))
+        slopes = (waves @ (orders * factors)).real
+        steep = np.abs(slopes) > NOTHING * size
+        found[steep] -= (waves @ factors).real[steep] / slopes[steep]
+    found = found[np.abs((np.exp(np.outer(found, orders)) @ factors).real) < FITS * size]
+    return np.array([np.cos(found), np.sin(found)])

@@ -1,0 +1,158 @@
+"""Complementarity: which contacts push, in an impact and after it; numbers alone.
+
+Rows are constraints, one below the other; w = A y + b is what becomes of their rates, A being
+positive semidefinite. In an impact y are impulses and b rates before it, after it y are forces and
+b the accelerations without them. Kept rows have w = 0; each contact has
+
+    y_n >= 0,    w_n >= 0,    y_n w_n = 0
+
+for its normal n, and w = 0 in its other rows if it pushes, y = 0 if not. Without friction exactly
+one w fits, and exactly one y where rows are independent.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.layout import Indices
+from drake_dae.trace.functions import SINGULAR_PIVOT
+
+MOST = 8
+"""So many contacts may touch at once: every set of them is tried."""
+
+TIE = 1e-10
+"""Sets of contacts whose violations differ by less, relative to what there is, fit alike."""
+
+FITS = 1e-6
+"""What a set may violate, relative to what there is."""
+
+DEPENDENT = 1e-11
+"""Rows are dependent, and no set, where the smallest eigenvalue of their equilibrated A is less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """The rows of one contact.
+
+    Attributes:
+        normal: The row that must not be pierced, whose force can only push.
+        rows: All rows of the contact.
+    """
+
+    normal: int
+    rows: Indices
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What fits.
+
+    Attributes:
+        pushing: Places of the contacts that push, among those given.
+        values: y, one for each row.
+    """
+
+    pushing: tuple[int, ...]
+    values: FloatArray
+
+
+def complementary(
+    matrix: FloatArray, offset: FloatArray, kept: Indices, touches: Sequence[Touch]
+) -> Fit | None:
+    """The y that fits, with as few contacts that push as do.
+
+    Args:
+        matrix: A, shape (m, m).
+        offset: b, shape (m,).
+        kept: The rows that nothing opens.
+        touches: The contacts.
+
+    Returns:
+        What fits; None if nothing does.
+    """
+    length = np.sqrt(np.abs(np.diag(matrix)))
+    length[length == 0.0] = 1.0
+    used = [*kept, *(row for touch in touches for row in touch.rows)]
+    size = float(np.max(np.abs(offset / length)[used], initial=0.0))
+    normals = [touch.normal for touch in touches]
+    best, least = None, np.inf
+    for count in range(len(touches) + 1):
+        for pushing in combinations(range(len(touches)), count):
+            rows = rows_of(matrix, kept, [touches[i] for i in pushing])
+            if rows is None:
+                continue
+            values = np.zeros(offset.size)
+            if rows.size:
+                values[rows] = np.linalg.solve(matrix[np.ix_(rows, rows)], -offset[rows])
+            rates = matrix @ values + offset
+            amiss = [
+                -values[n] * length[n] if i in pushing else -rates[n] / length[n]
+                for i, n in enumerate(normals)
+            ]
+            violation = max(0.0, *amiss) if amiss else 0.0
+            if violation < least - TIE * size:
+                best, least = Fit(pushing, values), violation
+    return best if least <= FITS * size else None
+
+
+def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[Touch]) -> Indices | None:
+    """The rows that hold while some contacts push, kept ones first, then normals.
+
+    Of a table with four feet three carry it: normals that depend on each other are no set. Other
+    rows that depend on those before them, as of two feet that both stick, hold without a force.
+
+    Args:
+        matrix: A, shape (m, m).
+        kept: The rows that nothing opens.
+        pushing: The contacts.
+
+    Returns:
+        The rows; None if there is no such set.
+    """
+    first = [*kept, *(touch.normal for touch in pushing)]
+    others = [row for touch in pushing for row in touch.rows if row != touch.normal]
+    found: list[int] = []
+    for row in (*first, *others):
+        trial = [*found, row]
+        part = matrix[np.ix_(trial, trial)]
+        length = np.sqrt(np.abs(np.diag(part)))
+        if length[-1] > 0.0:
+            scaled = part / length / length[:, None]
+            if np.linalg.svd(scaled, compute_uv=False)[-1] >= DEPENDENT:
+                found = trial
+                continue
+        if row in first:
+            return None
+    return np.array(found, dtype=int)
+
+
+def stopping(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArray:
+    """The least impulses, shape (m,), that bring some rows to rest, dependent or not."""
+    values = np.zeros(offset.size)
+    part = matrix[np.ix_(rows, rows)]
+    values[rows] = np.linalg.pinv(part, DEPENDENT, hermitian=True) @ -offset[rows]
+    return values
+
+
+def is_p_matrix(matrix: FloatArray, without: FloatArray, contacts: Sequence[int]) -> bool:
+    """Whether all principal minors of A that hold all other rows are positive: one y fits any b.
+
+    Args:
+        matrix: A, shape (m, m).
+        without: A without friction, positive semidefinite, shape (m, m).
+        contacts: The rows of the contacts.
+    """
+    kept = [i for i in range(len(matrix)) if i not in contacts]
+    for count in range(1, len(contacts) + 1):
+        for chosen in combinations(contacts, count):
+            part = np.ix_([*kept, *chosen], [*kept, *chosen])
+            whole = np.linalg.det(without[part])
+            # Of normals that depend on each other none is a minor that decides.
+            if whole > DEPENDENT * np.prod(np.diag(without[part])) and not (
+                np.linalg.det(matrix[part]) > SINGULAR_PIVOT * whole
+            ):
+                return False
+    return True

@@ -1,0 +1,130 @@
+"""The modes of a robot whose contacts open and close: one system for each set of closed ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.structure.constrained import ConstraintStructure, find_constraint_structure
+from drake_dae.errors import DrakeDaeError, ModelError
+from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts, subsystem
+from drake_dae.systems.plants.unilateral.impacts import rows_of
+from drake_dae.trace.functions import TracedFunction
+
+Closed = tuple[bool, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """How the robot moves while some contacts are closed.
+
+    Attributes:
+        closed: Which contacts are closed.
+        structure: The structure of the system with their constraints alone.
+        rows: Where its constraints stand among all; of contacts that stick, those that are
+            independent.
+        dynamics: x', a function of state, control if there is one, and parameters.
+        force: All constraint forces, zero where open, likewise if `force_needs_control`.
+        output: The controlled outputs, likewise if `output_needs_control`.
+        holds: For each entry of the constraint residual 1, or 0 where its contact is open.
+        force_needs_control, output_needs_control: Whether the control enters them.
+    """
+
+    closed: Closed
+    structure: ConstraintStructure
+    rows: tuple[int, ...]
+    dynamics: TracedFunction
+    force: TracedFunction
+    output: TracedFunction
+    holds: FloatArray
+    force_needs_control: bool
+    output_needs_control: bool
+
+
+class Modes:
+    """The modes, each traced when it is first needed.
+
+    Args:
+        contacts: The contacts.
+        structure: The structure of the system with all contacts closed, if it is known.
+    """
+
+    def __init__(
+        self, contacts: UnilateralContacts, structure: ConstraintStructure | None = None
+    ) -> None:
+        self._contacts, self._whole = contacts, structure
+        self._known: dict[Closed, Mode] = {}
+
+    @property
+    def known(self) -> Sequence[Mode]:
+        """Those that were needed so far."""
+        return tuple(self._known.values())
+
+    def __call__(self, closed: Closed, state: FloatArray) -> Mode:
+        """A mode.
+
+        Args:
+            closed: Which contacts are closed.
+            state: A state near which it is examined, if it is new, shape (n,).
+
+        Raises:
+            AssumptionError: Its constraints are dependent near the state, or its A(x) is singular.
+        """
+        mode = self._known.get(closed)
+        if mode is None:
+            mode = self._known[closed] = self._traced(closed, state)
+        return mode
+
+    def _traced(self, closed: Closed, state: FloatArray) -> Mode:
+        contacts = self._contacts
+        names = [n for n, shut in zip(contacts.names, closed, strict=True) if shut]
+        dae = contacts.dae
+        terms = contacts.terms(state, np.zeros(dae.num_controls), dae.parameter_values)
+        pushing = [t for t, shut in zip(contacts.touches, closed, strict=True) if shut]
+        found = rows_of(terms.impulse_matrix, contacts.kept, pushing)
+        if found is None:
+            raise ModelError(
+                f"{dae.name}: {', '.join(names)} cannot be closed together at state {show(state)}: "
+                "the constraints depend on each other there"
+            )
+        rows = sorted(found.tolist())
+        whole = self._whole if len(rows) == dae.num_constraints else None
+        system = subsystem(contacts, rows, state) if whole is None else whole.system
+        try:
+            structure = whole or find_constraint_structure(system)
+        except DrakeDaeError as error:
+            note = f"While {', '.join(names) or 'no contact'} is closed: {error}"
+            error.args = (note, *error.args[1:])
+            raise
+        if any(degree > 2 for degree in structure.constraint_degrees):
+            raise ModelError(f"{system.name}: a contact that opens and closes has degree 2 at most")
+        derivatives = structure.derivatives
+        own = derivatives.expand(derivatives.constraint_input)
+        force = ca.SX(dae.num_constraints, 1)
+        force[rows] = own
+        output = system.l + ca.mtimes(system.m, own)
+        by_control = [ca.depends_on(value, derivatives.control) for value in (force, output)]
+        rate = derivatives.expand(derivatives.rate)
+        return Mode(
+            closed=closed,
+            structure=structure,
+            rows=tuple(rows),
+            dynamics=structure.trace("dynamics", rate, dae.num_controls > 0),
+            force=structure.trace("constraint force", ca.densify(force), by_control[0]),
+            output=structure.trace("controlled output", output, by_control[1]),
+            holds=contacts.holds(closed),
+            force_needs_control=by_control[0],
+            output_needs_control=by_control[1],
+        )
+
+
+def closed_of(values: FloatArray) -> Closed:
+    """Which contacts are closed, by the numbers of a discrete state: 1 is closed."""
+    return tuple(value > 0.5 for value in values.tolist())
+
+
+def numbers_of(closed: Closed) -> FloatArray:
+    """The numbers of a mode, shape (k,): 1 where closed, 0 where open."""
+    return np.array(closed, dtype=float)

@@ -1,0 +1,279 @@
+"""A RobotModel whose contacts open and close, as a LeafSystem."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    Context,
+    EventStatus,
+    State,
+    UnrestrictedUpdateEvent,
+    ValueProducer,
+    WitnessFunction,
+    WitnessFunctionDirection,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, positive
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+    SimulationError,
+)
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.failures import off_manifold
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.plants.unilateral.events import ContactChange, ContactEvent
+from drake_dae.systems.plants.unilateral.graph import ContactGraph
+from drake_dae.systems.plants.unilateral.log import Log, clearance
+from drake_dae.systems.plants.unilateral.modes import Closed, closed_of, numbers_of
+from drake_dae.systems.plants.unilateral.ports import ModalPorts
+from drake_dae.systems.plants.unilateral.resets import TOUCHING, Resets
+
+
+@checked(ModelError)
+class UnilateralRobotPlant(ModalPorts):
+    """A robot (37)-(40) some of whose contacts open and close: a system for each closed set.
+
+    The constraints that are closed hold as in `RobotPlant`; an open contact has a gap phi > 0 and
+    no force. So each contact that opens and closes keeps phi >= 0, lambda >= 0, phi lambda = 0.
+
+    - It closes where phi falls through zero: an impact, by Newton's law with its coefficient of
+      restitution e; several at once by a linear complementarity problem. Bouncing ends by a rule
+      that is exact in its limit; see `Resets` for all of it. Velocities jump; positions and the
+      states of stages do not. A contact that rubs does so in impacts, too.
+    - It opens where lambda falls through zero, or where a control that jumps pulls at it.
+    - Where contacts depend on each other, as four feet of a table, as few as do carry it, and the
+      others touch without force. Where friction leaves no motion, or two, the run ends with a
+      JammedContactError.
+
+    Drake's Simulator finds these moments as zeros of witness functions, to within a hundredth of
+    the context's accuracy in s under error control, and in steps with a fixed step. So it must be
+    set, which `simulate` does to that of the integrator: context.SetAccuracy(1e-9) is 1e-11 s. A
+    step leaves N* by its error, and is projected at the start of the next one, as in `DaePlant`.
+
+    Input ports:
+        control: u, shape (p,).
+        exogenous: The signals w with their derivatives, if the system has any; see
+            `ParameterizedSystem`.
+
+    Output ports:
+        state: x, shape (n,).
+        mode: For each contact 1 if it is closed and 0 if it is open, shape (k,).
+        gap: phi of each contact, m, shape (k,).
+        constraint_force: lambda, zero where open, shape (m,).
+        constraint_residual: phi_i, phi_i' of each constraint (or what restricts velocities alone),
+            constraint-major; zero where a contact is open, which is no constraint then.
+        controlled_output: z.
+        link_state: (q, v) of the links, shape (nq + nv,).
+        constraint_wrenches: What each constraint does to each of its frames; see `RobotPlant`.
+
+    A stage of actuation shows its state at ports of its own, and a robot with any has
+    `joint_torque`, as a `RobotPlant` has them.
+
+    Args:
+        model: The robot.
+        contacts: Name of a constraint that can only push -> its coefficient of restitution, 0 (no
+            bounce) to 1 (no loss). It becomes the parameter "<name>.restitution".
+        settling_time: Bouncing that would end within this time, in s, ends at once; positive.
+        structure: The structure of `model.dae`; found if None, where all contacts are closed.
+
+    Attributes:
+        model: The robot.
+        contacts: The names of the contacts that open and close, in the order of `mode`.
+        modes: Which contacts are closed -> how the robot moves then; see `Mode`.
+        gap_signals: Names and units of `gap`.
+        mode_signals: Names of `mode`.
+        normals: Where the normal force of each contact stands in `constraint_force`.
+        wrench_signals: Names and units of `constraint_wrenches`.
+
+    Raises:
+        ModelError: A constraint is not known, or cannot open; a number makes no sense.
+        InconsistentStateError: A simulation starts off the constraints that stay, or inside a
+            surface.
+        AssumptionError: The constraints of a mode are dependent.
+        SimulationError: No forces fit, impacts do not end, or the context has no accuracy.
+        JammedContactError: Friction jams a contact (Painleve), which has no motion, or two.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+    #: As of `DaePlant`.
+    time_step = 0.0
+
+    def __init__(
+        self,
+        model: RobotModel,
+        contacts: Mapping[str, float],
+        *,
+        settling_time: float = 1e-3,
+        structure: ConstraintStructure | None = None,
+    ) -> None:
+        settling = positive(f"{model.name}: settling_time", settling_time)
+        super().__init__(model, contacts, structure)
+        self._resets = Resets(self._contacts, self.modes, settling)
+        self._log_index = self.DeclareCacheEntry(
+            "events", ValueProducer(_no_events, _keep), {self.nothing_ticket()}
+        ).cache_index()
+        self._margins_index = self.DeclareCacheEntry(
+            "margins",
+            ValueProducer(_no_margins, weakly(self._calc_margins)),
+            self._by_control,
+        ).cache_index()
+        self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._start))
+        self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
+        self._witnesses = [
+            self.MakeWitnessFunction(
+                f"{name}: gap or force",
+                WitnessFunctionDirection.kPositiveThenNonPositive,
+                weakly(self._guard, i),
+                UnrestrictedUpdateEvent(weakly(self._at_guard)),
+            )
+            for i, name in enumerate(self.contacts)
+        ]
+
+    def events(self, context: Context) -> tuple[ContactEvent, ...]:
+        """What happened to contacts since the run of a context began."""
+        self.check_context(context)
+        return tuple(self._log(context).events)
+
+    @property
+    def graph(self) -> ContactGraph:
+        """Modes, guards and resets: print it, or draw its `graphviz()`."""
+        return ContactGraph(self.dae.name, self.contacts)
+
+    def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
+        return self._witnesses
+
+    def _log(self, context: Context) -> Log:
+        # The object stays the same, and is ours to change.
+        found: Log = self.get_cache_entry(self._log_index).Eval(context)
+        return found
+
+    def _guard(self, place: int, context: Context) -> float:
+        """Positive while a contact stays as it is: Drake seeks where that ends."""
+        margin, log = float(self._margins(context)[place]), self._log(context)
+        closed = context.get_discrete_state_vector().value()[place] > 0.5
+        if not closed or context.get_time() != log.time:
+            return -1.0 if place in log.pulled else margin
+        # A control that jumped, as where it is sampled, pulls from the start of a step on. That is
+        # seen only if it was not so at the start; it may have ceased at the end of the step.
+        if margin <= 0.0 and log.held:
+            log.pulled.add(place)
+        return margin if margin > 0.0 else 1.0
+
+    def _margins(self, context: Context) -> FloatArray:
+        """For each contact: its force if it is closed; else positive until it would be pierced."""
+        found: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
+        return found
+
+    def _calc_margins(self, context: Context, value: AbstractValue) -> None:
+        closed = context.get_discrete_state_vector().value() > 0.5
+        margins = np.zeros(closed.size)
+        if not closed.all():
+            state = context.get_continuous_state_vector().value()
+            gaps, rates = self._checked(self._contacts.gaps, context, state)
+            log = self._log(context)
+            margins[:] = clearance(log, context.get_time(), gaps, rates)
+        if closed.any():
+            force = self._shown_force(context)
+            margins[closed] = force[self._contacts.normals][closed]
+        value.set_value(margins)
+
+    def _at_guard(
+        self, context: Context, event: UnrestrictedUpdateEvent, state: State
+    ) -> EventStatus:
+        return self._advance(context, state)
+
+    def _start(self, context: Context, state: State) -> EventStatus:
+        vars(self._log(context)).update(vars(Log(time=context.get_time())))
+        if context.get_accuracy() is None:
+            raise SimulationError(
+                f"{self.dae.name}: the context has no accuracy, and without one Drake does not "
+                "seek the times at which contacts open and close; call context.SetAccuracy(1e-10)",
+                context.get_time(),
+                self.state(context),
+            )
+        x, values = self.state(context), self._values(context)
+        kept = self.modes((False,) * len(self.contacts), x).structure.manifold
+        if not kept.is_consistent(x, values):
+            residual = kept.residual(x, values)
+            worst = int(np.argmax(np.abs(residual)))
+            signal = kept.residual_signals[worst]
+            raise InconsistentStateError(
+                f"{self.dae.name}: the start state is not on the constraints that stay: "
+                f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
+                residual,
+            )
+        gaps = self.gaps(context)
+        deepest = int(np.argmin(gaps))
+        if gaps[deepest] < -TOUCHING:
+            raise InconsistentStateError(
+                f"{self.dae.name}: the start state is {-gaps[deepest]:.3g} m inside the surface of "
+                f"'{self.contacts[deepest]}'; start outside",
+                gaps,
+            )
+        log = self._log(context)
+        if np.isnan(self._control(context)).any():
+            # What is held between samples comes with this event: the first step begins with it.
+            log.waits = True
+            closed = self._resets.resting(x, values)
+            state.get_mutable_discrete_state().set_value(numbers_of(closed))
+            self._begin_step(context, x, values)
+            return EventStatus.Succeeded()
+        status = self._reset(context, state)
+        # To begin closed is no event.
+        log.events = [event for event in log.events if event.kind is not ContactChange.CLOSING]
+        return status
+
+    def _advance(self, context: Context, state: State) -> EventStatus:
+        log = self._log(context)
+        log.time, waits, log.waits = context.get_time(), log.waits, False
+        log.held = not (waits or (self._margins(context) <= 0.0).any())
+        log.pulled.clear()
+        if not log.held:
+            return self._reset(context, state)
+        x, values = self.state(context), self._values(context)
+        try:
+            x = self._mode(context).structure.manifold.projected(x, values)
+        except InconsistentStateError as error:
+            raise off_manifold(context.get_time(), x, error) from error
+        state.get_mutable_continuous_state().SetFromVector(x)
+        self._begin_step(context, x, values)
+        return EventStatus.Succeeded()
+
+    def _begin_step(self, context: Context, state: FloatArray, values: FloatArray) -> None:
+        """Notes where a step begins."""
+        log = self._log(context)
+        log.gaps, log.rates = (v.copy() for v in self._contacts.gaps.evaluate(state, values))
+
+    def _reset(self, context: Context, state: State) -> EventStatus:
+        closed: Closed = closed_of(context.get_discrete_state_vector().value())
+        time, x, values = context.get_time(), self.state(context), self._values(context)
+        try:
+            x = self._mode(context).structure.manifold.projected(x, values)
+            e = context.get_numeric_parameter(1).value()
+            after = self._resets(time, x, closed, self._control(context), values, e)
+        except InconsistentStateError as error:
+            raise off_manifold(time, x, error) from error
+        log, before = self._log(context), (time, x.tobytes())
+        if log.before != before:  # Guards that trigger at once lead here each.
+            log.before = before
+            log.events += after.events
+        state.get_mutable_continuous_state().SetFromVector(after.state)
+        state.get_mutable_discrete_state().set_value(numbers_of(after.closed))
+        self._begin_step(context, after.state, values)
+        return EventStatus.Succeeded()
+
+
+def _no_events() -> AbstractValue:
+    return AbstractValue.Make(Log())
+
+
+def _no_margins() -> AbstractValue:
+    return AbstractValue.Make(np.zeros(0))
+
+
+def _keep(context: Context, value: AbstractValue) -> None:
+    """The log of a context is never out of date."""

@@ -1,0 +1,270 @@
+"""What becomes of state and mode where a gap or a force of a contact comes to zero."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.system.contacts import Jam
+from drake_dae.errors import SimulationError
+from drake_dae.systems.plants.unilateral.contacts import Terms, UnilateralContacts
+from drake_dae.systems.plants.unilateral.events import ContactChange, ContactEvent
+from drake_dae.systems.plants.unilateral.frictional import impact
+from drake_dae.systems.plants.unilateral.impacts import (
+    MOST,
+    Fit,
+    Touch,
+    complementary,
+    rows_of,
+    stopping,
+)
+from drake_dae.systems.plants.unilateral.modes import Closed, Modes
+
+TOUCHING = 1e-11
+"""A gap below this, in m, is none: such contacts touch at once."""
+
+SLOW = 1e-11
+"""A rate below this, in m/s, is none."""
+
+REPEATED = 100
+"""So many impacts may follow each other at one time, as in a row of balls."""
+
+
+@dataclass(frozen=True, eq=False)
+class After:
+    """What a reset made.
+
+    Attributes:
+        state: x, shape (n,).
+        closed: The mode.
+        events: What happened.
+    """
+
+    state: FloatArray
+    closed: Closed
+    events: tuple[ContactEvent, ...]
+
+
+class Resets:
+    """Impacts, and the choice of the mode.
+
+    Touching contacts are those that are closed or whose gap is zero. While one of them approaches,
+    there is an impact by Newton's law with each contact's coefficient of restitution e,
+
+        c+ = c- + A Lambda,    0 <= Lambda_i,    0 <= c+_i + e_i c-_i,    Lambda_i (...) = 0,
+
+    c being the rates and A = J M^-1 J^T; kept constraints have c+ = 0. No energy is gained: it
+    changes by Lambda . (c- + c+) / 2, in which every term of a contact is at most zero. Where a
+    contact rubs, its impulse along the surface is Coulomb's; see `frictional`.
+
+    Bouncing ends where its end is near: the contacts that leave at c+ fall back at the rate a > 0
+    after 2 c+ / a, and from impact to impact the largest rate shrinks by rho = max c+ / max |c-|.
+    With a and rho as they are, infinitely many impacts take
+
+        max(2 c+ / a) / (1 - rho)
+
+    (exact for a single contact, and for two that a block rocks on, where a is constant). If that is
+    at most `settling_time` T, all touching contacts come to rest at once, which may take impulses
+    that pull as little as what is skipped: gaps of at most a T^2 / 8, and rates of at most a T / 2.
+    No energy is gained by that either. The event has the limit as its `rest_time`.
+
+    Then those touching contacts are closed which push: lambda_i >= 0, c'_i >= 0, lambda_i c'_i = 0.
+
+    Args:
+        contacts: The contacts.
+        modes: Their modes.
+        settling_time: T, s.
+    """
+
+    def __init__(self, contacts: UnilateralContacts, modes: Modes, settling_time: float) -> None:
+        self._contacts = contacts
+        self._modes = modes
+        self._settling_time = settling_time
+
+    def __call__(
+        self,
+        time: float,
+        state: FloatArray,
+        closed: Closed,
+        control: FloatArray,
+        parameters: FloatArray,
+        restitution: FloatArray,
+    ) -> After:
+        """What follows at a time from a state, in a mode, with the e of each contact.
+
+        Raises:
+            SimulationError: No set of contacts fits, or impacts do not end.
+        """
+        contacts = self._contacts
+        events: list[ContactEvent] = []
+        x, before = state, closed
+        for _ in range(REPEATED):
+            terms = contacts.terms(x, control, parameters)
+            gaps, rates = (value.copy() for value in contacts.gaps.evaluate(x, parameters))
+            touching = [i for i in range(len(closed)) if closed[i] or gaps[i] <= TOUCHING]
+            if len(touching) > MOST:
+                names = ", ".join(contacts.names[i] for i in touching)
+                raise SimulationError(
+                    f"{contacts.dae.name}: {len(touching)} contacts touch at once at t = "
+                    f"{time:.6g} s: {names}; there may be {MOST}, since all sets of them are tried",
+                    time,
+                    x,
+                )
+            # What leaves already takes no part.
+            touching = [i for i in touching if rates[i] <= SLOW]
+            if not any(rates[i] < -SLOW for i in touching):
+                break
+            e = restitution[touching]
+            x, event = self._impact(time, x, touching, terms, control, parameters, e)
+            events.append(event)
+        else:
+            raise SimulationError(
+                f"{contacts.dae.name}: {REPEATED} impacts follow each other at t = {time:.6g} s, "
+                f"state {show(x)}, and none is the last. Take smaller coefficients of restitution",
+                time,
+                x,
+            )
+        touches = [contacts.touches[i] for i in touching]
+        if contacts.dae.rubbing:
+            found = terms.jam(contacts.kept.tolist(), [touch.normal for touch in touches])
+            if found in (Jam.INCONSISTENT, Jam.INDETERMINATE):
+                raise contacts.jammed(time, x, [contacts.names[i] for i in touching], found)
+        fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
+        pushing = {touching[place] for place in fit.pushing}
+        closed = tuple(i in pushing for i in range(len(closed)))
+        x = self._modes(closed, x).structure.manifold.projected(x, parameters)
+        events += self._changes(time, before, closed, events)
+        return After(x, closed, tuple(self._told(events, closed)))
+
+    def resting(self, state: FloatArray, parameters: FloatArray) -> Closed:
+        """The contacts that touch at rest, as many as can be closed together, whatever pushes."""
+        contacts = self._contacts
+        control = np.zeros(contacts.dae.num_controls)
+        matrix = contacts.terms(state, control, parameters).impulse_matrix
+        gaps, rates = (value.copy() for value in contacts.gaps.evaluate(state, parameters))
+        found: list[int] = []
+        for i in np.flatnonzero((gaps <= TOUCHING) & (np.abs(rates) <= SLOW)).tolist():
+            trial = [contacts.touches[j] for j in (*found, i)]
+            if rows_of(matrix, contacts.kept, trial) is not None:
+                found.append(i)
+        return tuple(i in found for i in range(len(contacts.touches)))
+
+    def _impact(
+        self,
+        time: float,
+        state: FloatArray,
+        touching: Sequence[int],
+        terms: Terms,
+        control: FloatArray,
+        parameters: FloatArray,
+        e: FloatArray,
+    ) -> tuple[FloatArray, ContactEvent]:
+        contacts, before = self._contacts, terms.all_rates
+        touches = [contacts.touches[i] for i in touching]
+        normals = np.array([touch.normal for touch in touches])
+        matrix = terms.all_impulses
+        rubbing = [contacts.rubbing(i, parameters, own) for i, own in zip(touching, e, strict=True)]
+        if any(0.0 < one.friction < np.inf for one in rubbing):
+            found = impact(matrix, before, contacts.kept, rubbing)
+            if found is None:
+                raise self._unfit(time, state)
+            impulse = found
+        else:
+            wanted = before.copy()
+            wanted[normals] *= 1.0 + e
+            impulse = self._fit(time, state, matrix, wanted, touches).values
+        after = before + matrix @ impulse
+        x = state + terms.velocity_change @ impulse
+        rest = self._rest(time, x, touches, before, control, parameters)
+        if rest is not None:
+            rows = np.array([*contacts.kept, *(r for touch in touches for r in touch.rows)])
+            added = stopping(matrix, after, rows)
+            impulse = impulse + added
+            after = before + matrix @ impulse
+            x = state + terms.velocity_change @ impulse
+        took_part = [i for i, n in zip(touching, normals, strict=True) if impulse[n] != 0.0]
+        return x, ContactEvent(
+            time=time,
+            kind=ContactChange.IMPACT if rest is None else ContactChange.REST,
+            contacts=tuple(contacts.names[i] for i in took_part),
+            closed=(),
+            impulses=tuple(float(impulse[contacts.normals[i]]) for i in took_part),
+            energy_lost=float(-0.5 * impulse @ (before + after)),
+            rest_time=None if rest is None else float(time + rest),
+        )
+
+    def _rest(
+        self,
+        time: float,
+        state: FloatArray,
+        touches: Sequence[Touch],
+        before: FloatArray,
+        control: FloatArray,
+        parameters: FloatArray,
+    ) -> float | None:
+        """How long bouncing would go on after an impact, in s; None if not for a short time."""
+        terms = self._contacts.terms(state, control, parameters)
+        after = terms.rates
+        leaving = [touch for touch in touches if after[touch.normal] > SLOW]
+        if not leaving:
+            return 0.0
+        staying = [touch for touch in touches if touch not in leaving]
+        fit = complementary(terms.force_matrix, terms.accelerations, self._contacts.kept, staying)
+        if fit is None:
+            return None
+        normals = [touch.normal for touch in leaving]
+        fall = -(terms.accelerations + terms.force_matrix @ fit.values)[normals]
+        fastest = -min(before[touch.normal] for touch in touches)
+        shrinks = float(max(after[normals])) / fastest
+        if not (np.all(fall > 0.0) and shrinks < 1.0):
+            return None
+        rest = float(np.max(2.0 * after[normals] / fall)) / (1.0 - shrinks)
+        return rest if rest <= self._settling_time else None
+
+    def _fit(
+        self,
+        time: float,
+        state: FloatArray,
+        matrix: FloatArray,
+        offset: FloatArray,
+        touches: Sequence[Touch],
+    ) -> Fit:
+        fit = complementary(matrix, offset, self._contacts.kept, touches)
+        if fit is None:
+            raise self._unfit(time, state)
+        return fit
+
+    def _unfit(self, time: float, state: FloatArray) -> SimulationError:
+        return SimulationError(
+            f"{self._contacts.dae.name}: no forces of the contacts that touch at t = "
+            f"{time:.6g} s, state {show(state)}, keep them from being pierced by pushing alone",
+            time,
+            state,
+        )
+
+    def _changes(
+        self, time: float, before: Closed, closed: Closed, events: Sequence[ContactEvent]
+    ) -> list[ContactEvent]:
+        """What opened or closed without impact."""
+        told = {name for event in events for name in event.contacts}
+        found = []
+        for kind, was in ((ContactChange.OPENING, True), (ContactChange.CLOSING, False)):
+            names = tuple(
+                name
+                for name, old, new in zip(self._contacts.names, before, closed, strict=True)
+                if old is was and new is not was and not (name in told and not was)
+            )
+            if names:
+                found.append(ContactEvent(time, kind, names, ()))
+        return found
+
+    def _told(self, events: Sequence[ContactEvent], closed: Closed) -> list[ContactEvent]:
+        names = tuple(n for n, shut in zip(self._contacts.names, closed, strict=True) if shut)
+        told = []
+        for event in events:
+            found = replace(event, closed=names)
+            if event.kind is ContactChange.REST and not set(event.contacts) & set(names):
+                found = replace(found, kind=ContactChange.IMPACT, rest_time=None)
+            told.append(found)
+        return told

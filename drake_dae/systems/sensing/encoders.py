@@ -1,0 +1,221 @@
+"""What a law knows of the state where encoders measure it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, positive
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+
+_SAME = 1e-9
+"""Times that differ by less than this, in periods, are one."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Encoders:
+    """How a robot's positions and velocities are measured at samples t_k = k T.
+
+    A position is rounded to a multiple of the resolution delta, after bias and noise are added:
+
+        qm_k = delta round((q(t_k) + b + sigma_q n_k) / delta).
+
+    A velocity is measured with noise of its own, vm_k = v(t_k) + sigma_v n_k; or it is the filtered
+    difference of the measured positions, with the bandwidth w,
+
+        vm_k = a vm_(k-1) + (1 - a) (qm_k - qm_(k-1)) / T,    a = exp(-w T),
+
+    which begins with the velocity that the robot has. While a position passes many multiples of
+    delta from one sample to the next, its rounding errors are as noise that is even over
+    (-delta/2, delta/2) and new at each sample: see `position_deviation` and `velocity_deviation`.
+
+    Attributes:
+        resolution: delta in rad or m, one number for all positions or one each; 0 for none.
+        velocity_bandwidth: w in rad/s; None for velocities that are measured themselves.
+        position_bias: b in rad or m, one number or one each.
+        position_noise: sigma_q in rad or m, one number or one each.
+        velocity_noise: sigma_v in rad/s or m/s, one number or one each; where there is no
+            velocity_bandwidth.
+        seed: The seed of the noise.
+
+    Raises:
+        ModelError: A number is negative or not finite; or velocities from differences have a noise
+            of their own.
+    """
+
+    resolution: ArrayLike = 0.0
+    velocity_bandwidth: float | None = None
+    position_noise: ArrayLike = 0.0
+    velocity_noise: ArrayLike = 0.0
+    seed: int = 0
+    position_bias: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("resolution", "position_noise", "velocity_noise"):
+            given = numbers(name, getattr(self, name))
+            if given.ndim > 1 or not (np.isfinite(given).all() and np.all(given >= 0.0)):
+                raise ModelError(
+                    f"the {name} of encoders must be 0 or more, one number or one for each "
+                    f"position, got {brief(getattr(self, name))}"
+                )
+        bias = numbers("position_bias", self.position_bias)
+        if bias.ndim > 1 or not np.isfinite(bias).all():
+            raise ModelError(
+                "the position_bias of encoders must be finite, one number or one for each "
+                f"position, got {brief(self.position_bias)}"
+            )
+        if self.velocity_bandwidth is not None:
+            positive("the velocity_bandwidth of encoders", self.velocity_bandwidth)
+            if np.any(self.velocity_noise):
+                raise ModelError(
+                    "velocities from differences have the noise of the positions; give encoders "
+                    "either a velocity_bandwidth or a velocity_noise"
+                )
+        check_whole_number("the seed of encoders", self.seed, 0)
+        if self.seed >= 2**32:
+            raise ModelError(f"the seed of encoders must be below 2^32, got {self.seed}")
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether any of it is random."""
+        return bool(np.any(self.position_noise) or np.any(self.velocity_noise))
+
+    @property
+    def position_deviation(self) -> FloatArray:
+        """The standard deviation of qm - q - b, sqrt(delta^2 / 12 + sigma_q^2), rad or m."""
+        return np.sqrt(np.square(self.resolution) / 12.0 + np.square(self.position_noise))
+
+    def velocity_deviation(self, period: float) -> FloatArray:
+        """The standard deviation of vm, rad/s or m/s.
+
+        Of white errors of the positions the filtered difference passes the sum of squares of its
+        impulse response, (1 - a) / T (1, -(1 - a), -(1 - a) a, ...):
+
+            position_deviation (1 - a) / T sqrt(2 / (1 + a)).
+
+        Args:
+            period: T in s.
+        """
+        if self.velocity_bandwidth is None:
+            return np.array(self.velocity_noise, dtype=float)
+        a = self._forgetting(period)
+        return self.position_deviation * (1.0 - a) / period * np.sqrt(2.0 / (1.0 + a))
+
+    def velocity_lag(self, period: float) -> float:
+        """By how much vm is late where the acceleration is constant, T / 2 + T a / (1 - a), in s.
+
+        It is 0 for velocities that are measured themselves, and about 1 / w for a filter that is
+        slow beside the samples.
+
+        Args:
+            period: T in s.
+        """
+        if self.velocity_bandwidth is None:
+            return 0.0
+        a = self._forgetting(period)
+        return period * (0.5 + a / (1.0 - a))
+
+    def _forgetting(self, period: float) -> float:
+        """a, the share of the last velocity that stays in the next one."""
+        assert self.velocity_bandwidth is not None
+        return float(np.exp(-self.velocity_bandwidth * positive("period", period)))
+
+
+@checked(ModelError)
+class StateSensor(LeafSystem):
+    """Measures a robot's state by `Encoders`: the state that a law gets for x = (q, v, ...).
+
+    What it measured at t_k = k period is at its port from then on until the next sample; what
+    stands in x behind q and v passes as it is. At t_k itself it is a function of the state of that
+    instant, so that a law which reads at t_k reads what was measured at t_k. Its updates are
+    unrestricted ones, so that it sees that instant also where a discrete MultibodyPlant steps then.
+
+    Drake's DiscreteDerivative is of no use here: its difference is one sample old, and it is
+    updated after such a plant has stepped.
+
+    Input ports:
+        state: x, shape (n,).
+        noise: Noise of deviation 1 for q and v, shape (2 k,), as of Drake's RandomSource; only if
+            the encoders have noise.
+
+    Output port:
+        estimated_state: x as it is measured, shape (n,); direct feedthrough.
+
+    Args:
+        size: n.
+        num_positions: k, the number of positions, and of velocities, that x begins with.
+        encoders: How they are measured.
+        period: The time between samples in s.
+
+    Attributes:
+        encoders, period: The arguments.
+
+    Raises:
+        ModelError: The encoders have another number of entries, or a size makes no sense.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, size: int, num_positions: int, encoders: Encoders, period: float) -> None:
+        super().__init__()
+        self.set_name("state_sensor")
+        check_whole_number("num_positions", num_positions, 1)
+        check_whole_number("size", size, 2 * num_positions)
+        self.encoders, self.period = encoders, positive("period", period)
+        self._resolution, self._bias, self._position_noise, self._velocity_noise = (
+            _each(name, getattr(encoders, name), num_positions)
+            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
+        )
+        self._count = num_positions
+        self._port = self.DeclareVectorInputPort("state", size)
+        self._noise = None
+        if encoders.has_noise:
+            self._noise = self.DeclareVectorInputPort("noise", 2 * num_positions)
+        # The number of the sample that is held, and what was measured then.
+        self._held = self.DeclareDiscreteState(np.full(1 + 2 * num_positions, np.nan))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, weakly(self._sample))
+        self.DeclareVectorOutputPort("estimated_state", size, weakly(self._calc))
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        state = np.array(self._port.Eval(context))
+        state[: 2 * self._count] = self._measured(context, state)[1:]
+        output.SetFromVector(state)
+
+    def _sample(self, context: Context, state: State) -> EventStatus:
+        found = self._measured(context, self._port.Eval(context))
+        state.get_mutable_discrete_state().set_value(self._held, found)
+        return EventStatus.Succeeded()
+
+    def _measured(self, context: Context, state: FloatArray) -> FloatArray:
+        """The number of the sample that counts now, and what was measured then."""
+        held = context.get_discrete_state(self._held).CopyToVector()
+        sample = np.floor(context.get_time() / self.period + _SAME)
+        if held[0] == sample:
+            return held
+        count = self._count
+        q, v = state[:count] + self._bias, state[count : 2 * count]
+        if self._noise is not None:
+            noise = self._noise.Eval(context)
+            q += self._position_noise * noise[:count]
+            v = v + self._velocity_noise * noise[count:]
+        rounded = self._resolution > 0.0
+        steps = self._resolution[rounded]
+        q[rounded] = steps * np.round(q[rounded] / steps)
+        if self.encoders.velocity_bandwidth is not None and np.isfinite(held[0]):
+            a = np.exp(-self.encoders.velocity_bandwidth * self.period)
+            v = a * held[1 + count :] + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
+        return np.concatenate([[sample], q, v])
+
+
+def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
+    """One number for each position."""
+    found = np.asarray(given, dtype=float)
+    if found.shape not in ((), (count,)):
+        raise ModelError(
+            f"the {name} of encoders has {found.size} entries, the robot has {count} positions"
+        )
+    return np.broadcast_to(found, (count,))

@@ -1,0 +1,179 @@
+"""Sensors of constraint forces, for laws with measured force.              (59), (71), (81)"""
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector, Context, ContinuousState
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, vector
+from drake_dae.errors import ModelError, NonFiniteError
+from drake_dae.systems.blocks.block import DifferentiableSystem
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
+from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.trials import StepWatch, state_tickets
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class ForceSensor(DifferentiableSystem):
+    """A force sensor with state, so that it can stand in a loop with a rigid robot:
+
+        time_constant * y' = force - y,    measured_force = y + bias + noise_deviation * noise,
+
+    and, if it samples, measured_force is held between samples. With rigid joints the constraint
+    force depends on the control in the same instant; a controller that read it directly would close
+    an algebraic loop. Without sampling it converts to AutoDiffXd.
+
+    Input ports:
+        force: The constraint force in N (N m), shape (m,).
+        noise: Noise of deviation 1, shape (m,), for example from Drake's RandomSource; only with a
+            noise_deviation.
+
+    Output port:
+        measured_force: The measured force, shape (m,); no direct feedthrough from `force`.
+
+    Args:
+        size: The number of forces, m.
+        time_constant: The time constant of the lag in s; 0 for none, then it must sample.
+        sample_period: The time between samples in s; 0 for none, then it must lag.
+        bias: A constant error in N, a number or shape (m,).
+        noise_deviation: The standard deviation of the noise in N, a number or shape (m,).
+
+    Attributes:
+        time_constant, sample_period, bias, noise_deviation: The arguments, the last two as arrays
+            of shape (m,).
+
+    Raises:
+        ModelError: A number is negative, or there is neither lag nor sampling.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        size: int,
+        time_constant: float = 0.0,
+        sample_period: float = 0.0,
+        bias: ArrayLike = 0.0,
+        noise_deviation: ArrayLike = 0.0,
+    ) -> None:
+        super().__init__()
+        self.set_name("force_sensor")
+        self.time_constant = float(time_constant)
+        self.sample_period = float(sample_period)
+        try:
+            given = [np.asarray(value, dtype=float) for value in (bias, noise_deviation)]
+            self.bias, self.noise_deviation = (np.broadcast_to(value, (size,)) for value in given)
+        except ValueError:
+            raise ModelError(
+                f"a ForceSensor's bias and noise_deviation are numbers or shape ({size},), got "
+                f"{bias!r} and {noise_deviation!r}"
+            ) from None
+        positive = [self.time_constant, self.sample_period, *self.noise_deviation]
+        negative = any(number < 0 for number in positive)
+        numbers = [*positive, *self.bias]
+        if negative or not np.all(np.isfinite(numbers)):
+            raise ModelError(
+                "a ForceSensor's time_constant, sample_period and noise_deviation must be finite "
+                f"and not negative, got {time_constant}, {sample_period}, {noise_deviation!r}"
+            )
+        if not (self.time_constant or self.sample_period):
+            raise ModelError(
+                "a ForceSensor needs a time_constant or a sample_period: without state it would "
+                "close an algebraic loop"
+            )
+        self._force_port = self.DeclareVectorInputPort("force", size)
+        self._noise_port = None
+        if self.noise_deviation.any():
+            self._noise_port = self.DeclareVectorInputPort("noise", size)
+        if self.time_constant:
+            self.DeclareContinuousState(size)
+            self._steps = StepWatch(self)
+        if self.sample_period:
+            self._held = self.DeclareDiscreteState(size)
+            self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, weakly(self._sample))
+            sources = {self.xd_ticket()}
+        else:
+            sources = state_tickets(self)
+            if self._noise_port is not None:
+                sources.add(self.input_port_ticket(self._noise_port.get_index()))
+        self.DeclareVectorOutputPort("measured_force", size, weakly(self._calc_measured), sources)
+
+    def set_force(self, context: Context, force: ArrayLike) -> None:
+        """Starts the sensor as if it had felt a constant force, shape (m,), without noise."""
+        self.check_context(context)
+        value = vector("force", force, self._force_port.size())
+        if self.time_constant:
+            context.SetContinuousState(value)
+        if self.sample_period:
+            context.SetDiscreteState(self._held, value + self.bias)
+
+    def largest_stable_gain(self) -> float:
+        """The largest gain Gbar of (59) for which a rigid robot's force error decays.
+
+        With the lag alone it is infinite: the error decays at (1 + Gbar) / time_constant. A sampled
+        sensor multiplies it by a - (1 - a) Gbar a step, a = exp(-sample_period / time_constant).
+        """
+        if not self.sample_period:
+            return np.inf
+        a = np.exp(-self.sample_period / self.time_constant) if self.time_constant else 0.0
+        return float((1.0 + a) / (1.0 - a))
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        if self.time_constant:
+            felt = context.get_continuous_state_vector().CopyToVector()
+            force = self._force_port.Eval(context)
+            with np.errstate(over="ignore"):
+                rate = (force - felt) / self.time_constant
+            if not np.isfinite(rate).all():
+                time = context.get_time()
+                error = NonFiniteError(
+                    f"{self.get_name()}: the rate of the measured force is not finite at "
+                    f"t = {time:.6g} s; its time_constant is {self.time_constant:g} s",
+                    time,
+                    felt,
+                )
+                self._steps.tolerate(context, error)
+            derivatives.get_mutable_vector().SetFromVector(rate)
+
+    def _felt(self, context: Context) -> FloatArray:
+        if self.time_constant:
+            value = context.get_continuous_state_vector().CopyToVector()
+        else:
+            value = self._force_port.Eval(context)
+        if self._noise_port is not None:
+            value = value + self.noise_deviation * self._noise_port.Eval(context)
+        return value + self.bias
+
+    def _sample(self, context: Context, state: object) -> None:
+        state.set_value(self._held, self._felt(context))  # type: ignore[attr-defined]
+
+    def _calc_measured(self, context: Context, output: BasicVector) -> None:
+        if self.sample_period:
+            output.SetFromVector(context.get_discrete_state(self._held).value())
+        else:
+            output.SetFromVector(self._felt(context))
+
+    def _formulas(self) -> dict[str, Formula]:
+        if self.sample_period:
+            raise ModelError(
+                f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has "
+                "no derivative by the time. Give it a time_constant alone"
+            )
+        size = self._force_port.size()
+        force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
+        rate = TracedFunction(
+            "force sensor",
+            {"force": force, "state": felt},
+            {"value": (force - felt) / self.time_constant},
+        )
+        inputs, measured = {"state": felt}, felt
+        if self._noise_port is not None:
+            inputs["noise"] = noise
+            measured = measured + self.noise_deviation * noise
+        output = TracedFunction("measured force", inputs, {"value": measured + self.bias})
+        return {
+            "derivative": TracedFormula(rate),
+            "measured_force": TracedFormula(output),
+        }

@@ -1,0 +1,321 @@
+"""`drake-dae analyze`: its numbers against simulations and closed forms, and how it ends."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from runs import each_scenario, run, scenario
+from scipy.optimize import brentq
+
+from drake_dae import build_scenario
+from drake_dae.cli import main
+from drake_dae.scenario.feasibility import feasibility as module
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.feasibility.report import Feasibility
+from drake_dae.simulation.summary import Limits
+
+
+def analyze(capsys, *arguments):
+    """Exit code, and what is printed."""
+    code = main(["analyze", *arguments])
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    return code, captured.out
+
+
+def course(courses, name):
+    (found,) = [c for c in courses if c.signal.name == name]
+    return found
+
+
+# Against another route.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_wall", "two_link_flexible"])
+def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
+    """A loop that starts on the reference stays on it."""
+    case = scenario(name, "start.errors={}", "duration=1.5")
+    told = find_feasibility(case)
+    loop, context = build_scenario(case)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_state(own, told.analysis.motion.states[0])
+    record = run(loop, context, case.duration, case.integrator)
+    # What integration to 1e-8, or fixed steps of 5 ms, leave of the error.
+    assert np.abs(record["tracking_error"]).max() < 1e-6
+    groups = (("control", told.controls), ("constraint_force", told.constraint_forces))
+    for key, courses in groups:
+        recorded = record.signals[key]
+        scale = np.abs(recorded.values).max()
+        for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
+            found = course(courses, signal.name)
+            # A peak between the steps of the record is missed.
+            for value, time in (
+                (found.least, found.least_time),
+                (found.largest, found.largest_time),
+            ):
+                assert np.interp(time, record.time, values) == pytest.approx(
+                    value, abs=1e-3 * scale
+                )
+            assert found.least <= values.min() + 1e-3 * scale
+            assert found.largest >= values.max() - 1e-3 * scale
+    states = record.signals["state"]
+    for found in told.joints:
+        index = [signal.name for signal in states.signals].index(found.signal.name)
+        assert found.largest == pytest.approx(states.values[:, index].max(), abs=1e-3)
+        assert found.least == pytest.approx(states.values[:, index].min(), abs=1e-3)
+
+
+@pytest.mark.slow
+def test_the_joint_force_behind_an_actuation():
+    """At rest the springs hold what rigid joints would: the same tau, against the same limits."""
+    still = [
+        "references.tool.z=0.3",
+        "references.wall.force=400",
+        "start.errors={}",
+        "duration=0.1",
+    ]
+    rigid = find_feasibility(scenario("two_link_wall", *still))
+    soft = find_feasibility(scenario("two_link_flexible", *still))
+    assert rigid.joint_forces == ()
+    for one, two in zip(rigid.controls, soft.joint_forces, strict=True):
+        assert two.largest == pytest.approx(one.largest, rel=1e-9)
+        assert two.high == one.high
+    assert any("needs" in problem for problem in soft.problems)
+
+
+@pytest.mark.slow
+def test_a_torque_limit_that_is_exceeded(capsys):
+    """At rest, u = g(q) - J' F with rods of 12 and 6 kg, 1 m long, and 400 N against the wall."""
+    code, text = analyze(
+        capsys,
+        "two_link_wall",
+        *("--set", "references.tool.z=0.3"),
+        *("--set", "references.wall.force=400"),
+    )
+    x, z, force, gravity = 1.2, 0.3, 400.0, 9.81
+    elbow = -np.arccos((x**2 + z**2 - 2.0) / 2.0)
+    second = np.arctan2(z, x) + elbow / 2.0  # Of the isosceles triangle.
+    first = second - elbow
+    torque1 = gravity * (12.0 * np.cos(first) + 3.0 * np.cos(second)) - force * z
+    torque2 = 3.0 * gravity * np.cos(second) - force * np.sin(second)
+    assert abs(torque1) < 300.0
+    assert torque2 > 120.0
+    assert code == 2
+    (line,) = [line for line in text.splitlines() if line.startswith("PROBLEM")]
+    assert re.fullmatch(
+        rf"PROBLEM  joint2_motor needs {torque2:.4g} N m at \S+ s, limit 120 N m", line
+    )
+    (row,) = [line.split() for line in text.splitlines() if line.startswith("joint1_motor")]
+    assert row[1:4] == ["N", "m", f"{abs(torque1):.4g}"]
+    assert row[-1] == "300"
+
+
+@pytest.mark.slow
+def test_a_reference_that_leaves_the_workspace(capsys):
+    """Two links of 1 m reach z = 1.6 m on the wall at x = 1.2 m.
+
+    The quintic blend from 0.3 to 3 m in 0.3 s is there when 10 s^3 - 15 s^4 + 6 s^5 = 1.3 / 2.7.
+    """
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    when = 0.3 * brentq(lambda s: 10 * s**3 - 15 * s**4 + 6 * s**5 - 1.3 / 2.7, 0.0, 1.0)
+    code, text = analyze(capsys, "two_link_wall", "--set", move)
+    assert code == 2
+    words = " ".join(text.split())
+    assert "the reference leaves what the system can reach at t = 0.147" in words
+    found = find_feasibility(scenario("two_link_wall", move)).analysis.motion
+    assert found.ending.time == pytest.approx(when, abs=1e-4)
+    assert found.times[-1] < when < found.times[-1] + 0.01
+    # On the way there, what is beyond the limits is told as well.
+    assert re.search(r"PROBLEM  joint2_w goes from .* its limits are -3 and 3, left at 0\.0", text)
+
+
+@pytest.mark.slow
+def test_a_contact_that_would_have_to_pull(capsys):
+    """2 + 5 sin 2t is negative from t = (pi + asin 0.4) / 2 on; samples are 10 ms apart."""
+    code, text = analyze(capsys, "two_link_wall", "--set", "references.wall.force.offset=2")
+    assert code == 2
+    (line,) = [line for line in text.splitlines() if line.startswith("PROBLEM")]
+    found = re.fullmatch(
+        r"PROBLEM  wall\.force pulls from (\S+) s on, most with 3 N at \S+ s: a real contact would "
+        "open",
+        line,
+    )
+    first = (np.pi + np.arcsin(0.4)) / 2.0
+    assert first <= float(found[1]) <= first + 0.01
+    assert re.search(r"^wall\.force +N +-3 .* pulls: a real contact would open$", text, re.M)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("periods", [10, 200, 1000])
+def test_times_follow_a_reference_that_even_times_would_not_see(periods):
+    """1001 even times over 1000 periods see sin(2 pi t) as 0, and half as many as a beat."""
+    wanted = lambda t: np.array([4.0 + 5.0 * np.sin(2 * np.pi * t), 0.3])  # noqa: E731
+    times, is_resolved = module.sample_times(wanted, 0.0, float(periods))
+    assert is_resolved
+    assert (times[0], times[-1]) == (0.0, periods)
+    assert module.SAMPLES <= times.size <= module.MOST_SAMPLES
+    assert np.all(np.diff(times) > 0.0)
+    values = np.array([wanted(t)[0] for t in times])
+    # A chord is off by 1 % of the range, 0.1, at a random place of it: 0.16 at the worst.
+    assert values.min() == pytest.approx(-1.0, abs=0.16)
+    assert values.max() == pytest.approx(9.0, abs=0.16)
+    # Long ones are about turning points of the curvature, or passed by chance.
+    assert np.quantile(np.diff(times), 0.9) < 0.15
+
+
+@pytest.mark.slow
+def test_times_that_do_not_suffice_are_told():
+    wanted = lambda t: np.array([np.sin(1e4 * t)])  # noqa: E731
+    times, is_resolved = module.sample_times(wanted, 0.0, 100.0)
+    assert not is_resolved
+    assert times.size == module.MOST_SAMPLES
+    values = np.array([wanted(t)[0] for t in times])
+    assert np.ptp(values) > 1.99
+    analysis = find_feasibility(scenario("two_link_wall", "duration=0.1")).analysis
+    told = Feasibility(analysis, 0.1, is_resolved=False)
+    assert "The reference varies too fast" in str(told)
+    assert told.to_dict()["resolved"] is False
+
+
+@pytest.mark.slow
+def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
+    """2 + 5 sin 20 pi t over 10 s at 101 even times, all of them at its zeros."""
+    monkeypatch.setattr(module, "SAMPLES", 101)
+    fast = (
+        "references.wall.force.offset=2",
+        "references.wall.force.frequencies=[62.83185307179586]",
+    )
+    arguments = [word for setting in fast for word in ("--set", setting)]
+    code, text = analyze(capsys, "two_link_wall", *arguments, "--set", "duration=10")
+    assert code == 2
+    found = re.search(r"PROBLEM  wall\.force pulls from (\S+) s on, most with (\S+) N", text)
+    assert float(found[2]) == pytest.approx(3.0, abs=0.16)
+    assert float(found[1]) == pytest.approx((np.pi + np.arcsin(0.4)) / (20 * np.pi), abs=0.01)
+
+
+@pytest.mark.slow
+def test_extremes_of_a_constant_have_no_time(capsys):
+    settings = ["--set", "references.wall.force=15", "--set", "duration=2"]
+    _, text = analyze(capsys, "two_link_wall", *settings)
+    row = [line.split() for line in text.splitlines() if line.startswith("wall.force")][-1]
+    assert row == ["wall.force", "N", "15", "15"]
+    assert "Started without errors, and examined at 1001 times." in text
+
+
+@pytest.mark.slow
+def test_a_pin_may_pull():
+    told = find_feasibility(scenario("five_bar", "references.pin.fx.offset=-15"))
+    assert course(told.constraint_forces, "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
+    assert not any("pulls" in problem for problem in told.problems)
+    loop, _ = build_scenario(scenario("five_bar"))
+    assert all(Limits.of(loop.plant.model).can_pull(s) for s in loop.plant.dae.output_signals[2:])
+    loop, _ = build_scenario(scenario("two_link_wall"))
+    (force,) = loop.plant.dae.constraint_input_signals
+    assert not Limits.of(loop.plant.model).can_pull(force)
+    assert not Limits().can_pull(force)
+
+
+# How it ends.
+
+
+@pytest.mark.slow
+def test_a_scenario_without_problems(capsys):
+    code, text = analyze(capsys, "two_link_wall")
+    assert code == 0
+    lines = text.splitlines()
+    assert lines[0] == "two_link_wall"
+    assert lines[-1] == "no problem found"
+    assert max(map(len, lines)) <= 100
+    assert "index 3, N* of dimension 2, zero dynamics of dimension 0" in lines
+
+
+def test_a_violated_assumption_is_a_finding(capsys):
+    """The wall fixes x, so x is no output; what the constraint alone tells is still known."""
+    code, text = analyze(capsys, "two_link_wall", "--set", "outputs.0.axes=x")
+    assert code == 2
+    assert re.search(r"^wall\.distance +2$", text, re.M)
+    assert re.search(r"^\(5\) .* violated$", text, re.M)
+    assert "PROBLEM  Assumption (5): the control never acts on output 'tool.x'" in text
+
+
+@pytest.mark.slow
+def test_json(capsys):
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    code, text = analyze(capsys, "two_link_motors", "--json", "--set", "duration=1")
+    assert code == 0
+    found = json.loads(text)
+    assert found.pop("scenario") == "two_link_motors"
+    assert found == find_feasibility(scenario("two_link_motors", "duration=1")).to_dict()
+    assert found["analysis"]["index"] == 3
+    # Voltages have no limit, which JSON has no number for.
+    assert [c["high"] for c in found["controls"]] == [None, None]
+    assert [c["high"] for c in found["joint_forces"]] == [300.0, 120.0]
+    assert set(found["analysis"]["reference"]["margins"]) == {"A(x)", "B(x)"}
+    code, text = analyze(capsys, "two_link_wall", "--json", "--set", move)
+    assert code == 2
+    found = json.loads(text)
+    assert found["analysis"]["reference"]["failure_time"] == pytest.approx(0.147, abs=1e-3)
+    assert found["problems"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["no_such_scenario"], "no scenario file 'no_such_scenario'"),
+        (["two_link_wall", "--set", "duratoin=1"], "duratoin"),
+        (["two_link_wall", "--set", "references.tool.z.offset=7"], "start: found no configuration"),
+        (["two_link_wall", "--set", "duration=-1"], "duration: "),
+    ],
+)
+def test_errors(arguments, message, capsys):
+    assert main(["analyze", *arguments]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+
+
+def test_an_error_as_json(capsys):
+    assert main(["analyze", "two_link_wall", "--json", "--set", "start.positions.joint2=9"]) == 1
+    captured = capsys.readouterr()
+    text = "start.positions: joint2 = 9 rad is outside its limits, "
+    assert json.loads(captured.out)["error"].startswith(text)
+    assert captured.err.startswith(f"error: {text}")
+
+
+@pytest.mark.slow
+def test_objects_are_one_line_at_the_prompt():
+    case = scenario("two_link_wall", "duration=0.1")
+    assert repr(find_feasibility(case)) == "Feasibility('two_link_arm': no problem found)"
+    loop, _ = build_scenario(case)
+    assert repr(loop).startswith("ClosedLoop('two_link_arm', logs state, constraint_force, ")
+
+
+@pytest.mark.slow
+def test_states_have_units(capsys):
+    _, text = analyze(capsys, "two_link_wall")
+    assert re.search(
+        r"^B\(x\) is nearest to singular at joint1=\S+ rad, joint2=\S+ rad\.$", text, re.M
+    )
+
+
+def test_help_tells_the_exit_codes(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["analyze", "--help"])
+    assert caught.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "exit code: 0 if no problem was found, 2 if one was" in text
+
+
+@pytest.mark.slow
+# That which leaves its wall shall pull at it; its own test says so.
+@pytest.mark.parametrize("name", each_scenario(lambda name: name == "wall_bounce"))
+def test_shipped_scenarios_have_no_problems(name):
+    told = find_feasibility(scenario(name))
+    assert told.problems == ()
+    motion = told.analysis.motion
+    assert motion.times[-1] == told.duration if motion else name == "wall_polish"
+    assert told.to_markdown().endswith("no problem found")

@@ -1,0 +1,101 @@
+"""`drake-dae sweep`: what it prints and leaves, and what it refuses."""
+
+import os
+import pty
+import re
+import subprocess
+import sys
+
+import pytest
+
+from drake_dae.cli import main
+from drake_dae.studies.study import FILES
+
+SHORT = ["--set", "duration=0.2", "--compiled", "false"]
+VARY = ["--vary", "start.errors.tool.z=0..0.05:3"]
+
+
+@pytest.mark.slow
+def test_it_leaves_its_files_and_prints_the_summary(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):  # The second time it has all runs already.
+        assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--workers=1"]) == 0
+        printed = capsys.readouterr()
+        folder = tmp_path / "runs" / "two_link_wall-sweep"
+        summary = (folder / "summary.txt").read_text()
+        files = ", ".join(["runs.jsonl", *FILES])
+        assert printed.out == f"{summary}written to runs/two_link_wall-sweep/: {files}\n"
+        assert printed.err == ""
+        assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "runs.jsonl"])
+        assert summary.startswith("3 runs: 3 finished\n")
+    other = ["sweep", "two_link_wall", *VARY, *SHORT[2:], "--set", "duration=0.3"]
+    assert main(other) == 1
+    assert capsys.readouterr().err == (
+        "error: 'runs/two_link_wall-sweep/runs.jsonl' belongs to another study: duration = 0.2 "
+        "there, 0.3 here. Choose another folder, or remove it\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--vary", "start.errors.tool=0.1"], "start.errors: no output 'tool'"),
+        (["--vary", "start.error=0.1"], "start: has no key 'error'; did you mean 'errors'"),
+        (["--vary", "duration=[1, a]"], "duration: expected a number, got 'a'"),
+        (["--vary", "duration=[]"], "duration: expected at least one value"),
+        (["--vary", "duration"], "duration: expected KEY=VALUES"),
+        (["--vary", "duration=1..2"], "duration: 1..2 needs the number of its values"),
+        (["--vary", "duration=1..2", "--random", "0"], "count must be a whole number from 1"),
+        (["--vary", "duration=1", "--workers", "0"], "workers must be a whole number from 1"),
+        (["--vary", "plant_parameters.a=1"], "plant_parameters: two_link_arm: no parameter 'a'"),
+    ],
+)
+def test_what_is_wrong_is_told_before_anything_runs(options, line, tmp_path, capsys):
+    folder = tmp_path / "out"
+    assert main(["sweep", "two_link_wall", *options, *SHORT, "--out", str(folder)]) == 1
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("error: ")
+    assert line in said
+    assert not folder.exists()
+
+
+def test_the_files_of_others_are_left_alone(tmp_path, capsys):
+    (tmp_path / "summary.txt").write_text("mine")
+    assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--out", str(tmp_path)]) == 1
+    assert "holds summary.txt, not from a study" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.txt"]
+
+
+@pytest.mark.parametrize(
+    "options", [[], [*VARY, "--random", "3", "--together"], [*VARY, "--random", "many"]]
+)
+def test_wrong_usage_exits_with_2(options, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["sweep", "two_link_wall", *options])
+    assert caught.value.code == 2
+    assert "usage: drake-dae sweep" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_a_bar_with_the_time_left_on_a_terminal(tmp_path):
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "drake_dae", "sweep", "two_link_wall", *SHORT, "--out", tmp_path,
+         "--workers=1", "--vary", "start.errors.tool.z=[0, 0.01, 0.02, 3]"],
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        env=os.environ | {"PYTHONUTF8": "1"},
+    )  # fmt: skip
+    os.close(theirs)
+    shown = b""
+    try:
+        while part := os.read(ours, 4096):
+            shown += part
+    except OSError:
+        pass  # Linux says so when the other end is closed.
+    os.close(ours)
+    assert process.wait(timeout=60) == 0
+    steps = shown.decode().rstrip().split("\r")
+    assert re.search(r"  0%\|.*\| 0/4 runs, \? left", shown.decode())
+    assert re.search(r"100%\|.*\| 4/4 runs, 00:00 left, 1 not finished", steps[-1])

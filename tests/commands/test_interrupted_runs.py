@@ -1,0 +1,157 @@
+"""Runs that a signal ends, at any moment: what they leave is readable and is what was simulated."""
+
+import multiprocessing
+import os
+import random
+import signal
+import sys
+import time
+
+import numpy as np
+import pytest
+from runs import run_scenario, scenario
+
+from drake_dae import Record
+from drake_dae.cli import main
+from drake_dae.commands.run_folder import FILES, PART
+from drake_dae.running.rollout.course import Course
+from drake_dae.simulation.records.interruption import ENDING_SIGNALS
+
+SECONDS = 2.5
+"""Of the run, by a clock; plots and animation follow."""
+
+SETTINGS = ("duration=10", f"integrator.target_realtime_rate={10 / SECONDS}")
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    return run_scenario(scenario("two_link_wall", "duration=10"))[2]
+
+
+BARE = ("write.plots=false", "write.animation=false")
+
+WITHOUT_PICTURES = ("scenario.yaml", "summary.txt", "record.npz")
+
+
+def command(folder, extra):
+    """In a process of its own."""
+    output = os.open(folder.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT)
+    for descriptor in (1, 2):
+        os.dup2(output, descriptor)
+    # As from a shell, whatever the tests were started by.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    settings = [word for setting in SETTINGS + extra for word in ("--set", setting)]
+    sys.exit(main(["simulate", "two_link_wall", "--out", str(folder), *settings]))
+
+
+def interrupted(moments, parent, settings=()):
+    """Runs it once for each (signal, s after the start), all at a time.
+
+    Returns:
+        (signal, exit code, folder) of each.
+    """
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["drake_dae.commands.simulate", "matplotlib.figure"])
+    runs = []
+    for number, (sent, after) in enumerate(moments):
+        folder = parent / f"{sent.name}{number}"
+        process = processes.Process(target=command, args=(folder, settings))
+        process.start()
+        runs.append((sent, after, folder, process))
+    due, limit = {}, time.monotonic() + 120
+    while len(due) < len(runs) or min(due.values()) < np.inf:
+        assert time.monotonic() < limit
+        for sent, after, folder, process in runs:
+            scenario = folder / "scenario.yaml"
+            if folder not in due and scenario.exists() and scenario.stat().st_size:
+                due[folder] = time.monotonic() + after
+            if time.monotonic() >= due.get(folder, np.inf):
+                os.kill(process.pid, sent)
+                due[folder] = np.inf
+        time.sleep(0.005)
+    found = []
+    for sent, _, folder, process in runs:
+        process.join(60)
+        found.append((sent, process.exitcode, folder))
+    return found
+
+
+def check(sent, code, folder, undisturbed, complete=FILES):
+    output = folder.with_suffix(".txt").read_text()
+    left = sorted(path.name for path in folder.iterdir())
+    if sent == signal.SIGKILL:
+        assert code in (0, -signal.SIGKILL)
+    else:
+        # After the last file is written, the process may end before the signal has come.
+        assert code == 128 + sent or (code == 0 and left == sorted(complete)), output
+        assert not [name for name in left if name.startswith(".")], left
+        assert "record.npz" in left, output
+        assert PART not in left
+        assert "tracking error" in output
+        assert "Traceback" not in output
+    whole = folder / "record.npz"
+    path = whole if whole.exists() else folder / PART
+    if not path.exists():
+        assert sent == signal.SIGKILL
+        return 0
+    record = Record.load(path)
+    count = record.time.size
+    np.testing.assert_array_equal(record.time, undisturbed.time[:count])
+    # Where a run ends, its last row is the one after the projection.
+    exact = count if path.name == PART else count - 1
+    for name in undisturbed.signals:
+        np.testing.assert_array_equal(record[name][:exact], undisturbed[name][:exact], name)
+        assert record.signals[name].signals == undisturbed.signals[name].signals
+        # A residual of 1e-9 m is taken away.
+        np.testing.assert_allclose(record[name], undisturbed[name][:count], rtol=1e-6, atol=1e-6)
+    return count
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("always")
+def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
+    moments = [(sent, 0.7 * SECONDS) for sent in (signal.SIGKILL, *ENDING_SIGNALS)]
+    for sent, code, folder in interrupted(moments, tmp_path, BARE):
+        count = check(sent, code, folder, undisturbed, WITHOUT_PICTURES)
+        assert 0 < count < undisturbed.time.size
+        if sent != signal.SIGKILL:
+            assert code == 128 + sent
+            assert sorted(path.name for path in folder.iterdir()) == sorted(WITHOUT_PICTURES)
+    # A killed run is no obstacle to the next one.
+    folder = tmp_path / "SIGKILL0"
+    (folder / ".unfinished-plots").mkdir()
+    short = [f"--set={setting}" for setting in ("duration=0.1", *BARE)]
+    assert main(["simulate", "two_link_wall", "--out", str(folder), *short]) == 0
+    assert f"warning: {folder / PART} of a run that did not end is" in capsys.readouterr().err
+    assert sorted(path.name for path in folder.iterdir()) == sorted(WITHOUT_PICTURES)
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
+    moments, signals = random.Random(13), (*ENDING_SIGNALS, signal.SIGKILL)
+    chosen = [(sent, moments.uniform(0.1, 2.2 * SECONDS)) for sent in 3 * signals]
+    counts = [check(*found, undisturbed) for found in interrupted(chosen, tmp_path)]
+    assert len(set(counts)) > 3
+
+
+def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys):
+    """Ctrl-C after some steps of the integrator: the record goes up to there."""
+    accept = Course.accept
+
+    def and_interrupt(self, *arguments):
+        accept(self, *arguments)
+        if self.steps == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    words = ["simulate", "two_link_wall", "--rollout", "--compiled", "false", "--set=duration=10"]
+    words += [f"--set={setting}" for setting in BARE]
+    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+    monkeypatch.setattr(Course, "accept", and_interrupt)
+    assert main([*words, "--out", str(tmp_path / "part")]) == 128 + signal.SIGINT
+    assert "interrupted" in capsys.readouterr().out
+    whole, part = (Record.load(tmp_path / name / "record.npz") for name in ("whole", "part"))
+    assert 1 < part.time.size < whole.time.size
+    for name in whole.signals:
+        np.testing.assert_allclose(part[name], whole[name][: part.time.size], rtol=0.0, atol=1e-12)

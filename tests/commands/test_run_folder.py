@@ -1,0 +1,111 @@
+"""The folder of a run: one run at a time, and only files of its own."""
+
+import errno
+import fcntl
+import os
+
+import pytest
+
+from drake_dae.commands.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
+from drake_dae.errors import ModelError
+
+
+@pytest.fixture
+def earlier(tmp_path):
+    (tmp_path / SCENARIO).write_text(f"{MARK} 0.1.0\n")
+    return tmp_path
+
+
+def test_two_runs_into_one_folder(tmp_path):
+    with run_folder(tmp_path / "run"):
+        (tmp_path / "run" / SCENARIO).write_text(f"{MARK}\nof the first")
+        with (
+            pytest.raises(ModelError, match=r"another run writes to .*run'; wait"),
+            run_folder(tmp_path / "run"),
+        ):
+            pass
+        assert (tmp_path / "run" / SCENARIO).read_text() == f"{MARK}\nof the first"
+    with run_folder(tmp_path / "run"):
+        assert (tmp_path / "run" / SCENARIO).read_text() == ""
+
+
+def test_what_a_killed_run_left_is_removed(earlier):
+    (earlier / ".unfinished-abc").mkdir()
+    (earlier / ".unfinished-abc" / "record.npz").write_text("")
+    (earlier / PART).write_text("")
+    (earlier / "notes.txt").write_text("mine")
+    with (
+        pytest.warns(UserWarning, match=r"record\.part of a run that did not end is removed"),
+        run_folder(earlier),
+    ):
+        assert sorted(path.name for path in earlier.iterdir()) == ["notes.txt", SCENARIO]
+
+
+@pytest.mark.parametrize("name", [*FILES, PART])
+def test_nothing_is_written_through_a_link(name, tmp_path):
+    target = tmp_path / "target"
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / name).symlink_to(target)
+    refused = pytest.raises(ModelError, match=f"holds {name}, not from an earlier run")
+    with refused, run_folder(folder):
+        pass
+    assert not target.exists()
+    assert (folder / name).is_symlink()
+
+
+def test_an_empty_scenario_is_no_proof_of_an_earlier_run(tmp_path):
+    (tmp_path / SCENARIO).touch()
+    with run_folder(tmp_path):
+        pass
+    (tmp_path / "controls.png").write_text("mine")
+    refused = pytest.raises(ModelError, match=r"holds scenario\.yaml, controls\.png, not from")
+    with refused, run_folder(tmp_path):
+        pass
+    assert (tmp_path / "controls.png").read_text() == "mine"
+
+
+def test_a_link_beside_an_earlier_run_is_removed_and_its_target_stays(earlier):
+    (earlier / "notes.txt").write_text("mine")
+    (earlier / "summary.txt").symlink_to(earlier / "notes.txt")
+    with run_folder(earlier):
+        assert not os.path.lexists(earlier / "summary.txt")
+    assert (earlier / "notes.txt").read_text() == "mine"
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(earlier):
+    (earlier / "record.npz").mkdir()
+    with (
+        pytest.raises(ModelError, match=r"cannot write to .*\(.*record\.npz\)"),
+        run_folder(earlier),
+    ):
+        pass
+
+
+def test_a_file_system_without_locks(tmp_path, monkeypatch):
+    def none(file, operation):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    with pytest.warns(UserWarning, match="No locks available"), run_folder(tmp_path):
+        pass
+
+
+def test_files_appear_when_they_are_complete(tmp_path):
+    with stage(tmp_path, "one", "two") as place:
+        for name in ("one", "two"):
+            (place / name).write_text(name)
+            assert not (tmp_path / name).exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
+
+
+@pytest.mark.parametrize("path", [None, "in its place", "elsewhere"])
+def test_an_error_names_the_file(path, tmp_path):
+    def fail(place):
+        names = {None: (), "in its place": (str(place / "one"),), "elsewhere": ("/mesh.obj",)}
+        raise OSError(errno.ENOSPC, "No space left on device", *names[path])
+
+    with pytest.raises(OSError, match="No space left") as caught, stage(tmp_path, "one") as place:
+        fail(place)
+    assert caught.value.filename == ("/mesh.obj" if path == "elsewhere" else str(tmp_path / "one"))
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,404 @@
+"""The coordinates (20)-(22) and their inverse, against hand calculation and MultibodyPlant."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from actuated import actuated, slope, states
+from arms import arm, consistent_states, numbers
+from problems import PROBLEMS, hidden_normal_form, knife_edge, pendulum, pendulum_tension
+from two_arms import two_arms
+
+from drake_dae.dae.normal_form.normal_form import NormalForm
+from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.newton import Linearization, newton
+
+ROBOTS = {
+    "two_link": lambda: arm("two_link").structure,
+    "seven_joint": lambda: arm("seven_joint").structure,
+    "two_arms": lambda: find_structure(two_arms().dae),
+    **{
+        f"two_link {kind}": lambda kind=kind: actuated("two_link", kind).structure
+        for kind in ("flexible", "damped", "motor", "hydraulic", "flexible motor")
+    },
+    "seven_joint damped": lambda: actuated("seven_joint", "damped").structure,
+}
+
+
+@cache
+def form(name: str) -> NormalForm:
+    structure = ROBOTS[name]() if name in ROBOTS else find_structure(PROBLEMS[name]().system)
+    return NormalForm(structure.system, structure=structure)
+
+
+def chain_ends(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
+    """Where the chains of constraints and of outputs end in (y, zeta, xi)."""
+    ends = np.cumsum([*structure.constraint_degrees, *structure.output_degrees]) - 1
+    m = len(structure.constraint_degrees)
+    dynamic = np.flatnonzero(structure.output_degrees)
+    return ends[:m], ends[m:][dynamic]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*PROBLEMS, *ROBOTS])
+def test_phi_and_its_inverse_compose_to_the_identity(name):
+    """Both ways, on N* and off it, from the nominal state as the guess."""
+    normal_form = form(name)
+    system, structure = normal_form.system, normal_form.structure
+    random = np.random.default_rng(1)
+    if name in PROBLEMS:
+        found = [PROBLEMS[name]().consistent(random) for _ in range(4)]
+    elif len(name.split()) > 1 and name.startswith("two_link"):
+        found = list(states("two_link", name.removeprefix("two_link "), 4))
+    else:
+        found = list(structure.states[1:5])
+    size = np.abs([*structure.states, *found]).max(axis=0)
+    found += [x + 1e-2 * size * random.standard_normal(size.size) for x in found]
+    for x in found:
+        coordinates = normal_form.coordinates(x)
+        back = normal_form.state(coordinates)
+        scale = np.maximum(1.0, np.abs(x).max())
+        # Round-off times the condition, which is highest (1e3) behind flexible joints and motors.
+        np.testing.assert_allclose(back, x, rtol=0, atol=1e-12 * scale)
+        again = normal_form.coordinates(back)
+        np.testing.assert_allclose(
+            again, coordinates, rtol=0, atol=1e-12 * max(1.0, np.abs(coordinates).max())
+        )
+    assert len(normal_form.coordinate_signals) == system.num_states
+
+
+@pytest.mark.slow
+def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
+    """dPhi/dx (f + g v + h u): integrators, then a + B u by hand; y stays; v by hand."""
+    system = problem.system
+    normal_form = NormalForm(system)
+    fields = ca.Function(
+        "fields",
+        [system.state, system.parameter_symbol],
+        [ca.densify(e) for e in (system.f, system.g, system.h)],
+    )
+    random = np.random.default_rng(2)
+    constraint_ends, output_ends = chain_ends(normal_form.structure)
+    for _ in range(3):
+        x, u = problem.consistent(random), random.standard_normal(system.num_controls)
+        f, g, h = (np.array(e) for e in fields(x, system.parameter_values))
+        known = problem.known(x)
+        rate = f[:, 0] + g @ (known.alpha + known.beta @ u) + h @ u
+        coordinates = normal_form.coordinates(x)
+        moving = normal_form.jacobian(x) @ rate
+        expected = np.roll(coordinates, -1)
+        expected[constraint_ends] = 0.0
+        highest = known.drift + known.control_matrix @ u
+        expected[output_ends] = highest[np.flatnonzero(problem.output_degrees)]
+        first_xi = system.num_states - problem.zero_dynamics
+        scale = max(1.0, np.abs(moving).max())
+        np.testing.assert_allclose(
+            moving[:first_xi], expected[:first_xi], rtol=0, atol=1e-12 * scale
+        )
+        residual = problem.derivatives(x)
+        np.testing.assert_allclose(coordinates[: residual.size], residual, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["pendulum_tension", "knife_edge_force", "two_link damped"])
+def test_the_jacobian_is_the_derivative(name):
+    """Central differences along random directions, with an error of order step^6."""
+    normal_form, random = form(name), np.random.default_rng(3)
+    x = normal_form.structure.states[2]
+    for _ in range(3):
+        along = random.standard_normal(x.size)
+        difference = slope(normal_form.coordinates, x, along, 1e-2)
+        expected = normal_form.jacobian(x) @ along
+        scale = np.abs(normal_form.jacobian(x)).max()
+        np.testing.assert_allclose(difference, expected, rtol=0, atol=1e-9 * scale)
+
+
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+def test_robot_coordinates_are_those_of_50_to_53(name):
+    """phi, J qd, h_1, P qd from MultibodyPlant alone."""
+    normal_form, wall = form(name), {"two_link": 1.2, "seven_joint": 0.7}[name]
+    random = np.random.default_rng(4)
+    for x in consistent_states(name, 3):
+        x = x + 0.05 * random.standard_normal(x.size)  # Off N*, so that y is not zero.
+        q, v = np.split(x, 2)
+        n = numbers(name, q, v)
+        tip = arm(name).plant.CreateDefaultContext()
+        arm(name).plant.SetPositions(tip, q)
+        pose = arm(name).plant.GetFrameByName("tool").CalcPoseInWorld(tip)
+        y = [wall - pose.translation()[0], *(n.constraint_jacobian @ v)]
+        zeta = np.column_stack([n.outputs, n.output_jacobian @ v]).reshape(-1)
+        # A few hundred operations on numbers of order 1.
+        np.testing.assert_allclose(
+            normal_form.coordinates(x), [*y, *zeta], rtol=0, atol=1e-13 * max(1, *np.abs(x))
+        )
+
+
+def test_robot_inverse_is_58():
+    """q = psi(xbar_1) by the model's own search; qd = Q xbar_2 with Q from MultibodyPlant."""
+    for name in ("two_link", "seven_joint"):
+        normal_form, model = form(name), arm(name).model
+        for x in consistent_states(name, 3, seed=5):
+            coordinates = normal_form.coordinates(x)
+            zeta = coordinates[2:].reshape(-1, 2)
+            state = normal_form.state(np.concatenate([[0.0, 0.0], zeta.reshape(-1)]))
+            q = model.configuration(zeta[:, 0], np.split(model.dae.nominal_state, 2)[0])
+            n = numbers(name, q, np.zeros_like(q))
+            both = np.vstack([n.constraint_jacobian, n.output_jacobian])
+            v = np.linalg.solve(both, [0.0, *zeta[:, 1]])
+            # The configuration is found to 1e-10 or better.
+            np.testing.assert_allclose(state, [*q, *v], rtol=0, atol=1e-9)
+
+
+def test_the_jacobian_is_singular_exactly_where_b_is():
+    """Theorem 2.1 by closed forms: |det dPhi/dx| is y^2 for the pendulum, B is y^2/(m L^2).
+
+    For the knife edge with z = (force, heading) it is m |w|, and det B is w/I.
+    """
+    flat = form("pendulum")
+    for x in ([0.4, -0.6, 0.1, 0.1], [0.5, 0.6, 0.3, -0.2], [0.8, 0.0, 0.0, 0.4]):
+        determinant = np.linalg.det(flat.jacobian(x))
+        assert abs(determinant) == pytest.approx(x[1] ** 2, abs=1e-15)
+    turning = form("knife_edge_force")
+    assert [s.name for s in turning.completion_signals] == ["x", "y"]
+    for rate in (1.3, -0.4, 0.0):
+        x = [0.2, 0.1, 0.3, 0.8 * np.cos(0.3), 0.8 * np.sin(0.3), rate]
+        determinant = np.linalg.det(turning.jacobian(x))
+        assert abs(determinant) == pytest.approx(3.0 * abs(rate), abs=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3, 4, 8, 11])
+def test_systems_made_from_their_normal_form(seed):
+    """With d > 0 and 4 to 6 coordinates bent by a polynomial: the inverse over a wider range."""
+    hidden = hidden_normal_form(seed)
+    structure = find_structure(hidden.system)
+    normal_form = NormalForm(structure.system, structure=structure)
+    assert normal_form.completion.numel() == hidden.zero_dynamics
+    random = np.random.default_rng(seed)
+    for _ in range(5):
+        guess = 0.3 * random.standard_normal(hidden.system.num_states)
+        x = structure.manifold.project(guess)
+        back = normal_form.state(normal_form.coordinates(x))
+        np.testing.assert_allclose(back, x, rtol=0, atol=1e-12)
+
+
+def test_chosen_completions_are_named_states():
+    """The shafts' velocities behind damped joints, the knife edge's position."""
+    expected = {
+        "two_link damped": ["joint1_motor.velocity", "joint2_motor.velocity"],
+        "knife_edge": ["x", "y"],
+        "two_link": [],
+    }
+    for name, names in expected.items():
+        normal_form = form(name)
+        assert [s.name for s in normal_form.completion_signals] == names
+        assert not normal_form.margin.is_singular
+    signals = form("two_link damped").coordinate_signals
+    assert [(s.name, s.unit) for s in signals[-2:]] == [
+        ("joint1_motor.velocity", "rad/s"),
+        ("joint2_motor.velocity", "rad/s"),
+    ]
+
+
+def radius() -> DaeSystem:
+    """z = (x0^2 + x1^2)/2 is pushed radially; its level curves turn by more than 90 degrees."""
+    return DaeSystem.from_functions(
+        2,
+        f=lambda x: [x[1], -x[0]],
+        h=lambda x: [x[0], x[1]],
+        l=lambda x: (x[0] ** 2 + x[1] ** 2) / 2,
+        nominal_state=[1.0, 1.0],
+        name="radius",
+    )
+
+
+@pytest.mark.parametrize("small", [-0.1, 0.02])
+def test_combinations_of_states_where_no_single_state_will_do(small):
+    """dz = (x0, x1): x0 completes it where x1 is not 0, x1 where x0 is not, x0 - x1 at both."""
+    states = np.array([[1.0, 1.0], [1.0, small], [small, 1.0]])
+    structure = replace(find_structure(radius()), states=states)
+    normal_form = NormalForm(structure.system, structure=structure)
+    (signal,) = normal_form.completion_signals
+    assert signal.name == "x0 - x1"
+    for x in states:
+        coordinates = normal_form.coordinates(x)
+        np.testing.assert_allclose(coordinates, [x @ x / 2, x[0] - x[1]], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(normal_form.state(coordinates), x, rtol=0, atol=1e-13)
+
+
+def test_a_given_completion():
+    """Angle and angular velocity of the pendulum under z = tension, where d = 2."""
+    system = pendulum_tension().system
+    x, y, vx, vy = ca.vertsplit(system.state)
+    structure = find_structure(system)
+    xi = ca.vertcat(ca.atan2(x, -y), (x * vy - y * vx) / (x**2 + y**2))
+    normal_form = NormalForm(structure.system, xi, structure=structure)
+    assert [s.name for s in normal_form.completion_signals] == ["xi0", "xi1"]
+    angle, rate = 0.7, -0.3
+    state = normal_form.state([0.0, 0.0, angle, rate])
+    s, c = np.sin(angle), np.cos(angle)
+    expected = 0.8 * np.array([s, -c, rate * c, rate * s])
+    np.testing.assert_allclose(state, expected, rtol=0, atol=1e-15)
+    # Given states keep their names.
+    named = NormalForm(structure.system, ca.vertcat(vx, x), structure=structure)
+    assert [s.name for s in named.completion_signals] == ["vx", "x"]
+
+
+@pytest.mark.parametrize(
+    ("completion", "message"),
+    [
+        (lambda x: x[:1], r"column of 2 expressions, n - sum r_i - sum mu_i; got shape \(1, 1\)"),
+        (lambda x: x[:2].T, r"got shape \(1, 2\)"),
+        (lambda x: [x[0], x[1]], "completion must be a CasADi SX expression"),
+        (lambda x: ca.vertcat(x[0], ca.SX.sym("w")), "depends on w, which is neither"),
+        (lambda x: ca.vertcat(x[0], ca.sin(x[2])), r"'xi1' = sin\(heading\) is not independent"),
+        (lambda x: ca.vertcat(x[2], x[1]), "completion 'heading' = heading is not independent"),
+        (lambda x: ca.vertcat(x[1], 1.0), "'xi1' = 1 is not independent"),
+        # Regular at all samples, but on both sides of a zero.
+        (lambda x: ca.vertcat((x[0] + 0.003) ** 2, x[1]), r"'xi0' = .* at x = \[-(0\.00)?3"),
+    ],
+)
+def test_completions_that_do_not_complete_are_refused(completion, message):
+    system = knife_edge().system
+    structure = find_structure(system)
+    with pytest.raises(ModelError, match=message):
+        NormalForm(structure.system, completion(system.state), structure=structure)
+
+
+def test_outputs_that_repeat_each_other_are_refused():
+    system = DaeSystem.from_functions(
+        3,
+        f=lambda x: [0, 0, x[0]],
+        h=lambda x: [[1, 1], [1, 1], [0, 0]],
+        l=lambda x: [x[0], x[1]],
+        name="twins",
+    )
+    structure, violation = examine_structure(system)
+    assert violation is not None
+    with pytest.raises(ModelError, match=r"twins: B\(x\) of \(16\) is singular at x = "):
+        NormalForm(structure.system, structure=structure)
+
+
+def test_the_inverse_stays_on_the_branch_of_its_guess():
+    """The pendulum has two states for each x; full Newton steps would jump between them."""
+    normal_form = form("pendulum")
+    for guess, sign in (([-0.79, -0.126, 0.0, 0.0], -1.0), ([0.3, 0.75, 0.0, 0.0], 1.0)):
+        guess = normal_form.structure.manifold.project(guess)
+        for x in (0.79, -0.7999, 0.1, 0.79999):
+            y = sign * np.sqrt(0.8**2 - x**2)
+            state = normal_form.state([0.0, 0.0, x, 0.5], guess)
+            # The condition is 1 / y.
+            expected = [x, y, 0.5, -x * 0.5 / y]
+            np.testing.assert_allclose(state, expected, rtol=0, atol=1e-14 / y**2 + 1e-13)
+
+
+@pytest.mark.parametrize("seed", [467])
+def test_continuation_arrives_where_newtons_method_alone_does_not(seed):
+    """From one random configuration of the 7-joint arm to another, some 0.5 rad per joint apart."""
+    normal_form, random = form("seven_joint"), np.random.default_rng(seed)
+    manifold, nominal = normal_form.structure.manifold, normal_form.structure.states[0]
+    guess, x = (manifold.project(nominal + 0.5 * random.standard_normal(14)) for _ in range(2))
+    coordinates = normal_form.coordinates(x)
+
+    def linearize(state):
+        inverse = np.linalg.inv(normal_form.jacobian(state))
+        return Linearization(
+            lambda z: inverse @ (coordinates - normal_form.coordinates(z)), is_regular=True
+        )
+
+    assert not newton(guess, linearize)[1]
+    np.testing.assert_allclose(normal_form.state(coordinates, guess), x, rtol=0, atol=1e-12)
+
+
+def test_coordinates_out_of_reach_are_named():
+    normal_form = form("pendulum")
+    with pytest.raises(InconsistentStateError) as info:
+        normal_form.state([0.0, 0.0, 0.9, 0.0])
+    message = str(info.value)
+    assert re.search(r"x can be brought from 0\.4\d+ to 0\.7999\d+, but not to 0\.9;", message)
+    assert r"B(x) of (16) loses its rank (Theorem 2.1)" in message
+    assert info.value.residual[2] == pytest.approx(0.1, abs=1e-4)
+    # Two links of 1 m reach at most sqrt(4 - 1.2^2) = 1.6 m high on the wall.
+    with pytest.raises(InconsistentStateError, match=r"but not to 1\.7; .*Theorem 2\.1"):
+        form("two_link").state([0.0, 0.0, 1.7, 0.0])
+    tension = form("pendulum_tension")
+    with pytest.raises(InconsistentStateError, match="or x, vx does not complete the chains"):
+        tension.state([0.0, 0.0, 0.9, 0.0])
+
+
+def test_parameters_move_the_inverse():
+    system = pendulum().system
+    normal_form = form("pendulum")
+    values = system.parameter_values.copy()
+    values[system.parameter_slice("length")] = 1.0
+    state = normal_form.state([0.0, 0.0, 0.9, 0.0], parameters=values)
+    np.testing.assert_allclose(state, [0.9, -np.sqrt(0.19), 0.0, 0.0], rtol=0, atol=1e-15)
+
+
+def test_wrong_inputs():
+    normal_form = form("pendulum")
+    with pytest.raises(ModelError, match=r"coordinates must be finite and of shape \(4,\)"):
+        normal_form.state([0.0, 0.0, 0.5])
+    with pytest.raises(ModelError, match="coordinates must be finite"):
+        normal_form.state([0.0, 0.0, np.nan, 0.0])
+    with pytest.raises(ModelError, match="a state must be finite"):
+        normal_form.state([0.0, 0.0, 0.5, 0.0], [1.0, 2.0])
+    with pytest.raises(ModelError, match="'state' has size 3"):
+        normal_form.coordinates([0.0, 0.0, 0.5])
+    logarithm = DaeSystem.from_functions(
+        1, f=lambda x: 0, h=lambda x: 1, l=lambda x: ca.log(x), nominal_state=[1.0]
+    )
+    with pytest.raises(ModelError, match="not finite at the guess"):
+        NormalForm(logarithm).state([0.0], [-1.0])
+
+
+def test_what_is_out_of_reach_is_named():
+    """The pendulum's x cannot be 2; its y and their rates stay where they are."""
+    flat = NormalForm(PROBLEMS["pendulum"]().system)
+    message = r": x can be brought from \S+ to 0\.799\S+, but not to 2"
+    with pytest.raises(InconsistentStateError, match=message):
+        flat.state([0.0, 0.0, 2.0, 0.0])
+
+
+def test_something_else_than_a_system_is_refused():
+    with pytest.raises(ModelError, match="NormalForm: system must be a DaeSystem"):
+        NormalForm(3.0)
+
+
+def leaning() -> DaeSystem:
+    """A cart on a rail that a constraint force holds at y = 0, in coordinates that mix them."""
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+
+    def height(x: ca.SX) -> ca.SX:
+        return ca.sinh(3 * x[0]) + 0.3 * ca.sin(x[0]) * x[1]
+
+    return DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], -x[0] - 0.2 * x[2], -x[1]],
+        g=lambda x: [0, 0, *turn[:, 0]],
+        h=lambda x: [0, 0, *turn[:, 1]],
+        k=height,
+        l=lambda x: [ca.sin(x[1])],
+        m=lambda x: [0],
+        nominal_state=[0.02, 0.4, 0.0, 0.1],
+        name="leaning",
+    )
+
+
+def test_the_inverse_where_a_state_is_round_off_on_the_manifold():
+    """On N* x0 = x2 = 0, so that Newton's method leaves them at 1e-20 or so; off N* they are 0.5.
+
+    Phi is regular there: y = k, y' = L_f k, zeta = (sin x1, x3 cos x1).
+    """
+    normal_form = NormalForm(leaning())
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        state = random.uniform([-0.5, -0.8, -0.5, -0.5], [0.5, 0.8, 0.5, 0.5])
+        assert np.linalg.cond(normal_form.jacobian(state)) < 100.0
+        found = normal_form.state(normal_form.coordinates(state))
+        # Round-off of Phi, times the condition of its Jacobian.
+        np.testing.assert_allclose(found, state, rtol=0, atol=1e-13)

@@ -1,0 +1,423 @@
+import math
+from dataclasses import FrozenInstanceError, replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import double_integrator
+
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
+
+
+def evaluated(system: DaeSystem, key: str, state: np.ndarray) -> np.ndarray:
+    function = ca.Function(
+        "value", [system.state, system.parameter_symbol], [ca.densify(getattr(system, key))]
+    )
+    return np.array(function(state, system.parameter_values))
+
+
+def constrained(**changes) -> DaeSystem:
+    """n = 4, m = 1, p = 2: a point on a line, with its force and its place along it."""
+    fields = {
+        "f": lambda x: [x[2], x[3], 0, 0],
+        "g": lambda x: [0, 0, 1, 0],
+        "h": lambda x: [[0, 0], [0, 0], [1, 0], [0, 1]],
+        "k": lambda x: x[0],
+        "l": lambda x: [0, x[1]],
+        "m": lambda x: [1, 0],
+    }
+    return DaeSystem.from_functions(4, **{**fields, **changes})
+
+
+def test_dimensions_and_made_up_names():
+    system = constrained()
+    assert (system.num_states, system.num_constraints, system.num_controls) == (4, 1, 2)
+    shapes = {key: getattr(system, key).shape for key in "fghklm"}
+    assert shapes == {"f": (4, 1), "g": (4, 1), "h": (4, 2), "k": (1, 1), "l": (2, 1), "m": (2, 1)}
+    assert [s.name for s in system.state_signals] == ["x0", "x1", "x2", "x3"]
+    assert [s.name for s in system.constraint_input_signals] == ["v0"]
+    assert [s.name for s in system.constraint_output_signals] == ["y0"]
+    assert [s.name for s in system.control_signals] == ["u0", "u1"]
+    assert [s.name for s in system.output_signals] == ["z0", "z1"]
+    np.testing.assert_array_equal(system.nominal_state, np.zeros(4))
+
+
+def test_without_constraints_g_k_and_m_are_empty():
+    system = double_integrator()
+    assert (system.g.shape, system.k.shape, system.m.shape) == ((2, 0), (0, 1), (1, 0))
+    assert system.constraint_input_signals == system.constraint_output_signals == ()
+
+
+@pytest.mark.parametrize(
+    "drift",
+    [
+        lambda x: ca.vertcat(x[1], -2 * x[0]),
+        lambda x: [x[1], -2 * x[0]],
+        lambda x: (x[1], -2 * x[0]),
+        lambda x: [[x[1]], [-2 * x[0]]],
+        lambda x: np.array([x[1], -2 * x[0]]),
+        lambda x: np.array([[x[1]], [-2 * x[0]]]),
+        lambda x: np.array([[0.0, 1.0], [-2.0, 0.0]]) @ x,
+        lambda x: ca.horzcat(x[1], -2 * x[0]),
+    ],
+)
+def test_an_expression_may_be_written_in_any_way(drift):
+    value = evaluated(double_integrator(f=drift), "f", np.array([3.0, 5.0]))
+    np.testing.assert_array_equal(value, [[5.0], [-6.0]])
+
+
+@pytest.mark.parametrize(
+    "control",
+    [[0, 1], [[0], [1]], [[0, 1]], np.array([0, 1]), np.array([[0.0], [1.0]]), ca.DM([0, 1])],
+)
+def test_constants_may_stand_for_expressions(control):
+    value = evaluated(double_integrator(h=lambda x: control), "h", np.zeros(2))
+    np.testing.assert_array_equal(value, [[0.0], [1.0]])
+
+
+def test_zeros_of_arrays_are_structural():
+    x = ca.SX.sym("x", 2)
+    system = DaeSystem(state=x, f=x, g=[], h=np.eye(2), k=[], l=[x[0], 0], m=[])
+    assert system.h.nnz() == 2
+    assert system.l.nnz() == 1
+
+
+def test_expressions_and_functions_make_the_same_system():
+    x, stiffness = ca.SX.sym("x", 2), Parameter("stiffness", 3.0, "N/m")
+    by_expressions = DaeSystem(
+        state=x,
+        f=ca.vertcat(x[1], -stiffness.symbol * x[0]),
+        g=[],
+        h=[0, 1],
+        k=[],
+        l=x[0],
+        m=[],
+        parameters=(stiffness,),
+    )
+    by_functions = double_integrator(
+        f=lambda x, p: [x[1], -p.stiffness * x[0]],
+        h=lambda x, p: [0, 1],
+        l=lambda x, p: x[0],
+        parameters={"stiffness": 3.0},
+    )
+    state = np.array([0.5, -2.0])
+    for key in "fghklm":
+        np.testing.assert_array_equal(
+            evaluated(by_expressions, key, state), evaluated(by_functions, key, state)
+        )
+
+
+def test_parameters_are_found_by_name():
+    system = double_integrator(
+        f=lambda x, p: [x[1], p.a + p.b[1]],
+        h=lambda x, p: [0, 1],
+        l=lambda x, p: x[0],
+        parameters={"a": 2.0, "b": [3.0, 4.0], "c": np.float32(5)},
+    )
+    np.testing.assert_array_equal(system.parameter_values, [2.0, 3.0, 4.0, 5.0])
+    assert [system.parameter_slice(name) for name in "abc"] == [
+        slice(0, 1),
+        slice(1, 3),
+        slice(3, 4),
+    ]
+    assert evaluated(system, "f", np.zeros(2))[1, 0] == 6.0
+    with pytest.raises(ModelError, match=r"no parameter 'mass'; there are a, b, c"):
+        system.parameter_slice("mass")
+    with pytest.raises(ModelError, match="there are none"):
+        double_integrator().parameter_slice("mass")
+
+
+def test_names_and_signals_label_the_vectors():
+    system = DaeSystem.from_functions(
+        [Signal("q", "rad"), "qd"],
+        f=lambda x: [x[1], 0],
+        h=lambda x: [0, 1],
+        l=lambda x: x[0],
+        output_signals=["angle"],
+        control_signals=[Signal("torque", "N m")],
+    )
+    assert system.state_signals == (Signal("q", "rad"), Signal("qd"))
+    assert system.output_signals == (Signal("angle"),)
+    assert system.control_signals == (Signal("torque", "N m"),)
+
+
+def test_derivatives_of_signals_carry_their_units():
+    angle = Signal("q", "rad")
+    assert angle.derivative(0) == angle
+    assert angle.derivative(1) == Signal("q'", "rad/s")
+    assert angle.derivative(3) == Signal("q'''", "rad/s^3")
+    assert Signal("gain").derivative(2).unit == "1/s^2"
+    assert signals(["a", "b"], "m") == (Signal("a", "m"), Signal("b", "m"))
+
+
+def test_a_system_cannot_be_changed():
+    nominal = np.array([1.0, 2.0])
+    system = double_integrator(nominal_state=nominal)
+    nominal[0] = 9.0
+    assert system.nominal_state[0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        system.nominal_state[0] = 3.0
+    with pytest.raises(FrozenInstanceError):
+        system.f = system.state
+    parameter = Parameter("mass", [1.0])
+    with pytest.raises(ValueError, match="read-only"):
+        parameter.value[0] = 2.0
+
+
+WRONG_SHAPES = {
+    "f": (lambda x: [x[1], 0, 0], r"f has shape \(3, 1\), expected \(2, 1\)"),
+    "g": (lambda x: [[1, 0], [0, 1]], r"g has shape \(2, 2\), expected \(2, 0\)"),
+    "h": (lambda x: [0, 1, 0], r"h has shape \(3, 1\), expected \(2, 1\)"),
+    "k": (lambda x: x[0], "k is given, so g and m are needed; g is missing, with shape .2, 1"),
+    "l": (lambda x: [[x[0], x[1]], [x[1], x[0]]], r"l has shape \(2, 2\), expected \(4, 1\)"),
+    "m": (lambda x: [1, 2], r"m has shape \(2, 1\), expected \(1, 0\)"),
+}
+
+
+@pytest.mark.parametrize("key", WRONG_SHAPES)
+def test_wrong_shapes_are_refused_by_name(key):
+    function, message = WRONG_SHAPES[key]
+    with pytest.raises(ModelError, match=f"double integrator: .*{message}"):
+        double_integrator(**{key: function})
+
+
+def test_only_g_beside_k_is_refused():
+    message = r"k is given, so g and m are needed; m is missing, with shape \(1, 1\)"
+    with pytest.raises(ModelError, match=message):
+        double_integrator(k=lambda x: x[0], g=lambda x: [0, 1])
+    with pytest.raises(ModelError, match=r"k has shape \(2, 2\), expected \(4, 1\)|g has shape"):
+        constrained(k=lambda x: [[x[0], 1], [x[1], 1]])
+
+
+@pytest.mark.parametrize("state", [None, 2.0, "xv", [3], [], 0, -1])
+def test_states_that_are_none_are_refused(state):
+    fields = {"f": lambda x: x, "h": lambda x: x, "l": lambda x: x}
+    with pytest.raises(ModelError, match=r"state.* must be a |at least one state"):
+        DaeSystem.from_functions(state, **fields)
+
+
+def test_labels_that_are_none_are_refused():
+    with pytest.raises(ModelError, match=r"no field 'nominal'; did you mean 'nominal_state'\?"):
+        double_integrator(nominal=[0, 0])
+    with pytest.raises(ModelError, match=r"no field 'state_signals'"):
+        double_integrator(state_signals=["a", "b"])
+    with pytest.raises(ModelError, match="name of a system must be text, got None"):
+        double_integrator(name=None)
+    for signals_given in ([3], "z"):
+        with pytest.raises(ModelError, match="output_signals must be a list of names or Signals"):
+            double_integrator(output_signals=signals_given)
+
+
+def test_a_parameter_that_is_not_there():
+    with pytest.raises(ModelError, match=r"function f failed.*no parameter 'kk'; there are a, k$"):
+        double_integrator(f=lambda x, p: [x[1], -p.kk], parameters={"a": 1.0, "k": 1.0})
+
+
+def test_a_system_is_one_line_at_the_prompt():
+    assert repr(constrained(name="slider")) == "DaeSystem('slider', n=4, m=1, p=2)"
+
+
+def test_what_has_a_system_is_no_system():
+    system = double_integrator()
+    with pytest.raises(ModelError, match=r"find_structure: system must be a DaeSystem, got None$"):
+        find_structure(None)
+    for name in ("dae", "system"):
+        with pytest.raises(ModelError, match=rf"must be a DaeSystem, got .*; pass its \.{name}$"):
+            find_structure(SimpleNamespace(**{name: system}))
+
+
+def test_m_has_a_row_for_each_output():
+    with pytest.raises(ModelError, match=r"m has shape \(1, 1\), expected \(2, 1\).* 2 controlled"):
+        constrained(l=lambda x: [x[1], x[0]], m=lambda x: 0)
+
+
+BAD_VALUES = {
+    "an MX": (lambda x: ca.MX.sym("a", 2), "casadi.* MX|CasADi MX"),
+    "a list of MX": (lambda x: [ca.MX.sym("a"), 0], "f must be a CasADi SX expression"),
+    "NaN": (lambda x: [x[1], np.nan], r"f, .* holds a constant that is not finite, nan; math.sin"),
+    "infinity": (lambda x: [x[1], ca.inf], r"f, .* holds a constant that is not finite, inf$"),
+    "NaN in a product": (
+        lambda x: [x[1], np.nan * x[0] + 1],
+        r"f, entry \[1, 0\] of shape \(2, 1\), holds a constant that is not finite, nan",
+    ),
+    "text": (lambda x: "x1", "f must be a CasADi SX expression.* got str"),
+    "nothing": (lambda x: None, "function f returned nothing"),
+    "rows of two lengths": (lambda x: [[1, 2], [3]], "lists of one length"),
+    "an unknown symbol": (lambda x: [x[1], ca.SX.sym("mass")], "f depends on mass, which is nei"),
+    "a failing function": (lambda x: [x[1], x[7]], "function f failed on a CasADi column of 2"),
+    "a wrong signature": (
+        lambda x, p: [x[1], 0],
+        r"missing 1 required positional argument: 'p'. It is called with the state x alone",
+    ),
+    "a place that is not there": (lambda x: [x[5], 0], "out of bounds with supplied length of 2$"),
+    "no function": ([1, 2], r"f must be a function, got"),
+    "a condition": (lambda x: [x[1], 1 if x[0] > 0 else 2], "Conditions are not smooth"),
+    "Python's max": (lambda x: [x[1], max(x[0], 0)], "Conditions are not smooth"),
+    "a function of others": (
+        lambda x: [x[1], ca.sin("x")],
+        r"(?s)function f failed.*Use CasADi's own functions",
+    ),
+    "a function of the real number": (
+        lambda x: [x[1], math.sin(x[0])],
+        r"f, entry \[1, 0\] .* nan; math.sin of a symbol is nan, use casadi.sin",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD_VALUES)
+def test_bad_expressions_are_refused(what):
+    drift, message = BAD_VALUES[what]
+    with pytest.raises(ModelError, match=message):
+        double_integrator(f=drift)
+
+
+@pytest.mark.parametrize("key", "fghklm")
+def test_constants_that_are_not_finite_are_named_with_function_and_shape(key):
+    base = constrained()
+    expression = ca.SX(getattr(base, key))
+    row, column = expression.shape[0] - 1, expression.shape[1] - 1
+    expression[row, column] = ca.inf * base.state[0]
+    rows, columns = expression.shape
+    with pytest.raises(ModelError) as caught:
+        replace(base, **{key: expression})
+    assert str(caught.value) == (
+        f"system: {key}, entry [{row}, {column}] of shape ({rows}, {columns}), holds a constant "
+        "that is not finite, inf"
+    )
+
+
+NOT_SMOOTH = {
+    "fabs": lambda x: ca.fabs(x),
+    "sign": lambda x: x * ca.sign(x),
+    "fmin": lambda x: ca.fmin(x, 1),
+    "fmax": lambda x: ca.fmax(x, 0) ** 2,
+    "floor": lambda x: ca.floor(x),
+    "ceil": lambda x: ca.ceil(x),
+    "fmod": lambda x: ca.fmod(x, 2),
+    "if_else": lambda x: ca.if_else(x, x, 2.0),
+    "a comparison": lambda x: (x > 0) * x,
+    "copysign": lambda x: ca.copysign(1, x),
+    "remainder": lambda x: ca.remainder(x, 2),
+}
+
+
+@pytest.mark.parametrize("key", "fghklm")
+@pytest.mark.parametrize("what", NOT_SMOOTH)
+def test_functions_that_are_not_smooth_are_refused(key, what):
+    """In any function, in any entry, and inside others."""
+    base = constrained()
+    expression = ca.SX(getattr(base, key))
+    expression[-1] += ca.sin(NOT_SMOOTH[what](base.state[2] + 1) + 3)
+    with pytest.raises(ModelError) as caught:
+        replace(base, **{key: expression})
+    shape = getattr(base, key).shape
+    assert str(caught.value).startswith(
+        f"system: {key}, entry [{shape[0] - 1}, {shape[1] - 1}] of shape {shape}, is not smooth: "
+        f"it takes {what} of the state. "
+    )
+
+
+def test_kinks_in_parameters_alone_are_no_kinks():
+    system = double_integrator(
+        f=lambda x, p: [x[1], -ca.fabs(p.a) * x[0] + ca.if_else(p.a > 0, 1, 2)],
+        h=lambda x, p: [0, 1],
+        l=lambda x, p: x[0],
+        parameters={"a": -3.0},
+    )
+    np.testing.assert_array_equal(evaluated(system, "f", np.array([1.0, 0.0])), [[0.0], [-1.0]])
+
+
+def test_smooth_functions_are_taken():
+    """All that CasADi has; roots and arcs are smooth inside their domain."""
+    smooth = [
+        *(ca.sin, ca.cos, ca.tan, ca.exp, ca.log, ca.sqrt, ca.asin, ca.acos, ca.atan),
+        *(ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.acosh, ca.atanh, ca.erf),
+        *(lambda x: ca.atan2(x, 2), lambda x: x**3, lambda x: x**-1.5, lambda x: ca.hypot(x, 1)),
+    ]
+    for function in smooth:
+        double_integrator(f=lambda x, function=function: [x[1], function(x[0])])
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "state_signals",
+        "constraint_input_signals",
+        "constraint_output_signals",
+        "control_signals",
+        "output_signals",
+    ],
+)
+def test_labels_must_fit_and_be_unique(key):
+    base = constrained()
+    fields = {name: getattr(base, name) for name in ("state", *"fghklm")}
+    count = len(getattr(base, key))
+    with pytest.raises(ModelError, match=f"{key} has {count + 1} entries, expected {count}"):
+        DaeSystem(**fields, **{key: signals([f"a{i}" for i in range(count + 1)])})
+    if count > 1:
+        with pytest.raises(ModelError, match=f"{key} names must be unique, twice: same"):
+            DaeSystem(**fields, **{key: signals(["same"] * count)})
+
+
+def test_states_must_be_a_column_of_different_symbols():
+    x = ca.SX.sym("x")
+    rest = {"g": [], "h": 1, "k": [], "l": x, "m": []}
+    for state in (x**2, ca.MX.sym("x"), np.zeros(1), ca.SX(0, 1)):
+        with pytest.raises(ModelError, match="'state' must be a CasADi SX column of symbols"):
+            DaeSystem(state=state, f=x, **rest)
+    with pytest.raises(ModelError, match="stands twice"):
+        DaeSystem(state=ca.vertcat(x, x), f=[x, x], **{**rest, "h": [0, 1]})
+    with pytest.raises(ModelError, match="stands twice"):
+        DaeSystem(state=x, f=x, parameters=(Parameter("x", 1.0, symbol=x),), **rest)
+    with pytest.raises(ModelError, match="state_signals names must be unique, twice: q"):
+        DaeSystem.from_functions(["q", "q"], f=lambda x: x, h=lambda x: x, l=lambda x: x[0])
+
+
+@pytest.mark.parametrize(
+    ("nominal", "message"),
+    [
+        ([1.0, 2.0, 3.0], r"finite and of shape \(2,\)"),
+        ([[1.0, 2.0]], r"finite and of shape \(2,\)"),
+        (0.0, r"finite and of shape \(2,\)"),
+        ([1.0, np.nan], r"finite and of shape \(2,\)"),
+        (np.array([1.0, 2.0j]), "nominal_state must be real numbers"),
+        ("up", "nominal_state must be real numbers, got 'up'"),
+    ],
+)
+def test_bad_nominal_states_are_refused(nominal, message):
+    with pytest.raises(ModelError, match=message):
+        double_integrator(nominal_state=nominal)
+
+
+def test_bad_parameters_are_refused():
+    for value in (np.nan, [1.0, np.inf], [[1.0]]):
+        with pytest.raises(ModelError, match="'mass' must be finite and one-dimensional"):
+            Parameter("mass", value)
+    with pytest.raises(ModelError, match="must be numbers, got 'heavy'"):
+        Parameter("mass", "heavy")
+    for symbol in (
+        ca.SX.sym("m", 3),
+        ca.SX.sym("m", 2).T,
+        ca.SX.sym("m", 2) ** 2,
+        ca.MX.sym("m", 2),
+    ):
+        with pytest.raises(ModelError, match=r"symbol .*must be a CasADi SX"):
+            Parameter("mass", [1.0, 2.0], symbol=symbol)
+    with pytest.raises(ModelError, match=r"must be Python identifiers.*link1\.mass"):
+        double_integrator(parameters={"link1.mass": 1.0})
+    x = ca.SX.sym("x")
+    with pytest.raises(ModelError, match="parameter names must be unique, twice: a"):
+        DaeSystem(
+            state=x,
+            f=x,
+            g=[],
+            h=1,
+            k=[],
+            l=x,
+            m=[],
+            parameters=(Parameter("a", 1.0), Parameter("a", 2.0)),
+        )

@@ -1,0 +1,129 @@
+"""No verdict depends on units: each problem in twenty-four systems of units has one answer.
+
+The natural sizes of the states, which all of this stands on, are held against sizes that follow by
+hand: those of a pendulum, a spring that hardens, a tank.
+"""
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import PROBLEMS, in_other_units
+from runs import some
+
+from drake_dae.analysis.analyze import analyze
+from drake_dae.dae.structure.redundancy import drop_constraints
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
+
+# From nanometres to giga-units, all states alike or each in a unit of its own.
+ALIKE = (-9.0, -6.0, -3.0, -1.0, 1.0, 3.0, 6.0, 9.0)
+OWN = 16
+
+
+def answer(system: DaeSystem) -> tuple[dict, np.ndarray]:
+    """What `analyze` finds, without numbers that have units, and eigenvalues in 1/s."""
+    found = analyze(system, count=8).to_dict()
+    dynamics = found["zero_dynamics"]
+    verdicts = {
+        "degrees": (found["constraint_degrees"], found["output_degrees"], found["output_order"]),
+        "dimensions": (found["manifold_dimension"], found["zero_dynamics_dimension"]),
+        "examined": found["examined_at"],
+        "assumptions": [(a["number"], a["finding"]) for a in found["assumptions"]],
+        "problems": len(found["problems"]),
+        "stability": dynamics and dynamics["verdict"],
+    }
+    return verdicts, np.array(dynamics["eigenvalues"] if dynamics else [])
+
+
+def other_units(system: DaeSystem):
+    """The system in twenty-four systems of units; inputs and equations by up to 1000."""
+    random = np.random.default_rng(1)
+    counts = (
+        system.num_constraints,
+        system.num_controls,
+        system.num_constraints,
+        system.num_outputs,
+    )
+    for exponent in (*ALIKE, *[None] * OWN):
+        own = random.uniform(-9.0, 9.0, system.num_states)
+        states = 10.0 ** (own if exponent is None else np.full(own.size, exponent))
+        yield (
+            states,
+            in_other_units(
+                system, states, *(10.0 ** random.uniform(-3.0, 3.0, count) for count in counts)
+            ),
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", some(PROBLEMS))
+def test_twenty_four_systems_of_units_have_one_answer(name):
+    system = PROBLEMS[name]().system
+    expected, known = answer(system)
+    for _, other in other_units(system):
+        found, values = answer(other)
+        assert found == expected
+        # The held outputs are those at a nominal state that sizes, known to 1e-6, helped to find.
+        np.testing.assert_allclose(values, known, rtol=1e-5, atol=1e-7)
+
+
+# What the equations leave open: the amplitude of a linear system, a place on the floor.
+FREE = ("circuit", "linear", "cart", "rolling_disk", "scalar")
+
+
+@pytest.mark.parametrize("name", sorted(set(PROBLEMS) - set(FREE)))
+def test_sizes_change_as_units_do(name):
+    system = PROBLEMS[name]().system
+    for states, other in other_units(system):
+        # The fit is repeated until its logarithms move by less than 1e-8, with a rate below 0.99.
+        np.testing.assert_allclose(other.scale * states, system.scale, rtol=1e-6)
+
+
+def test_sizes_by_hand():
+    """Half of where two terms of an equation meet: sin(q) and its cube, k x and k x^3 / a^2."""
+    pendulum = DaeSystem.from_functions(
+        2, f=lambda x: [x[1], -9.0 * ca.sin(x[0])], h=lambda x: [0, 1], l=lambda x: x[0]
+    )
+    # x' = v and v' = -9 sin x, so v ~ 3 x; x ~ x^3 / 6 at sqrt(6). The input and the output say
+    # nothing. Equal terms in each equation: nothing is left to a compromise.
+    np.testing.assert_allclose(2.0 * pendulum.scale, [np.sqrt(6.0), 3.0 * np.sqrt(6.0)], rtol=1e-3)
+    spring = DaeSystem.from_functions(
+        2, f=lambda x: [x[1], -(x[0] + x[0] ** 3 / 0.02**2)], h=lambda x: [0, 1], l=lambda x: x[0]
+    )
+    np.testing.assert_allclose(2.0 * spring.scale, [0.02, 0.02], rtol=1e-3)
+
+
+def test_a_scale_that_is_given_is_taken():
+    system = DaeSystem.from_functions(
+        2, f=lambda x: [x[1], 0], h=lambda x: [0, 1], l=lambda x: x[0], state_scale=[2.0, 5.0]
+    )
+    np.testing.assert_array_equal(system.scale, [2.0, 5.0])
+    np.testing.assert_array_equal(system.explicit.scale, [2.0, 5.0])
+    np.testing.assert_array_equal(system.nominal_spread, [0.2, 0.5])
+
+
+@pytest.mark.parametrize("scale", [[1.0], [1.0, 0.0], [1.0, -2.0], [1.0, np.nan], "one"])
+def test_a_scale_that_is_none_is_refused(scale):
+    with pytest.raises(ModelError, match="system: state_scale"):
+        DaeSystem.from_functions(
+            2, f=lambda x: x, h=lambda x: [0, 1], l=lambda x: x[0], state_scale=scale
+        )
+
+
+def test_redundant_constraints_are_left_out_in_any_units():
+    """A bead on a wire that two equal rods hold: one follows from the other, whatever the units."""
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], 0, -9.81],
+        g=lambda x: [[0, 0], [0, 0], [x[0], 3 * x[0]], [x[1], 3 * x[1]]],
+        h=lambda x: [0, 0, 1, 0],
+        k=lambda x: [x[0] ** 2 + x[1] ** 2 - 1, 3 * (x[0] ** 2 + x[1] ** 2 - 1)],
+        l=lambda x: x[0],
+        m=lambda x: [[0, 0]],
+        nominal_state=[0.6, -0.8, 0.0, 0.0],
+    )
+    for _, other in other_units(system):
+        kept = drop_constraints(other)
+        assert kept.num_constraints == 1
+        assert find_structure(kept).constraint_degrees == (2,)

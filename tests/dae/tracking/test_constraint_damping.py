@@ -1,0 +1,303 @@
+"""Damping of the constraint by the law, on contacts that give way, against closed forms.
+
+The plant of each test is x' = f + g F + h u with F = -k phi in place of the constraint; it is
+integrated by SciPy.
+"""
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+from arms import arm, touching
+from numpy.testing import assert_allclose
+
+from drake_dae import (
+    ConstantReference,
+    DaeSystem,
+    DcMotors,
+    FlexibleJoints,
+    SinusoidReference,
+    TrackingLaw,
+    build_scenario,
+    contact_damping,
+    find_structure,
+    load_scenario,
+    poles,
+    simulate,
+)
+from drake_dae.dae.references import stack_references
+from drake_dae.errors import GainError, ModelError, ScenarioError
+from drake_dae.scenario.shipped import find_scenario
+
+STIFFNESS, MASS = 1e4, 2.0
+
+
+def block():
+    """A mass above a floor: x' along it and z across, moved by a force along each."""
+    return DaeSystem.from_functions(
+        ["x", "z", "vx", "vz"],
+        f=lambda s: [s[2], s[3], 0.0, -9.81],
+        g=lambda s: [0.0, 0.0, 0.0, 1.0 / MASS],
+        h=lambda s: [[0.0, 0.0], [0.0, 0.0], [1.0 / MASS, 0.0], [0.0, 1.0 / MASS]],
+        k=lambda s: s[1],
+        l=lambda s: [s[0], 0.0],
+        m=lambda s: [0.0, 1.0],
+        name="block",
+    )
+
+
+def press(law, references, stiffness, start, times, order=0):
+    """phi and F = -k phi^(order) of a plant that gives way, shape (len(times), 2)."""
+    system = law.system
+    reference = stack_references(references, law.degrees)
+    residual, place = law.structure.manifold, order
+
+    def rate(t, x):
+        values = dict(zip(system.fields.output_names, system.fields(x, p), strict=True))
+        force = -stiffness * residual.residual(x)[place]
+        g, h = (values[key].reshape(x.size, -1) for key in "gh")
+        return values["f"] + g @ [force] + h @ law.control(x, reference(t))
+
+    p = system.parameter_values
+    found = scipy.integrate.solve_ivp(
+        rate, times[[0, -1]], start, "DOP853", t_eval=times, rtol=1e-9, atol=1e-11
+    )
+    assert found.success
+    phi = np.array([residual.residual(x)[0] for x in found.y.T])
+    return np.column_stack([phi, -stiffness * phi]), found.y.T
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 1.0, 3.0])
+def test_a_contact_that_gives_way_is_damped_as_chosen(share):
+    """phi'' + c phi' + A k phi = -A lambda_d from phi = phi' = 0, for c of several times 2 w.
+
+    In closed form by the exponential of a matrix; the integrator leaves 1e-6 of 20 N.
+    """
+    frequency = np.sqrt(STIFFNESS / MASS)
+    c = share * contact_damping(STIFFNESS, 1.0 / MASS)
+    assert contact_damping(STIFFNESS, 1.0 / MASS) == pytest.approx(2.0 * frequency)
+    law = TrackingLaw(block(), poles(-8.0), constraint_damping=poles(-c) if c else None)
+    times = np.linspace(0.0, 0.2, 101)
+    wanted = [ConstantReference(0.0), ConstantReference(20.0)]
+    (found, _) = press(law, wanted, STIFFNESS, np.zeros(4), times)
+    swing = np.array([[0.0, 1.0], [-(frequency**2), -c]])
+    rest = np.array([-20.0 / STIFFNESS, 0.0])
+    expected = [rest - scipy.linalg.expm(swing * t) @ rest for t in times]
+    assert_allclose(found[:, 1], -STIFFNESS * np.array(expected)[:, 0], atol=2e-5)
+    if share:
+        assert abs(found[-1, 1] - 20.0) < 20.0 * np.exp(
+            -0.2 * frequency * min(share, 1 / share) / 2
+        )
+
+
+def test_a_force_that_changes_is_followed_with_the_error_derived():
+    """F - lambda_d = -(F'' + c F') / (A k), of amplitude c w 5 / (A k) but for w^2 / (A k)."""
+    c, speed = 2.0 * np.sqrt(STIFFNESS / MASS), 3.0
+    law = TrackingLaw(block(), poles(-8.0), constraint_damping=poles(-c))
+    times = np.linspace(0.0, 3.0, 601)
+    wanted = [ConstantReference(0.0), SinusoidReference(20.0, 5.0, speed)]
+    found, _ = press(law, wanted, STIFFNESS, np.zeros(4), times)
+    late = times > 0.5
+    error = (found[:, 1] - 20.0 - 5.0 * np.sin(speed * times))[late]
+    about = -c * 5.0 * speed * np.cos(speed * times[late]) / (STIFFNESS / MASS)
+    assert np.abs(about).max() == pytest.approx(0.42, abs=0.01)
+    assert np.abs(error - about).max() < 0.08 * np.abs(about).max()
+    # Exactly, once the start is forgotten: the same as a transfer function.
+    gain = (STIFFNESS / MASS) / (STIFFNESS / MASS + 1j * speed * c - speed**2) - 1.0
+    exact = 5.0 * np.imag(gain * np.exp(1j * speed * times[late]))
+    assert_allclose(error, exact, atol=2e-5)
+
+
+def test_an_arm_presses_on_a_wall_that_gives_way():
+    """F = lambda (1 - (1 + w t) e^(-w t)) with damping, and a swing of 20 N without.
+
+    A changes by a percent as the arm holds its place.
+    """
+    model, structure = arm("two_link").model, arm("two_link").structure
+    q = model.configuration([0.3], [1.2, -1.6])
+    state = np.concatenate([q, [0.0, 0.0]])
+    A = structure.constraint_matrix(state)[0, 0]
+    frequency, c = np.sqrt(A * STIFFNESS), contact_damping(STIFFNESS, A)
+    times = np.linspace(0.0, 12.0 / frequency, 61)
+    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    known = {"structure": structure}
+    law = TrackingLaw(model.dae, poles(-8.0), constraint_damping=poles(-c), **known)
+    damped, _ = press(law, wanted, STIFFNESS, state, times)
+    closed = 20.0 * (1.0 - (1.0 + frequency * times) * np.exp(-frequency * times))
+    assert_allclose(damped[:, 1], closed, atol=0.2)
+    ideal, _ = press(TrackingLaw(model.dae, poles(-8.0), **known), wanted, STIFFNESS, state, times)
+    assert ideal[:, 1].max() > 38.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stage", "degree"),
+    [(DcMotors(0.5, 0.01, 1.0, 100.0), 1), (FlexibleJoints(8000.0, inertia=1.0), 2)],
+)
+@pytest.mark.parametrize("ratio", [3.0, 5.0])
+def test_behind_motors_and_springs_a_fast_force_damps_it_too(stage, degree, ratio):
+    """From 20 N off rest, with poles of the force at -3 w or -5 w and c = w, it comes to rest.
+
+    Behind motors phi'' = -w^2 phi - a, a' = -p (a - A lambda_d - c phi'), in closed form; the arm
+    moves a little. Springs have frequencies of their own near w, so that the end is looked at.
+    """
+    model = touching("two_link", [stage])
+    structure = find_structure(model.dae)
+    assert structure.output_degrees == (degree + 2, degree)
+    q = model.configuration([0.3], [1.2, -1.6])
+    state = model.rest_state(q, [20.0])
+    A = structure.constraint_matrix(state)[0, 0]
+    w = np.sqrt(A * STIFFNESS)
+    gains, times = poles({"wall.force": -ratio * w, "*": -8.0}), np.linspace(0.0, 15.0 / w, 76)
+    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    forces = []
+    for damping in (poles(-w), None):
+        law = TrackingLaw(model.dae, gains, structure=structure, constraint_damping=damping)
+        found, _ = press(law, wanted, STIFFNESS, state, times)
+        forces.append(found[:, 1])
+    assert abs(forces[0][-1] - 20.0) < 1.0
+    assert np.abs(forces[1][-20:] - 20.0).max() > 5.0
+    if degree == 1:
+        p = ratio * w
+        swing = np.array([[0.0, 1.0, 0.0], [-(w**2), 0.0, -1.0], [0.0, p * w, -p]])
+        start = np.array([20.0 / STIFFNESS, 0.0, 0.0])
+        off = [STIFFNESS * (scipy.linalg.expm(swing * t) @ start)[0] for t in times]
+        assert_allclose(forces[0], 20.0 - np.array(off), atol=0.5)
+
+
+def third_order():
+    """y''' = v + u_1 for the constraint y = x0, r = 3; x3 is steered by u_2."""
+    return DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[1], x[2], -x[3] * x[0], ca.sin(x[3])],
+        g=lambda x: [0.0, 0.0, 2.0, 0.0],
+        h=lambda x: [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+        k=lambda x: x[0],
+        l=lambda x: [x[3], 0.0],
+        m=lambda x: [0.0, 1.0],
+        name="third",
+    )
+
+
+def test_a_constraint_of_degree_three_takes_two_poles():
+    """y''' + 7 y'' + 12 y' = A (F - lambda_d), whatever F is: here a function of y, by hand."""
+    law = TrackingLaw(third_order(), poles(-2.0), constraint_damping=poles([-3.0, -4.0]))
+    assert law.structure.constraint_degrees == (3,)
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        x, force = random.standard_normal(4), random.standard_normal()
+        u = law.control(x, [0.4, 0.0, 5.0])
+        third = -x[3] * x[0] + 2.0 * force + u[0]
+        assert third + 7.0 * x[2] + 12.0 * x[1] == pytest.approx(2.0 * (force - 5.0), abs=1e-12)
+        assert np.sin(x[3]) + u[1] == pytest.approx(-2.0 * (x[3] - 0.4), abs=1e-12)
+
+
+def test_each_constraint_has_poles_of_its_own_and_bad_ones_are_refused():
+    system = arm("two_link").model.dae
+    known = {"structure": arm("two_link").structure}
+    TrackingLaw(system, poles(-4.0), constraint_damping=poles({"wall.distance": -50.0}), **known)
+    with pytest.raises(GainError, match=r"unknown outputs: tool\.z"):
+        TrackingLaw(system, poles(-4.0), constraint_damping=poles({"tool.z": -50.0}), **known)
+    with pytest.raises(GainError, match="not Hurwitz"):
+        TrackingLaw(system, poles(-4.0), constraint_damping=poles(50.0), **known)
+    gains = TrackingLaw(system, poles(-4.0), **known).gains
+    with pytest.raises(GainError, match=r"r_i - 1 = \(1,\) poles each"):
+        TrackingLaw(system, poles(-4.0), constraint_damping=gains, **known)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two_link_wall",
+        pytest.param("seven_joint_wall", marks=pytest.mark.slow),
+        pytest.param("two_link_flexible", marks=pytest.mark.slow),
+        pytest.param("two_link_hydraulics", marks=pytest.mark.slow),
+        pytest.param("seven_joint_moving_plate", marks=pytest.mark.slow),
+        pytest.param("cart_wall", marks=pytest.mark.slow),
+    ],
+)
+def test_on_an_ideal_plant_nothing_changes_but_round_off(name):
+    """The plant stays on N* to 1e-15 at each step, which c = 100 / s makes 1e-12 of what it gets.
+
+    Inside of a step the stages leave N* by the integrator's error. So steps are short.
+    """
+    records = []
+    for settings in ([], ["constraint_damping={all: [-100.0]}"]):
+        scenario = load_scenario(
+            find_scenario(name),
+            [
+                "duration=0.2",
+                "integrator={integration_scheme: runge_kutta5, max_step_size: 1e-3, "
+                "use_error_control: false}",
+                *settings,
+            ],
+        )
+        loop, context = build_scenario(scenario)
+        simulate(loop.diagram, context, 0.2, scenario.integrator)
+        records.append(loop.record(context))
+    for signal in ("controlled_output", "control", "state"):
+        one, other = (record[signal] for record in records)
+        scale = np.abs(one).max(axis=0) + 1e-3 * np.abs(one).max()
+        assert np.abs((one - other) / scale).max() < 1e-9
+
+
+def test_a_scenario_tells_which_key_has_bad_damping():
+    scenario = load_scenario(find_scenario("two_link_wall"), ["constraint_damping={all: [50.0]}"])
+    with pytest.raises(ScenarioError, match=r"constraint_damping: .*not Hurwitz"):
+        build_scenario(scenario)
+
+
+# Advice.
+
+
+def sampled(frequency, damping, sample_time, delay, samples):
+    """|phi| of a contact from phi = 1, its damping held and late, ten times a sample."""
+    fine = scipy.linalg.expm(
+        np.array([[0.0, 1.0, 0.0], [-(frequency**2), 0.0, 1.0], [0.0, 0.0, 0.0]])
+        * (sample_time / 10.0)
+    )
+    x, waiting, largest = np.array([1.0, 0.0, 0.0]), [0.0] * delay, []
+    for _ in range(samples):
+        waiting.append(-damping * x[1])
+        x[2], size = waiting.pop(0), 0.0
+        for _ in range(10):
+            x = fine @ x
+            size = max(size, abs(x[0]))
+        largest.append(size)
+    return np.array(largest)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.4, 0.8])
+def test_the_advice_brings_a_sampled_contact_to_rest_sooner_than_others(share, delay):
+    """Half and twice of it are slower in the long run, or no damping is advised at all."""
+    T, k = 1e-3, (share / 1e-3) ** 2
+    c, samples = contact_damping(k, 1.0, T, delay), int(20 / share)
+    assert 0.0 <= c <= 2.0 * np.sqrt(k) * (1.0 + 1e-12)
+    left = [sampled(np.sqrt(k), f * c, T, delay, samples)[-5:].max() for f in (1.0, 0.5, 2.0)]
+    if c > 0.0:
+        assert left[0] < min(*left[1:], 1.0)
+
+
+def test_soft_contacts_are_damped_critically_and_hard_ones_by_the_sample_time():
+    T = 1e-3
+    assert contact_damping(100.0, 1.0, T) == pytest.approx(20.0, rel=0.05)
+    assert contact_damping(1e5, 1.0, T) < 0.5 / T < contact_damping(1e5, 1.0, T, 0)
+    # w T = 2: late by more than a quarter of a swing, any damping would drive it.
+    assert contact_damping(4e6, 1.0, T) == 0.0
+    assert contact_damping(1e5, 0.5) == pytest.approx(2.0 * np.sqrt(5e4))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ((0.0, 1.0), "stiffness must be positive"),
+        ((1e5, -1.0), "mobility must be positive"),
+        ((1e5, 1.0, -1e-3), "sample_time must be 0 or more"),
+        ((1e5, 1.0, 1e-3, -1), "delay must be a whole number from 0"),
+    ],
+)
+def test_advice_needs_sensible_numbers(numbers, message):
+    with pytest.raises(ModelError, match=message):
+        contact_damping(*numbers)

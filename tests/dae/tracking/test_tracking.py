@@ -1,0 +1,362 @@
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.special
+from problems import (
+    PROBLEMS,
+    Problem,
+    closed_loop_outputs,
+    double_integrator,
+    pendulum,
+    pendulum_known,
+    reference_at,
+    wanted_outputs,
+)
+
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import GainError, ModelError
+
+
+def starts(problem: Problem) -> np.ndarray:
+    """Where each output's entries of the reference start."""
+    return np.cumsum([0, *(degree + 1 for degree in problem.output_degrees)])
+
+
+def test_the_closed_loop_has_exactly_the_predicted_error(problem):
+    """(30), (31) from a start with an error, by an independent integrator and elimination."""
+    law = TrackingLaw(problem.system, poles(-3.0))
+    start = problem.consistent(np.random.default_rng(3))
+    times = np.linspace(0.0, problem.horizon, 7)
+    outputs, _ = closed_loop_outputs(problem, law, start, times)
+    errors = outputs - wanted_outputs(problem, times)
+    predicted = law.predicted_error(times, start, reference_at(problem, 0.0))
+    # The integrator keeps 1e-11 a step; the largest output, of order 10, is a force.
+    np.testing.assert_allclose(errors, predicted, rtol=0, atol=2e-10)
+    met = [i for i, degree in enumerate(problem.output_degrees) if degree == 0]
+    np.testing.assert_array_equal(predicted[:, met], 0.0)
+    if len(met) < len(problem.output_degrees):
+        assert np.abs(predicted[0]).max() > 0.01
+        # (33): after 30 time constants nothing is left of an error of order 10.
+        late = law.predicted_error(10.0, start, reference_at(problem, 0.0))
+        assert np.abs(late).max() < 1e-7
+
+
+def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(problem):
+    """By elimination, equations (9), (10), (13), (14), off N* too; to the round-off of the control.
+
+    A law that finds its control by B(x), or whose contacts rub, tells no motion.
+    """
+    system, law = problem.system, TrackingLaw(problem.system, poles(-3.0))
+    motion, elimination = law.trace_motion(), law.structure.elimination
+    u = ca.SX.sym("u", system.num_controls)
+    if motion is None:
+        by_matrix = law.structure.derivatives.inverse(law.structure.highest_derivatives, u) is None
+        assert by_matrix or system.rubbing or system.control_metric is not None
+        return
+    rate = elimination.f_star + ca.mtimes(elimination.h_star, u)
+    force = elimination.alpha + ca.mtimes(elimination.beta, u)
+    plant = system.trace("plant", {"rate": rate, "force": force}, {"u": u})
+    random, p = np.random.default_rng(5), system.parameter_values
+    start = problem.consistent(random)
+    for state in (start, start + 1e-3 * random.standard_normal(start.size)):
+        R = reference_at(problem, 0.2)
+        control = law.control(state, R)
+        size = 1.0 + np.abs(control).max()
+        for found, wanted in zip(
+            motion(state, R, law.all_parameters()), plant(state, control, p), strict=True
+        ):
+            np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * size)
+
+
+def test_the_closed_loop_stays_on_the_manifold():
+    """The law and the elimination hold the constraint; only the integrator drifts."""
+    for name in ("two_link_arm", "third_order", "knife_edge"):
+        problem = PROBLEMS[name]()
+        start = problem.consistent(np.random.default_rng(3))
+        law = TrackingLaw(problem.system, poles(-3.0))
+        _, states = closed_loop_outputs(problem, law, start, np.linspace(0.0, 1.0, 3))
+        # Tolerances of 1e-11 a step, amplified over 1 s.
+        assert np.abs(problem.derivatives(states[-1])).max() < 1e-9
+
+
+LAMBDA_1 = np.array([[30.0, 8.0], [-6.0, 20.0]])
+LAMBDA_2 = np.array([[11.0, 2.0], [-1.0, 9.0]])
+
+
+def test_full_gain_matrices():
+    """e'' + Lambda_2 e' + Lambda_1 e = 0 (60), against a matrix exponential made here."""
+    problem = PROBLEMS["gantry"]()
+    law = TrackingLaw(problem.system, gain_matrices([LAMBDA_1, LAMBDA_2]))
+    start = problem.consistent(np.random.default_rng(4))
+    times = np.linspace(0.0, 1.0, 6)
+    outputs, _ = closed_loop_outputs(problem, law, start, times)
+    errors = outputs - wanted_outputs(problem, times)
+
+    reference = reference_at(problem, 0.0)
+    position, rate = reference[[1, 5]], reference[[2, 6]]
+    initial = np.concatenate([start[2:4] - position, start[6:8] - rate])
+    stacked = np.block([[np.zeros((2, 2)), np.eye(2)], [-LAMBDA_1, -LAMBDA_2]])
+    expected = np.array([(scipy.linalg.expm(stacked * t) @ initial)[:2] for t in times])
+    # The integrator's tolerance, as above.
+    np.testing.assert_allclose(errors[:, [1, 3]], expected, rtol=0, atol=2e-10)
+    # The forces are met at once, to round-off of numbers of order 10.
+    np.testing.assert_allclose(errors[:, [0, 2]], 0.0, rtol=0, atol=1e-13)
+
+
+def test_repeated_poles_in_closed_form():
+    """mu = 4 with one pole -5: e = sum w_j t^j/j! exp(-5 t), w_j the derivatives of e exp(5 t)."""
+    problem = PROBLEMS["flexible_pendulum"]()
+    law = TrackingLaw(problem.system, poles(-5.0))
+    start = problem.consistent(np.random.default_rng(6))
+    times = np.linspace(0.0, 2.0, 6)
+    outputs, _ = closed_loop_outputs(problem, law, start, times)
+    errors = (outputs - wanted_outputs(problem, times))[:, 0]
+    e0, e1, e2, e3 = law.error_coordinates(start, reference_at(problem, 0.0))
+    a = 5.0
+    weights = [
+        e0,
+        e1 + a * e0,
+        e2 + 2 * a * e1 + a**2 * e0,
+        e3 + 3 * a * e2 + 3 * a**2 * e1 + a**3 * e0,
+    ]
+    polynomial = sum(w * times**j / scipy.special.factorial(j) for j, w in enumerate(weights))
+    # The integrator's tolerance, as above.
+    np.testing.assert_allclose(errors, polynomial * np.exp(-a * times), rtol=0, atol=2e-10)
+
+
+@pytest.mark.slow
+def test_error_coordinates_are_the_derivatives_of_the_outputs(problem):
+    """e_i^(j) = L_f*^j l*_i - r_i^(j), against differences along the closed loop."""
+    law = TrackingLaw(problem.system, poles(-3.0))
+    start = problem.consistent(np.random.default_rng(3))
+    step = 1e-4
+    reference = reference_at(problem, 0.0)
+    coordinates = law.error_coordinates(start, reference)
+    assert coordinates.shape == (sum(problem.output_degrees),)
+    outputs, _ = closed_loop_outputs(problem, law, start, np.array([0.0, step, 2 * step]))
+    slope = (-3 * outputs[0] + 4 * outputs[1] - outputs[2]) / (2 * step)
+    first = 0
+    for i, degree in enumerate(problem.output_degrees):
+        if degree >= 1:
+            wanted = reference[starts(problem)[i]]
+            assert coordinates[first] == pytest.approx(outputs[0, i] - wanted, abs=1e-12)
+        if degree >= 2:
+            # Second differences: step^2 times a third derivative of order 100.
+            wanted = reference[starts(problem)[i] + 1]
+            assert coordinates[first + 1] == pytest.approx(slope[i] - wanted, abs=1e-5)
+        first += degree
+
+
+def test_the_reference_is_output_major():
+    law = TrackingLaw(PROBLEMS["gantry"]().system, poles(-1.0))
+    assert law.degrees == (0, 2, 0, 2)
+    names = [signal.name for signal in law.reference_signals]
+    assert names == ["v1", "q3", "q3'", "q3''", "v2", "q4", "q4'", "q4''"]
+
+
+def test_control_by_hand():
+    """Cart: u = m (r'' - K_2 (x' - r') - K_1 (x - r)) + c x'."""
+    law = TrackingLaw(PROBLEMS["cart"]().system, gain_coefficients([6.0, 5.0]))
+    x, r = np.array([2.0, -1.0]), np.array([1.5, 0.5, 3.0])
+    expected = 4.0 * (3.0 - 5.0 * (-1.0 - 0.5) - 6.0 * (2.0 - 1.5)) + 0.3 * -1.0
+    # Three operations.
+    assert law.control(x, r) == pytest.approx([expected], rel=1e-15)
+    assert law.error_coordinates(x, r) == pytest.approx([0.5, -1.5], rel=1e-15)
+    error = law.function(x, r, law.all_parameters())[1]
+    assert error == pytest.approx([0.5], rel=1e-15)
+
+
+@pytest.mark.slow
+def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
+    """z - r by the model, with the control that the law chose."""
+    law = TrackingLaw(problem.system, poles(-3.0))
+    state = problem.consistent(np.random.default_rng(5))
+    reference = reference_at(problem, 0.2)
+    control, error = law.function(state, reference, law.all_parameters())
+    closed_form = problem.known(state)
+    for i, degree in enumerate(problem.output_degrees):
+        if degree == 0:
+            # z = a + B u, of order 10.
+            output = closed_form.drift[i] + closed_form.control_matrix[i] @ control
+            assert output == pytest.approx(reference[starts(problem)[i]], abs=1e-12)
+            assert abs(error[i]) < 1e-12
+    assert 0.0 < law.function.pivot <= 1.0 + 1e-15
+
+
+def test_changed_parameters_need_no_new_trace():
+    """The law at other masses and gravity, against the closed form at these."""
+    problem = pendulum()
+    law = TrackingLaw(problem.system, poles(-3.0))
+    operations = law.function.num_operations
+    random = np.random.default_rng(7)
+    for mass, length, gravity in random.uniform(0.5, 5.0, (3, 3)):
+        state, reference = problem.consistent(random), random.standard_normal(3)
+        closed_form = pendulum_known(state, False, mass, gravity)
+        radius_rate = np.array([state[0], state[2]]) - reference[:2]
+        wanted = reference[2] - np.array([9.0, 6.0]) @ radius_rate
+        expected = (wanted - closed_form.drift[0]) / closed_form.control_matrix[0, 0]
+        found = law.control(state, reference, parameters=[mass, length, gravity])
+        # Twenty operations.
+        assert found == pytest.approx([expected], rel=1e-13)
+        assert law.control(state, reference) != pytest.approx([expected], rel=1e-3)
+    assert law.function.num_operations == operations
+
+
+def test_gains_are_parameters_of_the_traced_law():
+    """They are those that are not zero: a study changes them without tracing."""
+    system = PROBLEMS["gantry"]().system
+    first = gain_matrices([np.diag([2.0, 3.0]), LAMBDA_2])
+    second = gain_matrices([np.diag([5.0, 7.0]), 2 * LAMBDA_2])
+    law = TrackingLaw(system, first)
+    changed = TrackingLaw(system, second, structure=law.structure)
+    # The diagonals of Lambda_1 and all of Lambda_2.
+    assert law.all_parameters().shape == (2 + 4,)
+    state, reference = np.linspace(0.5, 1.2, 8), np.linspace(-1.0, 1.0, 8)
+    np.testing.assert_array_equal(
+        law.function(state, reference, law.all_parameters(gains=second))[0],
+        changed.control(state, reference),
+    )
+
+
+def test_a_singular_b_shows_in_the_pivot():
+    problem = PROBLEMS["knife_edge_force"]()
+    law = TrackingLaw(problem.system, poles(-3.0))
+    state = problem.consistent(np.random.default_rng(0))
+    state[5] = 0.0  # The heading rate, without which the thrust does not act on the force.
+    law.control(state, reference_at(problem, 0.0))
+    assert law.function.pivot < 1e-15
+
+
+def test_a_singular_a_shows_in_the_pivot():
+    """Two walls at an angle a hold a point, whose drives are states: the law needs A for v."""
+    angle = Parameter("a", 1.0)
+    normals = ca.blockcat(1, ca.cos(angle.symbol), 0, ca.sin(angle.symbol))
+    x = ca.SX.sym("x", 6)
+    system = DaeSystem(
+        state=x,
+        f=ca.vertcat(x[2:4], x[4:], ca.SX(2, 1)),
+        g=ca.vertcat(ca.SX(2, 2), normals, ca.SX(2, 2)),
+        h=ca.vertcat(ca.SX(4, 2), ca.SX.eye(2)),
+        k=ca.mtimes(normals.T, x[:2]),
+        l=ca.SX(2, 1),
+        m=ca.SX.eye(2),
+        parameters=(angle,),
+    )
+    law = TrackingLaw(system, poles(-3.0))
+    reference = np.array([10.0, 0.0, 20.0, 0.0])
+    # A holds the products of the normals: its pivot is sin(a)^2, that of B only sin(a).
+    for value in (1.0, 1e-3, 1e-7):
+        law.control(np.zeros(6), reference, parameters=[value])
+        assert law.function.pivot == pytest.approx(np.sin(value) ** 2, rel=0.05)
+
+
+def test_wrong_arguments_are_refused():
+    law = TrackingLaw(PROBLEMS["cart"]().system, poles(-1.0))
+    with pytest.raises(ModelError, match="'state' has size 3, not 2"):
+        law.control([1, 2, 3], [0, 0, 0])
+    with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
+        law.control([1, 2], [0, 0])
+    with pytest.raises(ModelError, match="parameters must be finite and of shape"):
+        law.control([1, 2], [0, 0, 0], parameters=[1.0])
+    with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
+        law.error_coordinates([1, 2], [0, 0])
+
+
+def test_gains_must_be_those_of_the_system():
+    system = double_integrator(output_signals=["q"])
+    for gains in (
+        FeedbackGains(["q"], [1], [[1.0]]),
+        FeedbackGains(["p"], [2], [[1.0, 1.0]]),
+        FeedbackGains(["q", "p"], [1, 1], np.eye(2)),
+    ):
+        with pytest.raises(GainError, match=r"the system has q with \(2,\)"):
+            TrackingLaw(system, gains)
+    law = TrackingLaw(system, FeedbackGains(["q"], [2], [[2.0, 3.0]]))
+    assert law.control([1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx([-5.0])
+    with pytest.raises(GainError, match="unknown outputs: z0"):
+        TrackingLaw(system, poles({"z0": -1.0}))
+
+
+def test_the_structure_must_be_that_of_the_system():
+    system, other = double_integrator(), double_integrator(name="another")
+    structure = find_structure(system)
+    assert TrackingLaw(system, poles(-1.0), structure=structure).structure is structure
+    with pytest.raises(ModelError, match="structure is that of another system, 'another'"):
+        TrackingLaw(system, poles(-1.0), structure=find_structure(other))
+
+
+def test_measured_force_replaces_nothing_when_the_model_is_right():
+    """(59): with v = r_2, as the loop has it, the feedback Gbar (v - r_2) vanishes."""
+    problem = PROBLEMS["two_link_arm"]()
+    plain = TrackingLaw(problem.system, poles(-3.0))
+    measured = TrackingLaw(
+        problem.system, poles(-3.0), structure=plain.structure, measured_force=True, force_gain=4.0
+    )
+    state = problem.consistent(np.random.default_rng(0))
+    reference = reference_at(problem, 0.3)
+    force = reference[0]
+    expected = plain.control(state, reference)
+    np.testing.assert_allclose(
+        measured.control(state, reference, measured_force=[force]), expected, rtol=1e-14
+    )
+    # A measurement that is 1 N too high makes the model's own force 4 N smaller.
+    changed = measured.control(state, reference, measured_force=[force + 1.0])
+    closed_form = problem.known(state)
+    drop = closed_form.beta @ (changed - expected)
+    np.testing.assert_allclose(drop, [-4.0], rtol=1e-12)
+    # And leaves the position alone: the second row of B.
+    np.testing.assert_allclose(
+        closed_form.control_matrix[1] @ (changed - expected), 0.0, atol=1e-12
+    )
+
+
+def test_measured_force_takes_the_place_of_the_models():
+    """(71): an output v1 of degree 1 is fed back from the measurement, its gain acts on v1 - r."""
+    problem = PROBLEMS["mixed_degrees"]()
+    plain = TrackingLaw(problem.system, poles(-3.0))
+    measured = TrackingLaw(
+        problem.system, poles(-3.0), structure=plain.structure, measured_force=True
+    )
+    state = problem.consistent(np.random.default_rng(0))
+    reference, closed_form = reference_at(problem, 0.3), problem.known(state)
+    force = closed_form.alpha  # beta u does not act on v1.
+    expected = plain.control(state, reference)
+    changed = [
+        measured.control(state, reference, measured_force=force + np.array([error, 7.0])) - expected
+        for error in (0.0, 0.5)
+    ]
+    # Ten operations on numbers of order 1.
+    np.testing.assert_allclose(changed[0], 0.0, atol=1e-13)
+    # B du = (0, -K dv1): the other output does not notice.
+    np.testing.assert_allclose(
+        closed_form.control_matrix @ changed[1], [0.0, -3.0 * 0.5], rtol=1e-12, atol=1e-13
+    )
+
+
+def test_what_is_no_system_or_no_design_is_refused():
+    system = pendulum().system
+    with pytest.raises(ModelError, match=r"system must be a DaeSystem, got .*; pass its \.dae$"):
+        TrackingLaw(SimpleNamespace(dae=system), poles(-1.0))
+    with pytest.raises(ModelError, match="gains must be a function or a FeedbackGains, got None"):
+        TrackingLaw(system, None)
+
+
+def test_measured_force_needs_an_output_that_is_a_force():
+    with pytest.raises(ModelError, match="measured_force needs an output that is a constraint inp"):
+        TrackingLaw(pendulum().system, poles(-1.0), measured_force=True)
+    arm = PROBLEMS["two_link_arm"]().system
+    for gain, message in (
+        (-1.0, "positive semidefinite"),
+        ([[1.0, 2.0]], r"number or shape \(1, 1\)"),
+    ):
+        with pytest.raises(GainError, match=message):
+            TrackingLaw(arm, poles(-1.0), measured_force=True, force_gain=gain)
+    with pytest.raises(GainError, match="force_gain needs measured_force"):
+        TrackingLaw(arm, poles(-1.0), force_gain=1.0)

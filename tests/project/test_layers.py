@@ -1,0 +1,203 @@
+"""Imports run one way, and only to what pyproject.toml declares; see tests/support/house.py."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Collection
+
+import pytest
+from draw_house import draw
+from house import (
+    PAPER,
+    ROOMS,
+    ROOT,
+    WITHOUT_DRAKE,
+    circle,
+    imported_modules,
+    imports,
+    may_import,
+    modules,
+    room,
+    violations,
+)
+
+
+def test_every_import_points_down() -> None:
+    found = imports()
+    assert {"drake_dae.__init__", "drake_dae.errors", "drake_dae.diagrams.__init__"} <= set(found)
+    wrong = [line for module, imported in found.items() for line in violations(module, imported)]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.slow
+def test_no_imports_go_round() -> None:
+    assert circle(imports()) == []
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"d"}}) == []
+    assert circle({"a": {"b"}, "b": {"c", "d"}, "c": {"b"}}) == ["b", "c"]
+
+
+EXISTING = {
+    "drake_dae.__init__",
+    "drake_dae.errors",
+    "drake_dae.analysis.analyze",
+    "drake_dae.dae.__init__",
+    "drake_dae.dae.tracking.gains",
+    "drake_dae.dae.states.__init__",
+    "drake_dae.dae.states.samples",
+    "drake_dae.dae.structure.structure",
+    "drake_dae.dae.system.system",
+    "drake_dae.robots.__init__",
+    "drake_dae.robots.model",
+    "drake_dae.symbolic",
+    "drake_dae.diagrams.__init__",
+    "drake_dae.cli",
+}
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("drake_dae.dae.system.system", "from drake_dae.robots.model import RobotModel"),
+        ("drake_dae.dae.system.system", "from drake_dae.robots import model"),
+        ("drake_dae.dae.system.system", "from drake_dae import robots"),
+        ("drake_dae.dae.manifold", "from ..robots import model"),
+        ("drake_dae.dae.__init__", "from ..robots import model"),
+        ("drake_dae.dae.system.system", "import drake_dae.robots.model as m"),
+        ("drake_dae.dae.system.system", "def f():\n    import drake_dae.robots"),
+        (
+            "drake_dae.dae.system.system",
+            "if TYPE_CHECKING:\n    from drake_dae.robots import RobotModel",
+        ),
+        ("drake_dae.dae.system.system", "from drake_dae import RobotModel"),
+        ("drake_dae.dae.system.system", "import pydrake.math"),
+        ("drake_dae.dae.system.system", "from pydrake.all import RigidTransform"),
+        ("drake_dae.dae.system.system", "from drake_dae.dae.structure.structure import Structure"),
+        ("drake_dae.dae.manifold", "from .states import samples"),
+        ("drake_dae.dae.system.system", "from drake_dae.dae import find_structure"),
+        ("drake_dae.dae.states.samples", "from ..structure import Structure"),
+        ("drake_dae.dae.helpers", "import math"),
+        ("drake_dae.trace.lie", "from drake_dae.dae.system.system import DaeSystem"),
+        ("drake_dae.trace.lie", "import pydrake.symbolic"),
+        ("drake_dae.analysis.analyze", "from drake_dae.robots.model import RobotModel"),
+        ("drake_dae.analysis.analyze", "import pydrake.math"),
+        ("drake_dae.robots.model", "from drake_dae.analysis.analyze import analyze"),
+        ("drake_dae.robots.model", "from drake_dae.symbolic import from_symbolic"),
+        ("drake_dae.errors", "from .dae import system"),
+        ("drake_dae.robots.model", "import drake_dae.cli"),
+        ("drake_dae.robots.model", "import torch"),
+        (
+            "drake_dae.systems.plants.dae_plant",
+            "from drake_dae.simulation.records.record import Record",
+        ),
+        ("drake_dae.diagrams.__init__", "import pytest"),
+        ("drake_dae.__init__", "from drake_dae.cli import main"),
+        ("drake_dae.helpers", "import math"),
+    ],
+)
+def test_a_violation_is_found(module: str, source: str) -> None:
+    assert len(violations(module, imported_modules(module, source, EXISTING))) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        (
+            "drake_dae.dae.system.system",
+            "from drake_dae.errors import ModelError\nimport casadi, math",
+        ),
+        ("drake_dae.dae.manifold", "from .. import errors"),
+        (
+            "drake_dae.dae.structure.structure",
+            "from .system import DaeSystem\nfrom .states import samples",
+        ),
+        ("drake_dae.dae.states.region", "from drake_dae.dae.states import samples"),
+        ("drake_dae.robots.model", "from drake_dae.dae import system\nimport pydrake.math"),
+        ("drake_dae.diagrams.__init__", "from drake_dae.simulation import record"),
+        ("drake_dae.__init__", "from drake_dae.scenario import build\nfrom .dae import system"),
+        ("drake_dae.cli", "from drake_dae import __version__"),
+        ("drake_dae.__main__", "from drake_dae.cli import main"),
+    ],
+)
+def test_an_import_that_points_down_passes(module: str, source: str) -> None:
+    assert violations(module, imported_modules(module, source, EXISTING)) == []
+
+
+def loaded_with(rooms: Collection[str]) -> set[str]:
+    """All modules that a fresh interpreter holds after it has imported every file of some rooms."""
+    names = sorted(m.removesuffix(".__init__") for m in modules() if room(m) in rooms)
+    code = "import sys\n" + "".join(f"import {name}\n" for name in names) + "print(*sys.modules)"
+    command = [sys.executable, "-W", "error", "-c", code]
+    printed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert set(names) <= set(printed.split())
+    return set(printed.split())
+
+
+@pytest.mark.slow
+def test_the_mathematics_loads_no_drake() -> None:
+    tops = {module.split(".")[0] for module in loaded_with(WITHOUT_DRAKE)}
+    assert "casadi" in tops
+    assert "pydrake" not in tops
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [["list"], ["show"], ["show", "--path"], ["--version"], ["--help"], ["simulate", "--help"]],
+)
+def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
+    code = (
+        "import sys\nfrom drake_dae.cli import main\n"
+        f"try:\n    main({words})\nexcept SystemExit:\n    pass\n"
+        "print(*sys.modules)"
+    )
+    command = [sys.executable, "-W", "error", "-c", code]
+    printed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    tops = {name.split(".")[0] for name in printed.splitlines()[-1].split()}
+    assert "drake_dae" in tops
+    assert tops.isdisjoint({"pydrake", "casadi", "scipy", "matplotlib", "pydantic", "tqdm"})
+
+
+@pytest.mark.slow
+def test_what_most_runs_do_not_need_loads_when_it_is_used() -> None:
+    loaded = loaded_with(["commands"])
+    assert "pydrake" in loaded
+    assert loaded.isdisjoint({"matplotlib", "scipy.integrate", "scipy.optimize"})
+
+
+@pytest.mark.slow
+def test_traced_functions_load_no_system() -> None:
+    loaded = {room(name) for name in loaded_with(["trace"]) if name.startswith("drake_dae.")}
+    assert loaded == {"errors", "arrays", "trace"}
+
+
+GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def test_the_guide_has_the_rules_of_this_file() -> None:
+    """Its table has a row a room, from the roof down: whether Drake is in, and what it imports."""
+    told = {}
+    table = re.findall(r"^\| `([\w./]+)` \| .* \| (yes|no) \| (.*) \|$", GUIDE, flags=re.MULTILINE)
+    for written, drake, cell in table:
+        name = {"__init__.py": "drake_dae"}.get(written, re.sub(r"\.py$|/$", "", written))
+        below = may_import(name) if cell == "all below" else re.findall(r"`(\w+)`", cell)
+        told[name] = (drake == "no", set(below))
+    ruled = {name: (name in WITHOUT_DRAKE, set(may_import(name))) for name in reversed(ROOMS)}
+    assert list(told.items()) == list(ruled.items())
+
+
+def test_the_guide_has_the_order_of_the_paper() -> None:
+    (order,) = re.findall(r"^    (system/(?:\s+\w+/?)*)$", GUIDE, flags=re.MULTILINE)
+    assert tuple(name.rstrip("/") for name in order.split()) == PAPER
+
+
+@pytest.mark.slow
+def test_the_house_is_drawn(tmp_path) -> None:
+    draw(tmp_path / "house.png")
+    assert (tmp_path / "house.png").stat().st_size > 50_000
+
+
+def test_files_that_the_guide_names_exist() -> None:
+    names = re.findall(r"`((?:robots|dae|tests)/[\w/]+\.py)`|\]\(([\w/.]+)\)", GUIDE)
+    assert len(names) > 10
+    for name in (first or second for first, second in names):
+        assert (ROOT / name).exists() or (ROOT / "drake_dae" / name).exists(), name

@@ -1,0 +1,74 @@
+"""A wheel built from the sdist is complete, and runs without the checkout."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    result = subprocess.run(
+        command,
+        cwd=cwd,
+        env=environment | {"PYTHONNOUSERSITE": "1", "MPLBACKEND": "agg"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, f"{' '.join(map(str, command))}\n{result.stdout}"
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel built from the sdist: that is what `python -m build` does by default."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.mark.slow
+def test_wheel_from_sdist_holds_every_file_of_the_package(wheel: Path) -> None:
+    expected = {
+        Path(folder, file).relative_to(ROOT).as_posix()
+        for folder, _, files in os.walk(ROOT / "drake_dae", followlinks=True)
+        for file in files
+        if Path(folder).name != "__pycache__" and not file.startswith(".")
+    }
+    # What it must be able to lose: the folder behind the link, and each kind of file in it.
+    diagrams = {name for name in expected if name.startswith("drake_dae/diagrams/")}
+    assert {Path(name).suffix for name in diagrams} >= {".py", ".urdf", ".xml", ".yaml"}
+    packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert packed == expected
+
+
+@pytest.mark.slow
+def test_installed_wheel_simulates_a_shipped_scenario(wheel: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=False, symlinks=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    install = ("-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel)
+    run(sys.executable, *install, cwd=tmp_path)
+    # Third parties come from the running environment, as plain folders on the path: the .pth file
+    # of an editable drake_dae in there is not read.
+    (site_packages,) = (tmp_path / "venv").glob("lib/python*/site-packages")
+    borrowed = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    (site_packages / "third_parties.pth").write_text("\n".join(borrowed) + "\n")
+    location = run(python, "-c", "import drake_dae; print(drake_dae.__file__)", cwd=tmp_path)
+    assert Path(location.strip()).is_relative_to(site_packages)
+
+    command = (tmp_path / "venv" / "bin" / "drake-dae", "simulate", "two_link_wall")
+    out = tmp_path / "run"
+    run(*command, "--out", out, "--set", "duration=0.2", cwd=tmp_path)
+    assert any(out.iterdir())

@@ -1,0 +1,273 @@
+"""The rules of `Surface` on every member, and distances against brute force."""
+
+import atexit
+import shutil
+import tempfile
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from members import Saddle, subclasses
+from meshes import obj_of_grid
+from pydrake import geometry
+
+from drake_dae import PointOnSurface
+from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.maps import HeightMap, MeshSurface
+from drake_dae.robots.surfaces.surface import Surface, tangents
+from drake_dae.robots.surfaces.surfaces import (
+    Cylinder,
+    Ellipsoid,
+    ImplicitSurface,
+    Plane,
+    Sphere,
+    Torus,
+)
+from drake_dae.trace.functions import TracedFunction
+
+FOLDER = Path(tempfile.mkdtemp(prefix="drake_dae_surfaces_"))
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
+WAVES = 0.1 * np.sin(np.linspace(-4.0, 4.0, 41)) * np.cos(np.linspace(-2.0, 2.0, 31))[:, None]
+SIDE = np.linspace(-0.6, 0.6, 49)
+BELL = 0.3 * np.exp(-2.0 * (SIDE**2 + SIDE[:, None] ** 2))
+
+SURFACES = {
+    "plane": Plane((0.3, -0.2, 0.5), (1.0, -2.0, 0.5)),
+    "sphere": Sphere((0.1, 0.2, 0.3), 0.7),
+    "inside sphere": Sphere((0.1, 0.2, 0.3), 0.7, inside=True),
+    "cylinder": Cylinder((0.4, 0.0, 0.1), (1.0, 1.0, 0.3), 0.5),
+    "turned cylinder": Cylinder((0.4, 0.0, 0.1), (0.2, 0.0, 1.0), 0.5, zero=(-1.0, 0.5, 0.0)),
+    "inside cylinder": Cylinder((0.4, 0.0, 0.1), (0.0, 0.0, 2.0), 0.5, inside=True),
+    "ellipsoid": Ellipsoid((0.1, -0.1, 0.2), (0.5, 0.8, 0.3)),
+    "torus": Torus((0.0, 0.1, 0.2), (0.2, 0.1, 1.0), 0.8, 0.3),
+    "implicit": ImplicitSurface(
+        lambda p: 7.0 * (p[2] - 0.3 * ca.sin(2.0 * p[0]) - 0.2 * p[1] ** 2), (0.5, 0.0, 0.1)
+    ),
+    "saddle": Saddle((0.3, 0.1, -0.2), 0.6),
+    "formula": ImplicitSurface("a*cos(3*x) + exp(y/l) - z", (0.5, 0.0, 0.1), {"a": 0.2, "l": 2.0}),
+    "height map": HeightMap((2.4, 2.0), WAVES, point=(0.1, 0.2, 0.3), normal=(0.1, -1.0, 0.3)),
+    "mesh": MeshSurface(
+        obj_of_grid(FOLDER / "bell.obj", SIDE, SIDE, BELL),
+        point=(0.1, 0.2, 0.3),
+        normal=(0.0, 0.2, 1.0),
+        middle=(0.0, 0.0),
+        size=(1.0, 1.0),
+    ),
+}
+
+
+def test_no_member_is_left_out():
+    assert subclasses(Surface) <= {type(surface) for surface in SURFACES.values()}
+
+
+def functions(surface):
+    p = ca.SX.sym("p", 3)
+    distance = surface.distance(p)
+    outputs = {"distance": distance, "gradient": ca.gradient(distance, p)}
+    if surface.coordinate_signals:
+        outputs["coordinates"] = surface.coordinates(p)
+        outputs["jacobian"] = ca.jacobian(surface.coordinates(p), p)
+    return TracedFunction("surface", {"p": p}, outputs)
+
+
+def points_on(surface, count=30):
+    """Random offsets from the reference point, brought to the surface along the gradient."""
+    function, random, found = functions(surface), np.random.default_rng(0), []
+    while len(found) < count:
+        p = random.uniform(-1.2, 1.2, 3)
+        for _ in range(50):
+            value, gradient = function(p)[:2]
+            p = p - value * gradient / max(gradient @ gradient, 1e-3)
+        if abs(function(p)[0][0]) < 1e-13:
+            found.append(p)
+    return function, np.array(found)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_gradient_has_length_one_on_the_surface(name):
+    """So that the multiplier is a force in newtons; exact up to round-off."""
+    function, points = points_on(SURFACES[name])
+    for p in points:
+        gradient = function(p)[1]
+        assert np.linalg.norm(gradient) == pytest.approx(1.0, abs=1e-11)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_distance_grows_with_one_along_the_normal(name):
+    """phi(p + d n) = d + O(d^2) on both sides: positive on the free side."""
+    function, points = points_on(SURFACES[name])
+    for p in points:
+        normal = function(p)[1]
+        for d in (1e-5, -1e-5):
+            # Curvatures here are below 20 1/m.
+            assert function(p + d * normal)[0][0] == pytest.approx(d, abs=20 * d * d)
+
+
+@pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].coordinate_signals])
+def test_coordinates_cover_the_surface(name):
+    """Normal and gradients of the two coordinates are independent away from the poles."""
+    function, points = points_on(SURFACES[name])
+    volumes = [
+        abs(np.linalg.det(np.vstack([gradient, jacobian])))
+        for _, gradient, _, jacobian in map(function, points)
+    ]
+    assert min(volumes) > 0.1
+
+
+def test_the_angle_of_a_cylinder_is_counted_from_where_it_is_told():
+    """A pipe before a robot at the origin: 0 where it faces it, growing to its right."""
+    pipe = Cylinder((0.8, 0.0, 0.0), (0.0, 0.0, 2.0), 0.2, zero=(-1.0, 0.0, 7.0))
+    for angle in (-2.9, -0.4, 0.0, 1.1):
+        offset = [-0.2 * np.cos(angle), -0.2 * np.sin(angle), 0.3]
+        found = np.array(ca.evalf(pipe.coordinates(ca.SX(offset)))).ravel()
+        np.testing.assert_allclose(found, [angle, 0.3], atol=1e-15)
+
+
+@pytest.mark.parametrize("name", [n for n in SURFACES if not SURFACES[n].coordinate_signals])
+def test_coordinates_that_there_are_not_are_refused(name):
+    with pytest.raises(ModelError, match="has no coordinates along it"):
+        SURFACES[name].coordinates(ca.SX.sym("p", 3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SURFACES)
+def test_any_surface_is_drawn_from_its_distance_alone(name):
+    """As `Surface` does where a class has no shape of its own: around a point, on the surface."""
+    surface, size = SURFACES[name], 0.4
+    function, points = points_on(surface, 5)
+    for center in points + 0.1 * np.random.default_rng(2).uniform(-1.0, 1.0, (5, 3)):
+        picture = Surface.picture(surface, center, size)
+        assert picture.pose.IsExactlyIdentity()
+        mesh = picture.form
+        vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+        distances = [function(vertex)[0][0] for vertex in vertices]
+        np.testing.assert_allclose(distances, 0.0, atol=1e-12)
+        apart = np.linalg.norm(vertices - center, axis=1)
+        # A patch of about this size, the center above its middle.
+        assert mesh.num_triangles() > 500
+        assert apart.min() < 0.2
+        assert 0.5 * size < apart.max() < 2.0 * size
+
+
+def test_a_patch_ends_where_the_surface_does():
+    """A small ball in a large patch: half of it is drawn, all of that on the ball."""
+    ball = Sphere((0.0, 0.0, 0.0), 0.1)
+    mesh = Surface.picture(ball, [0.0, 0.0, 0.3], 1.0).form
+    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.1, atol=1e-12)
+
+
+AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
+
+
+@pytest.mark.parametrize(
+    ("surface", "kind"),
+    [
+        (Plane((0, 0, 0), (1, 2, 2)), geometry.Box),
+        (Sphere((0, 0, 0), 0.5), geometry.Sphere),
+        (Cylinder((0, 0, 0), (1, 2, 2), 0.5), geometry.Cylinder),
+        (Ellipsoid((0, 0, 0), (0.5, 0.6, 0.7)), geometry.Ellipsoid),
+    ],
+)
+def test_shapes_stand_where_the_surfaces_are(surface, kind):
+    """Where a parameter puts the surface, and not where it was made."""
+    position, center = np.array([0.1, 0.2, 0.3]), np.array([0.7, -0.4, 0.9])
+    contact = PointOnSurface("tool", surface, name="it")
+    picture = contact.picture(position, center, 2.0)
+    turn, place = picture.pose.rotation().matrix(), picture.pose.translation()
+    assert isinstance(picture.form, kind)
+    if kind is geometry.Box:
+        # Its upper side is in the plane, below the center; no shape can be seen to stand higher.
+        np.testing.assert_allclose(turn[:, 2], AXIS, atol=1e-12)
+        foot = center - np.dot(center - position, AXIS) * AXIS
+        np.testing.assert_allclose(place + 0.01 * AXIS, foot, atol=1e-12)
+    elif kind is geometry.Cylinder:
+        np.testing.assert_allclose(turn[:, 2], AXIS, atol=1e-12)
+        foot = position + np.dot(center - position, AXIS) * AXIS
+        np.testing.assert_allclose(place, foot, atol=1e-12)
+        assert (picture.form.radius(), picture.form.length()) == (0.5, 2.0)
+    else:
+        np.testing.assert_allclose(place, position, atol=1e-12)
+
+
+def test_a_torus_is_drawn_on_its_surface():
+    torus, position = Torus((0, 0, 0), (1, 2, 2), 0.5, 0.2), np.array([0.1, 0.2, 0.3])
+    picture = PointOnSurface("tool", torus, name="it").picture(position, position, 1.0)
+    mesh, distance = picture.form, functions(torus)
+    points = [picture.pose @ mesh.vertex(i) for i in range(mesh.num_vertices())]
+    assert len(points) > 1000
+    distances = [distance(point - position)[0][0] for point in points]
+    np.testing.assert_allclose(distances, 0.0, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["plane", "sphere", "cylinder", "torus"])
+def test_distance_is_the_distance_to_the_nearest_point(name):
+    """Against the nearest of a dense cloud of points on the surface."""
+    surface = SURFACES[name]
+    function = functions(surface)
+    random = np.random.default_rng(1)
+    for p in random.uniform(-1.0, 1.0, (10, 3)):
+        distance, gradient = function(p)[:2]
+        foot = p - distance * gradient
+        # The foot is on the surface and no point of the surface is nearer.
+        assert function(foot)[0][0] == pytest.approx(0.0, abs=1e-12)
+        _, cloud = points_on(surface, 40)
+        assert np.min(np.linalg.norm(cloud - p, axis=1)) >= abs(distance[0]) - 1e-9
+
+
+def test_known_values():
+    assert float(Plane((1, 0, 0), (-2, 0, 0)).distance(ca.SX([-0.25, 5, 5]))) == 0.25
+    assert float(Sphere((0, 0, 0), 2.0).distance(ca.SX([3, 0, 4]))) == 3.0
+    assert float(Sphere((0, 0, 0), 2.0, inside=True).distance(ca.SX([0, 0, 1.5]))) == 0.5
+    assert float(Cylinder((0, 0, 0), (0, 0, 1), 1.0).distance(ca.SX([3, 4, 9]))) == 4.0
+    assert float(Torus((0, 0, 0), (0, 0, 1), 2.0, 0.5).distance(ca.SX([0, 3, 0]))) == 0.5
+    # On the long axis F = 3, |grad F| = 4: not the distance 1, but the same to first order.
+    assert float(Ellipsoid((0, 0, 0), (1, 1, 1)).distance(ca.SX([2, 0, 0]))) == 0.75
+
+
+def test_tangents_are_upright():
+    np.testing.assert_allclose(tangents([-1, 0, 0]), [[0, 1, 0], [0, 0, 1]], atol=0)
+    np.testing.assert_allclose(tangents([0, 0, 1]), [[1, 0, 0], [0, 1, 0]], atol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Plane((0, 0), (1, 0, 0)), "point must be three finite numbers"),
+        (lambda: Plane((0, 0, 0), (0, 0, 0)), "normal must not be zero"),
+        (lambda: Sphere((0, 0, 0), 0.0), "radius must be positive, got 0.0"),
+        (lambda: Sphere((0, 0, np.nan), 1.0), "center must be three finite numbers"),
+        (lambda: Cylinder((0, 0, 0), (0, 0, 1), -1.0), "radius must be positive"),
+        (
+            lambda: Cylinder((0, 0, 0), (0, 0, 2), 1.0, zero=(0, 0, -3)),
+            r"zero must not lie along the axis, got \(0\.0, 0\.0, -1\.0\)",
+        ),
+        (lambda: Ellipsoid((0, 0, 0), (1, 0, 1)), "semi_axes must be positive"),
+        (lambda: Torus((0, 0, 0), (0, 0, 1), 0.2, 0.3), "must exceed minor_radius"),
+        (
+            lambda: ImplicitSurface(lambda p: p).distance(ca.SX.sym("p", 3)),
+            "returns one number",
+        ),
+        (
+            lambda: ImplicitSurface(lambda p: p[0]).coordinates(ca.SX.sym("p", 3)),
+            "has no coordinates",
+        ),
+    ],
+)
+def test_refusals(make, message):
+    with pytest.raises(ModelError, match=message):
+        make()
+
+
+@pytest.mark.slow
+def test_a_surface_without_points_is_not_drawn_and_says_so():
+    with pytest.warns(UserWarning, match=r"ImplicitSurface: no point of it is found within 0\.4 m"):
+        assert ImplicitSurface(lambda p: ca.sumsqr(p) + 1.0).picture([0.1, 0.0, 0.0], 0.4) is None
+
+
+def test_a_surface_is_drawn_around_its_tip():
+    """The gradient vanishes at the tip of a cone; beside it there is a normal."""
+    cone = ImplicitSurface(lambda p: p[2] ** 2 - p[0] ** 2 - p[1] ** 2)
+    assert cone.picture([0.0, 0.0, 0.0], 0.4) is not None

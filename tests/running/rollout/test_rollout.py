@@ -1,0 +1,422 @@
+"""Rollouts against Drake's Simulator on the same closed loop."""
+
+import shutil
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.trajectories import PiecewisePolynomial
+from runs import each_scenario, run, scenario
+
+from drake_dae import (
+    ConstantReference,
+    ForceSensor,
+    RobotPlant,
+    TrackingLaw,
+    TrajectoryReference,
+    build_scenario,
+    make_closed_loop,
+    poles,
+    rollout,
+    simulate,
+    start_values,
+)
+from drake_dae.errors import (
+    InconsistentStateError,
+    MachineCodeWarning,
+    ModelError,
+    SimulationError,
+)
+from drake_dae.running.rollout.rollout import run_loop
+from drake_dae.scenario.rolled import roll_scenario
+
+with_compiler = pytest.param(
+    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+)
+both = pytest.mark.parametrize("compiled", [False, with_compiler])
+
+COMPILED = {"boom", "planar_4rrr", "seven_joint_moving_plate", "two_link_hydraulics"}
+"""Those that are also made machine code; others take the compiler longer."""
+
+
+def fixed(scheme: str = "runge_kutta3", step: float = 1e-3) -> list[str]:
+    return [
+        f"integrator.integration_scheme={scheme}",
+        "integrator.use_error_control=false",
+        f"integrator.max_step_size={step}",
+        "compiled=false",
+    ]
+
+
+def grid(duration: float, step: float) -> np.ndarray:
+    return np.linspace(0.0, duration, round(duration / step) + 1)
+
+
+def assert_equal_records(found, wanted, tolerance) -> None:
+    """Drake adds its steps up, and so may take one of 1e-13 s more at the end."""
+    assert list(found.signals) == list(wanted.signals)
+    last = found.time.size - 1
+    for name, recorded in wanted.signals.items():
+        assert found.signals[name].signals == recorded.signals
+        scale = max(1.0, np.max(np.abs(recorded.values), initial=0.0))
+        same = [*range(last - 1), -1]
+        np.testing.assert_allclose(
+            found[name][same], recorded.values[same], rtol=0.0, atol=tolerance * scale
+        )
+
+
+@both
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [
+        ("two_link_wall", "runge_kutta3"),
+        ("two_link_wall", "runge_kutta5"),
+        ("two_link_wall", "runge_kutta2"),
+        ("two_link_wall", "bogacki_shampine3"),
+        ("two_link_wall", "explicit_euler"),
+        ("two_link_motors", "runge_kutta3"),
+        ("two_link_measured_force", "runge_kutta3"),
+        pytest.param("seven_joint_wall", "runge_kutta3", marks=pytest.mark.slow),
+        pytest.param("seven_joint_moving_plate", "runge_kutta3", marks=pytest.mark.slow),
+    ],
+)
+def test_equal_fixed_steps_are_equal(name, scheme, compiled):
+    """To 1e-12 of the largest value: both do the same, in another order of additions.
+
+    The states of both are rounded 200 times; forces and controls of some 1e3 are cancelled.
+    """
+    chosen = scenario(name, "duration=0.2", *fixed(scheme))
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.2, chosen.integrator)
+    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    (found,) = rollout(
+        loop,
+        start,
+        parameters,
+        grid(0.2, 1e-3),
+        config=chosen.integrator,
+        compiled=compiled,
+        seeds=seeds,
+    )
+    assert found.failure is None
+    assert found.steps == 200
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
+@both
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two_link_wall",
+        pytest.param("seven_joint_wall", marks=pytest.mark.slow),
+        pytest.param("seven_joint_moving_plate", marks=pytest.mark.slow),
+    ],
+)
+def test_error_control_agrees(name, compiled):
+    """To 1e-9: Drake at an accuracy of 1e-12 is the truth, and the rollout at 1e-8 is held to it.
+
+    Its steps are long, so that this holds between them, too.
+    """
+    chosen = scenario(name, "duration=1", "integrator.accuracy=1e-12", "compiled=false")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 1.0, chosen.integrator)
+    config = SimulatorConfig()
+    config.accuracy = 1e-8
+    (found,) = rollout(loop, start, parameters, wanted.time, config=config, compiled=compiled)
+    assert found.failure is None
+    assert found.steps < 40
+    for signal in ("state", "controlled_output", "constraint_force"):
+        np.testing.assert_allclose(found.record[signal], wanted[signal], rtol=1e-9, atol=1e-9)
+    assert np.max(np.abs(found.record["constraint_residual"])) < 1e-13
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize("mass", [None, 11.0])
+def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass):
+    """To 1e-9, as long as the steps do; also where the plant is not what the law takes it for."""
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6", "compiled=false")
+    loop, context = build_scenario(chosen)
+    if mass is not None:
+        loop.plant.set_parameter(
+            loop.plant.GetMyMutableContextFromRoot(context), "link1.mass", mass
+        )
+    start, parameters = start_values(loop, context)
+    times = [0.0, 0.05, 0.051, 0.4, 1.0]
+    one, other = (
+        rollout(loop, start, parameters, times, config=chosen.integrator, compiled=compiled)[0]
+        for compiled in (False, True)
+    )
+    assert one.steps == other.steps
+    for name, recorded in one.record.signals.items():
+        np.testing.assert_allclose(other.record[name], recorded.values, rtol=1e-9, atol=1e-9)
+
+
+def test_rows_within_a_thousand_short_steps_are_those_of_long_ones():
+    """To 1e-9, as error control agrees: they are computed in parts, so that memory is bounded."""
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-8", "compiled=false")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    found = []
+    for longest in (1e-3, 0.1):
+        config = SimulatorConfig(accuracy=1e-8, max_step_size=longest)
+        times = np.linspace(0.0, 1.0, 778)
+        found += rollout(loop, start, parameters, times, config=config)
+    assert found[0].steps >= 1000 > 20 * found[1].steps
+    for signal in ("state", "constraint_force", "control"):
+        short, long = (each.record[signal] for each in found)
+        np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9)
+
+
+@both
+@pytest.mark.parametrize(
+    "settings",
+    [
+        # The tool leaves what the arm can reach.
+        ("references.tool.z.amplitudes=[3.0]", "integrator.accuracy=1e-6"),
+        ("references.tool.z.amplitudes=[3.0]", *fixed(step=0.01)[:3]),
+        # Gains that no step of this length follows.
+        ("gains.all=[-4000]", *fixed("explicit_euler", 0.01)[:3]),
+    ],
+)
+def test_a_failure_is_that_of_the_simulation(settings, compiled):
+    """Its kind, its time, and its words up to the numbers: round-off grows before it."""
+    chosen = scenario("two_link_wall", *settings, "compiled=false", "duration=10")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    with pytest.raises(SimulationError) as raised:
+        simulate(loop.diagram, context, chosen.duration, chosen.integrator)
+    wanted = raised.value
+    (found,) = rollout(
+        loop, start, parameters, grid(10.0, 0.01), config=chosen.integrator, compiled=compiled
+    )
+    assert type(found.failure) is type(wanted)
+    tolerance = 1e-3 if chosen.integrator.use_error_control else 1e-9
+    assert found.failure.time == pytest.approx(wanted.time, abs=tolerance)
+    assert found.failure.state.shape == wanted.state.shape
+    assert f"t = {found.failure.time:.6g} s, state [" in str(found.failure)
+    assert str(found.failure)[:20] == str(wanted)[:20]
+    assert found.record.time[-1] <= found.failure.time < found.record.time[-1] + 0.02
+    assert np.isfinite(found.record["state"]).all()
+
+
+@both
+def test_many_runs_are_those_of_one_each(compiled):
+    """Exactly: each is computed alone. Parameters and starts are their own, as in Drake."""
+    chosen = scenario("two_link_wall", "duration=0.1", *fixed())
+    loop, context = build_scenario(chosen)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    times = grid(0.1, 1e-3)
+    values, records = [], []
+    for mass in (1.0, 2.0, 3.0):
+        loop.plant.set_parameter(own, "link1.mass", mass)
+        loop.plant.set_consistent_state(own, loop.plant.state(own) + 0.01)
+        values.append(start_values(loop, context))
+        other = context.Clone()
+        simulate(loop.diagram, other, 0.1, chosen.integrator)
+        records.append(loop.record(other))
+    starts, parameters = (np.array(column) for column in zip(*values, strict=True))
+    settings = {"config": chosen.integrator, "compiled": compiled}
+    found = rollout(loop, starts, parameters, times, **settings)
+    for one, wanted, (start, row) in zip(found, records, values, strict=True):
+        assert_equal_records(one.record, wanted, 1e-12)
+        (alone,) = rollout(loop, start, row, times, **settings)
+        np.testing.assert_array_equal(alone.record["state"], one.record["state"])
+    # One row of parameters serves all starts.
+    same = rollout(loop, starts, parameters[1], times, **settings)
+    np.testing.assert_array_equal(same[1].record["state"], found[1].record["state"])
+
+
+@both
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {"time_constant": 0.02},
+        {"time_constant": 0.02, "bias": 0.5, "noise_deviation": 0.1},
+        {"time_constant": 0.02, "sample_period": 0.01, "noise_deviation": 0.1},
+        {"time_constant": 0.06, "sample_period": 0.013},
+    ],
+)
+def test_sensors_measure_as_in_drake(sensor, compiled):
+    """The noise is that of Drake's RandomSource; steps of both end at each of its changes."""
+    chosen = scenario("two_link_measured_force", "duration=0.2", *fixed("runge_kutta3", 0.002))
+    built, _ = build_scenario(chosen)
+    law = built.controller.law
+    loop = make_closed_loop(
+        RobotPlant(built.plant.model, structure=law.structure),
+        law,
+        built.reference.references,
+        sensor=ForceSensor(1, **sensor),
+    )
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_seed(context, 7)
+    start, parameters = start_values(loop, context)
+    # The record of Drake has rows at the samples, too.
+    wanted = run(loop, context, 0.2, chosen.integrator)
+    (found,) = rollout(
+        loop, start, parameters, wanted.time, config=chosen.integrator, compiled=compiled, seeds=[7]
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
+@both
+@pytest.mark.parametrize("case", ["position", "measured", "direct"])
+def test_integrals_are_those_of_drake(case, compiled):
+    """To 1e-12 of the largest value, as all that equal steps give.
+
+    Of a position, of a force behind a sensor with a lag, and of one that the law but integrates.
+    """
+    name, settings = {
+        "position": ("two_link_wall", ["integral=[tool.z]", "start.errors.tool.z=0.01"]),
+        "measured": ("two_link_measured_force", ["integral=[wall.force, tool.z]"]),
+        "direct": ("two_link_wall", []),
+    }[case]
+    chosen = scenario(name, "duration=0.1", *settings, *fixed())
+    loop, context = build_scenario(chosen)
+    start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    if case == "direct":
+        model, structure = loop.plant.model, loop.controller.law.structure
+        options = {"structure": structure, "measured_force": True, "integral": ["wall.force"]}
+        law = TrackingLaw(model.dae, poles(-4.0), **options)
+        plant = RobotPlant(model, structure=structure)
+        loop = make_closed_loop(plant, law, loop.reference.references)
+        context = loop.diagram.CreateDefaultContext()
+        loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), start)
+    if case != "measured":
+        own = loop.controller.GetMyMutableContextFromRoot(context)
+        loop.controller.set_integral(own, [0.02])
+        own = loop.plant.GetMyMutableContextFromRoot(context)
+        loop.plant.set_parameter(own, "link1.mass", 13.0)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.1, chosen.integrator)
+    assert np.ptp(wanted["integral"]) > 1e-6
+    (found,) = rollout(
+        loop,
+        start,
+        parameters,
+        grid(0.1, 1e-3),
+        config=chosen.integrator,
+        compiled=compiled,
+        seeds=[chosen.force.seed],
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
+@both
+@pytest.mark.parametrize(("pole", "integral"), [(-80, []), (-40, ["integral=[tool.z]"])])
+def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
+    """To 1e-12 of the largest value; integrals stand still while a drive is at its limit."""
+    settings = ["duration=0.1", "start.errors.tool.z=0.05", f"gains.all=[{pole}]", *integral]
+    chosen = scenario("two_link_wall", *settings, "saturation=true", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.1, chosen.integrator)
+    limited = np.abs(wanted["excess"]).max(axis=1) > 0.0
+    assert 10 < np.count_nonzero(limited) < 90
+    if integral:
+        assert np.ptp(wanted["integral"][limited]) < np.ptp(wanted["integral"])
+    (found,) = rollout(
+        loop, start, parameters, grid(0.1, 1e-3), config=chosen.integrator, compiled=compiled
+    )
+    assert_equal_records(found.record, wanted, 1e-12)
+
+
+def test_what_cannot_be_rolled_out_is_refused():
+    chosen = scenario("two_link_wall", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    with pytest.raises(InconsistentStateError, match="not on the constraint"):
+        rollout(loop, start + 0.1, parameters, [0.0, 0.1])
+    for arguments, told in (
+        ((start[:-1], parameters, [0.0, 0.1]), r"starts must have shape \(4,\)"),
+        ((start, parameters[:-1], [0.0, 0.1]), "parameters must have shape"),
+        ((start, parameters, [0.0]), "times must be two or more"),
+        ((start, parameters, [0.0, 0.0]), "strictly increasing"),
+        (([start] * 3, [parameters] * 2, [0.0, 0.1]), "2 rows of parameters for 3 starts"),
+    ):
+        with pytest.raises(ModelError, match=told):
+            rollout(loop, *arguments)
+    implicit = SimulatorConfig()
+    implicit.integration_scheme, implicit.use_error_control = "implicit_euler", False
+    with pytest.raises(ModelError, match="no fixed steps of implicit_euler; choose explicit_euler"):
+        rollout(loop, start, parameters, [0.0, 0.1], config=implicit)
+    path = TrajectoryReference(PiecewisePolynomial.CubicHermite([0, 1], [[0.3, 0.3]], [[0, 0]]))
+    plant = RobotPlant(loop.plant.model, structure=loop.controller.law.structure)
+    other = make_closed_loop(plant, loop.controller.law, [path, ConstantReference(10.0)])
+    with pytest.raises(ModelError, match="a TrajectoryReference is no expression of time"):
+        rollout(other, start, parameters, [0.0, 0.1])
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_a_study_decides_on_machine_code_by_its_length_alone():
+    """So that a run has the same numbers in each process, whatever the cache has by then."""
+    chosen = scenario("two_link_wall", "duration=0.1")
+    loop, context = build_scenario(chosen)
+    for lasting in (1.0, 1000.0, 1.0):
+        before = "library True" in loop.memory
+        assert roll_scenario(chosen, loop, context, lasting).failure is None
+        assert ("library True" in loop.memory) == (before or lasting > 1.0)
+
+
+def test_without_a_compiler_it_warns_and_goes_on(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    chosen = scenario("two_link_wall", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    with pytest.warns(MachineCodeWarning, match="no-such-compiler"):
+        (found,) = rollout(loop, start, parameters, [0.0, 0.01], compiled=True)
+    assert found.failure is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", each_scenario(lambda name: name.startswith("wall_")))
+def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
+    """To 1e-10 of the largest value: forces of light mechanisms cancel more than those of arms."""
+    chosen = scenario(name, "duration=0.02", *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    wanted = run(loop, context, 0.02, chosen.integrator)
+    arguments = (loop, start, parameters, grid(0.02, 1e-3))
+    for compiled in (False, True)[: 2 if name in COMPILED and shutil.which("cc") else 1]:
+        (found,) = rollout(*arguments, config=chosen.integrator, compiled=compiled, seeds=seeds)
+        assert found.failure is None
+        assert_equal_records(found.record, wanted, 1e-10)
+
+
+@both
+def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
+    """Fixed steps of 1e-4 s; machine code looks after 20,000 steps, CasADi's after each call."""
+    fixed = ["use_error_control=false", "integration_scheme=runge_kutta3", "max_step_size=1e-4"]
+    chosen = scenario("two_link_wall", "duration=3", *(f"integrator.{each}" for each in fixed))
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    times, looks = np.linspace(0.0, 3.0, 31), iter([False] * (1 if compiled else 40))
+    settings = {"config": chosen.integrator, "compiled": compiled}
+    (whole,) = run_loop(loop, start, parameters, times, **settings)
+    (part,) = run_loop(loop, start, parameters, times, stop=lambda: next(looks, True), **settings)
+    assert part.failure is None
+    assert 1 < part.record.time.size < 31
+    for name in whole.record.signals:
+        np.testing.assert_array_equal(
+            part.record[name], whole.record[name][: part.record.time.size]
+        )
+
+
+@both
+@pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_dome"])
+def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, compiled):
+    """Steps of 10 ms by Euler leave them by 1e-5: after one Newton step alone it would be 1e-9."""
+    fixed = ["use_error_control=false", "integration_scheme=explicit_euler", "max_step_size=1e-2"]
+    words = (f"integrator.{each}" for each in fixed)
+    chosen = scenario(name, "duration=1", "compiled=false", *words)
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    simulate(loop.diagram, context, chosen.duration, chosen.integrator)
+    expected = loop.record(context)
+    times, settings = expected.time, {"config": chosen.integrator, "compiled": compiled}
+    (found,) = rollout(loop, start, parameters, times, **settings)
+    # The last row of Drake's log is projected, as that of the rollout.
+    assert np.abs(expected["constraint_residual"]).max() > 1e-6
+    np.testing.assert_allclose(found.record["state"], expected["state"], rtol=0.0, atol=1e-13)

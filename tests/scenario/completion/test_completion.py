@@ -1,0 +1,251 @@
+"""Outputs that complete those of a scenario, and starts that are found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.multibody.tree import JacobianWrtVariable
+from runs import run_scenario, scenario
+
+from drake_dae import (
+    CircleReference,
+    ConstantReference,
+    JointPositions,
+    Plane,
+    PointCoordinates,
+    PointOnSurface,
+    Sphere,
+    build_scenario,
+    complete_scenario,
+    load_scenario,
+    simulate,
+)
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.model import scenario_model
+from drake_dae.scenario.parts import Start, TiltFromNormal
+from drake_dae.scenario.scenario import save_scenario
+
+# tool.z = 0.35 m on the wall at 1.2 m, by the law of cosines with two links of 1 m.
+REACH = np.hypot(1.2, 0.35)
+HELD = np.arctan2(0.35, 1.2) + np.arccos(REACH / 2), -2 * np.arccos(REACH / 2)
+
+FORCE = ConstantReference((20.0,))
+
+
+def left_out(name="seven_joint_wall", **changes):
+    """A shipped scenario without outputs and start; its references are force alone."""
+    open_ = {"outputs": [], "start": Start(), "references": {"wall.force": FORCE}}
+    return replace(scenario(name), **(open_ | changes))
+
+
+def names(completed):
+    return [s.name for s in scenario_model(completed.scenario).position_signals]
+
+
+def touching(*constraints):
+    """The seven-joint arm on other surfaces."""
+    forces = {f"{constraint.name}.force": FORCE for constraint in constraints}
+    return left_out(constraints=list(constraints), references=forces)
+
+
+def test_a_scenario_that_says_all_is_returned_as_it_is():
+    whole = scenario("seven_joint_wall")
+    completed = complete_scenario(whole)
+    assert completed.scenario is whole
+    assert completed.notes == ()
+
+
+def test_the_arm_on_the_wall_gets_the_outputs_and_the_start_that_were_chosen_by_hand():
+    """They are those of the shipped file: the elbow and the hand of the redundant arm are held."""
+    by_hand = scenario("seven_joint_wall")
+    written = {name: by_hand.references[name] for name in ("tool.y", "tool.z")}
+    open_ = left_out(references={**written, "wall.force": by_hand.references["wall.force"]})
+    completed = complete_scenario(open_)
+    assert completed.scenario.outputs == [
+        PointCoordinates("tool", "yz"),
+        TiltFromNormal("wall", "z", "xy"),
+        JointPositions(["joint3", "joint7"]),
+    ]
+    found = completed.scenario.start.positions
+    # Four decimals are written; the file's own numbers have as many.
+    assert {k: v for k, v in found.items() if v} == pytest.approx(by_hand.start.positions, abs=2e-4)
+    assert completed.notes[0].startswith("outputs completed by tool.y, tool.z, wall.tilt_x")
+    assert completed.notes[1].startswith("start found: {joint1: 0, joint2: -0.1938")
+
+
+def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path):
+    completed = complete_scenario(left_out(duration=0.3)).scenario
+    save_scenario(completed, tmp_path / "run.yaml")
+    again = load_scenario(tmp_path / "run.yaml")
+    assert again == completed
+    assert complete_scenario(again).scenario is again
+    errors = replace(again, start=replace(again.start, errors={"tool.y": 0.01}))
+    loop, _, record = run_scenario(errors)
+    off = np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)
+    assert off.max() < 1e-7  # The integrator's accuracy is 1e-8.
+
+
+@pytest.mark.parametrize(
+    ("kind", "held"),
+    [
+        ("fixed", ["tool.z_axis.y", "tool.z_axis.z"]),
+        ("free", []),
+    ],
+)
+def test_the_tool_axis_may_be_fixed_or_free(kind, held):
+    found = names(complete_scenario(left_out(tool_axis=kind)))
+    assert found[:2] == ["tool.y", "tool.z"]
+    assert [name for name in found[2:] if "joint" not in name] == held
+    assert len(found) == 6
+
+
+def test_outputs_given_in_part_are_kept_and_come_first():
+    part = left_out(
+        outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
+        references={"joint1": 0.1, "tool.z": 0.6, "wall.force": FORCE},
+    )
+    whole = complete_scenario(part)
+    completed, found = whole.scenario, names(whole)
+    assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
+    assert found[5] in ("joint5", "joint7", "joint3")
+    assert completed.start.positions["joint1"] == 0.1
+    assert list(completed.references) == [*part.references, *found[2:]]
+    assert {name: completed.references[name] for name in part.references} == part.references
+
+
+def test_what_references_name_becomes_an_output_and_follows_them():
+    """A circle of the tool is along the surface; a joint that is named is steered."""
+    circle = CircleReference([0.0, 0.6], 0.1, period=5.0)
+    named = left_out(references={"tool": circle, "joint3": 0.2, "wall.force": FORCE})
+    completed = complete_scenario(named)
+    found = names(completed)
+    assert found[:3] == ["tool.y", "tool.z", "joint3"]
+    assert completed.scenario.start.positions["joint3"] == 0.2
+    loop, context = build_scenario(completed.scenario)
+    simulate(loop.diagram, context, 0.1, completed.scenario.integrator)
+    record = loop.record(context)
+    wanted = [0.1 * np.cos(2 * np.pi * 0.1 / 5), 0.6 + 0.1 * np.sin(2 * np.pi * 0.1 / 5), 0.2]
+    np.testing.assert_allclose(record["desired_output"][-1, :3], wanted, rtol=1e-12)
+    # It starts at rest, on a circle that does not: off as predicted, to the integrator's 1e-8.
+    off = record["tracking_error"] - loop.predicted_error(record)
+    np.testing.assert_allclose(off, 0.0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_the_tool_starts_normal_to_a_surface_that_bends():
+    ball = Sphere((0.5, 0.0, 0.2), 0.25)
+    loop, context = build_scenario(touching(PointOnSurface("tool", ball, name="ball")))
+    links = loop.plant.model.links
+    q = loop.plant.state(loop.plant.GetMyContextFromRoot(context))[:7]
+    low, high = links.position_limits
+    assert np.all((low < q) & (q < high))
+    own = links.plant.CreateDefaultContext()
+    links.plant.SetPositions(own, q)
+    pose = links.plant.GetFrameByName("tool").CalcPoseInWorld(own)
+    normal = (pose.translation() - ball.center) / 0.25
+    # The tool's z axis points into the ball; Newton's method leaves 1e-10.
+    assert pose.rotation().matrix()[:, 2] == pytest.approx(-normal, abs=1e-8)
+
+
+def test_a_start_that_is_left_out_is_found_for_outputs_that_are_given():
+    """The default configuration is stretched, where B(x) is singular."""
+    by_hand = scenario("two_link_wall")
+    completed = complete_scenario(replace(by_hand, start=Start(errors={"tool.z": 0.05})))
+    assert len(completed.notes) == 1
+    assert completed.notes[0].startswith("start found: {joint1:")
+    loop, context = build_scenario(completed.scenario)
+    own = loop.plant.GetMyContextFromRoot(context)
+    plant = loop.plant.model.links.plant
+    placed = plant.CreateDefaultContext()
+    plant.SetPositions(placed, loop.plant.state(own)[:2])
+    x, _, z = plant.GetFrameByName("tool").CalcPoseInWorld(placed).translation()
+    assert (x, z) == pytest.approx((1.2, 0.35), abs=1e-9)
+
+
+def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_kinetic_energy():
+    """For one output z and one contact x it is sqrt(1 - c^2), c = J M^-1 P^T of unit rows."""
+    from drake_dae.robots.constraints.constraint_set import ConstraintSet
+    from drake_dae.robots.force_outputs import force_rows
+    from drake_dae.scenario.completion.postures import Postures
+
+    model = scenario_model(scenario("two_link_wall"))
+    links, bound = model.links, ConstraintSet(model.constraints)
+    height = model.positions[0].expression(links)
+    S = force_rows(model.forces, bound, links)
+    q = np.array([1.2, -1.6])
+    plant = links.plant
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    M = plant.CalcMassMatrixViaInverseDynamics(context)
+    tool, world = plant.GetFrameByName("tool"), plant.world_frame()
+    kind = JacobianWrtVariable.kV
+    x, _, z = plant.CalcJacobianTranslationalVelocity(context, kind, tool, [0, 0, 0], world, world)
+    c = x @ np.linalg.solve(M, z)
+    c /= np.sqrt((x @ np.linalg.solve(M, x)) * (z @ np.linalg.solve(M, z)))
+    for unit in (1.0, 1e3):  # In metres and in millimetres.
+        posture = Postures(links, bound, unit * height, S, [], {}).at(q)
+        assert posture.independence([0]) == pytest.approx(np.sqrt(1 - c**2), rel=1e-10)
+
+
+def refusal(open_):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(open_)
+    return str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_start_out_of_reach_is_told_with_the_output_and_by_how_much():
+    """The arm reaches 1.5 m at most from its shoulder."""
+    message = refusal(left_out(references={"tool": ConstantReference([0.0, 3.0])}))
+    assert message.startswith("references: the robot cannot start there within its joint limits")
+    assert "tool.z comes to 1." in message
+    assert "from 3 m" in message
+
+
+def test_a_surface_out_of_reach_is_told():
+    far = PointOnSurface("tool", Plane((4.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), name="wall")
+    message = refusal(touching(far))
+    assert message.startswith("constraints: the robot cannot start there")
+    assert "is left of the constraints" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"outputs": [PointCoordinates("tool", "y")]},
+            "references: left without one: tool.y",
+        ),
+        (
+            {"references": {"tool": ConstantReference((0.0,) * 4), "wall.force": FORCE}},
+            "references.tool: 4 values for 2 outputs",
+        ),
+        (
+            {"references": {f"joint{k}": 0.0 for k in range(1, 8)}},
+            "references: joint1, joint2, joint3, joint4, joint5, joint6, joint7 are 7 outputs, but "
+            "only 6 are missing",
+        ),
+        (
+            {"references": {"tol.y": 0.0, "wall.force": FORCE}},
+            "references.tol.y: no output 'tol.y'; did you mean 'tool.y'?",
+        ),
+    ],
+)
+def test_references_that_fit_no_completion_are_refused(changes, message):
+    assert refusal(left_out(**changes)).startswith(message)
+
+
+def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
+    """Two joints on a wall leave one output, and y is none: the scenario as shipped comes out."""
+    by_hand = scenario("two_link_wall")
+    completed = complete_scenario(replace(by_hand, outputs=[])).scenario
+    assert completed.outputs == by_hand.outputs
+    assert completed.references == by_hand.references
+    assert completed.start.positions == pytest.approx(
+        dict(zip(("joint1", "joint2"), HELD, strict=True)), abs=1e-4
+    )
+
+
+def test_a_robot_that_is_only_simulated_gets_no_outputs():
+    still = left_out("slider_crank", forces=[], references={})
+    assert complete_scenario(still).scenario is still

@@ -1,0 +1,53 @@
+"""What goes wrong in a scenario is told with the keys of a scenario."""
+
+import re
+
+import pytest
+from runs import scenario
+
+from drake_dae import build_scenario
+from drake_dae.dae.structure.assumptions import Cause, Violation
+from drake_dae.errors import AssumptionError, ScenarioError
+from drake_dae.scenario.keys import violated
+
+PYTHON = re.compile(r"drop_constraints|share_forces|dynamic_extension|plant\.\w+\(|Finalize")
+
+
+@pytest.mark.parametrize("cause", Cause)
+@pytest.mark.parametrize(("assumption", "key"), [(2, "constraints"), (5, "outputs")])
+def test_no_remedy_is_a_call_of_python(cause, assumption, key):
+    error = violated(Violation(assumption, cause, ("tool.z",), 2).error())
+    ((found, text),) = error.problems
+    assert found == key
+    assert text.startswith(f"Assumption ({assumption}): ")
+    assert not PYTHON.search(text), text
+
+
+def test_what_is_no_violation_is_told_as_it_is():
+    assert violated(AssumptionError("no integrators", 5)).problems == (
+        ("outputs", "no integrators"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "words"),
+    [
+        (
+            "two_link_wall",
+            "start={positions: {joint1: 0}}",
+            ["outputs: Assumption (4)", "start.positions"],
+        ),
+        (
+            "seven_joint_wall",
+            "start={positions: {joint1: 0}}",
+            ["outputs: Assumption (5)", "start.positions"],
+        ),
+        ("two_link_wall", "outputs.0.axes=xz", ["outputs: ", "Name in `forces`"]),
+    ],
+)
+def test_a_robot_that_cannot_start_is_sent_to_its_keys(name, setting, words):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(scenario(name, setting))
+    message = str(caught.value)
+    assert [word for word in words if word not in message] == [], message
+    assert not PYTHON.search(message)

@@ -1,0 +1,409 @@
+"""Bases, locked joints and actuators of a scenario, against robots whose files say the same."""
+
+import re
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from runs import run_scenario
+from vendors import joint, link, mobile_arm, panda, robot, write_panda
+
+from drake_dae import load_scenario
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.model import scenario_model
+from drake_dae.scenario.robot_file.changes import change_robot
+from drake_dae.scenario.robot_file.efforts import read_efforts
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.scenario import save_scenario
+
+# The collision meshes of the panda are left out.
+pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
+
+ARM = [f"panda_joint{k + 1}" for k in range(7)]
+
+# The hand on a wall, the fingers locked, the base on a table that is turned.
+PANDA = """
+robot:
+  file: panda_description/urdf/panda.urdf
+  base: {weld: panda_link0, pose: {translation: [0.1, 0.0, 0.2], rpy_deg: [0.0, 0.0, 10.0]}}
+  locked: {panda_finger_joint1: 0.03}
+  actuators: all
+constraints:
+- name: wall
+  frame: panda_hand
+  surface: !Plane {point: [0.8, 0.0, 0.0], normal: [-1.0, 0.0, 0.0]}
+outputs:
+- !PointCoordinates {frame: panda_hand, axes: yz}
+- !JointPositions {joints: [panda_joint3, panda_joint5, panda_joint6, panda_joint7]}
+gains: !Poles {all: [-4.0]}
+references:
+  panda_hand.y: !Sinusoids {offset: 0.3, amplitudes: [0.05], frequencies: [2.0]}
+  panda_hand.z: !Sinusoids {offset: 1.3, amplitudes: [0.04], frequencies: [2.0]}
+  panda_joint3: 0.2
+  panda_joint5: 0.1
+  panda_joint6: 1.3
+  panda_joint7: 0.4
+  wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}
+start:
+  positions: {panda_joint2: 0.5, panda_joint4: -1.1, panda_joint6: 1.3}
+  errors: {panda_hand.z: 0.01}
+duration: 1.0
+integrator: {accuracy: 1.0e-8}
+"""
+
+# An arm on a base whose wheels stand still, slanted.
+MOBILE = """
+robot:
+  file: mobile_arm.urdf
+  base: {weld: base_footprint, pose: {translation: [0.3, 0.2, 0.1], rpy_deg: [5.0, -10.0, 90.0]}}
+  locked: {left_axle: 0.4, right_axle: -0.7}
+  actuators: {shoulder: 60.0, elbow: null}
+constraints:
+- name: ceiling
+  frame: forearm
+  point: [0.0, 0.0, 0.3]
+  surface: !Plane {point: [0.0, 0.0, 1.1], normal: [0.0, 0.0, -1.0]}
+outputs: [!JointPositions {joints: [shoulder]}]
+gains: !Poles {all: [-4.0]}
+references:
+  shoulder: !Sinusoids {offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}
+  ceiling.force: 10.0
+start: {errors: {shoulder: 0.02}}
+duration: 1.0
+"""
+
+# Both fingers are coupled and the first one is driven; the seven joints follow as well.
+GRIP = """
+robot:
+  file: panda_description/urdf/panda.urdf
+  base: {weld: panda_link0}
+  actuators: all
+outputs: [!JointPositions {joints: [ARM, panda_finger_joint1]}]
+forces: []
+gains: !Poles {all: [-4.0]}
+references:
+  ARM: !Constant {values: [0.1, 0.5, 0.2, -1.1, 0.1, 1.3, 0.4]}
+  panda_finger_joint1: !Sinusoids {offset: 0.02, amplitudes: [0.01], frequencies: [2.0]}
+start: {errors: {panda_joint2: 0.05}}
+duration: 1.0
+""".replace("ARM", ", ".join(ARM))
+
+
+def files(folder: Path, text: str) -> Path:
+    write_panda(folder)
+    (folder / "mobile_arm.urdf").write_text(mobile_arm())
+    (folder / "scenario.yaml").write_text(text)
+    return folder / "scenario.yaml"
+
+
+def fixed(text: str, name: str, shift: str, turn: str = "0 0 0") -> str:
+    """A URDF in which a joint is a fixed one, at another place: what "locked" should be."""
+    old = re.search(rf'<joint name="{name}".*?</joint>', text, re.DOTALL)
+    assert old is not None
+    parent, child = (re.search(rf'<{one} link="(\w+)"', old[0])[1] for one in ("parent", "child"))
+    new = (
+        f'<joint name="{name}" type="fixed"><origin xyz="{shift}" rpy="{turn}"/>'
+        f'<parent link="{parent}"/><child link="{child}"/></joint>'
+    )
+    return text.replace(old[0], new)
+
+
+def standing(text: str, base: str, pose: RigidTransform) -> MultibodyPlant:
+    """A robot of Drake's own, without geometry, on its base."""
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(text, "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base), pose)
+    for index in plant.GetJointIndices():
+        if plant.get_joint(index).num_velocities() == 1:
+            plant.AddJointActuator(plant.get_joint(index).name(), plant.get_joint(index))
+    plant.Finalize()
+    return plant
+
+
+def expected_panda() -> MultibodyPlant:
+    text = fixed(panda(), "panda_finger_joint1", "0 0.03 0.06")
+    text = fixed(text, "panda_finger_joint2", "0 -0.03 0.06")
+    pose = RigidTransform(RollPitchYaw(0, 0, np.deg2rad(10)), [0.1, 0, 0.2])
+    return standing(text, "panda_link0", pose)
+
+
+def expected_mobile() -> MultibodyPlant:
+    text = fixed(mobile_arm(), "left_axle", "0 0.2 0.1", "0 0.4 0")
+    text = fixed(text, "right_axle", "0 -0.2 0.1", "0 -0.7 0")
+    pose = RigidTransform(RollPitchYaw(np.deg2rad([5, -10, 90])), [0.3, 0.2, 0.1])
+    return standing(text, "base_footprint", pose)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [(PANDA, expected_panda), (MOBILE, expected_mobile)], ids=["arm", "cart"]
+)
+def test_accelerations_are_those_of_a_robot_whose_file_says_the_same(text, expected, tmp_path):
+    """Fixed joints at other places, and welds, by hand; what is left is round-off."""
+    links = scenario_model(load_scenario(files(tmp_path, text))).links
+    plant = expected()
+    assert [signal.name for signal in links.position_signals] == list(
+        plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
+    )
+    masses = ca.vertcat(*[parameter.symbol for parameter in links.parameters])
+    u = ca.SX.sym("u", plant.num_actuators())
+    force = links.actuation_matrix @ u - links.bias
+    acceleration = ca.Function(
+        "acceleration", [links.q, links.v, u, masses], [ca.solve(links.mass_matrix, force)]
+    )
+    context = plant.CreateDefaultContext()
+    rng = np.random.default_rng(5)
+    values = [parameter.value.item() for parameter in links.parameters]
+    for _ in range(5):
+        q, v, torque = (rng.normal(size=n) for n in (links.q.numel(),) * 3)
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        plant.get_actuation_input_port().FixValue(context, torque)
+        wanted = plant.EvalTimeDerivatives(context).CopyToVector()[links.q.numel() :]
+        found = np.array(acceleration(q, v, torque, values)).ravel()
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [PANDA, MOBILE, GRIP], ids=["arm", "cart", "gripper"])
+def test_a_run_ends_with_the_predicted_error(text, tmp_path):
+    """The accuracy of a step, 1e-8 or 1e-6, leaves less than 1e-5 along the way."""
+    loop, _, record = run_scenario(load_scenario(files(tmp_path, text)))
+    error = record["tracking_error"]
+    assert record.time[-1] == 1.0
+    assert np.abs(error[0]).max() > 0.009
+    np.testing.assert_allclose(error, loop.predicted_error(record), atol=1e-5)
+    if text == GRIP:
+        q = record["state"][:, :9]
+        np.testing.assert_allclose(q[:, 8], q[:, 7], atol=1e-10)
+        assert np.ptp(q[:, 7]) > 0.008
+
+
+def test_what_leads_a_locked_joint_is_locked_as_well(tmp_path):
+    """q_2 = -0.5 q_1 + 0.1 = 0.3 has q_1 = -0.4, and q_3 = 2 q_2."""
+    mimics = ['<mimic joint="j1" multiplier="-0.5" offset="0.1"/>']
+    mimics += ['<mimic joint="j2" multiplier="2"/>', '<mimic joint="j5"/>']
+    text = robot(
+        "tree",
+        *(link(f"b{k}", 1.0) for k in range(7)),
+        joint("j1", "b0", "b1", "0 1 0"),
+        joint("j2", "b1", "b2", "0 1 0", rest=mimics[0]),
+        joint("j3", "b2", "b3", "0 1 0", rest=mimics[1]),
+        joint("j4", "b0", "b4", "0 1 0", rest=mimics[2]),
+        joint("j5", "b0", "b5", "0 1 0"),
+        joint("j6", "b0", "b6", "1 0 0"),
+    )
+    (tmp_path / "tree.urdf").write_text(text)
+    path = tmp_path / "tree.yaml"
+    path.write_text(
+        "robot: {file: tree.urdf, base: {weld: b0}, locked: {j2: 0.3}, actuators: all}\n"
+        "outputs: [!JointPositions {joints: [j5, j6]}]\nforces: []\n"
+        "references: {j5: 0, j6: 0}"
+    )
+    model = scenario_model(load_scenario(path))
+    assert [signal.name for signal in model.links.position_signals] == ["j4", "j5", "j6"]
+    assert [signal.name for signal in model.links.actuator_signals] == ["j5", "j6"]
+    assert [constraint.name for constraint in model.constraints] == ["j4_coupler"]
+    for number, angle in ((1, -0.4), (2, 0.3), (3, 0.6)):
+        weld = model.links.plant.GetJointByName(f"j{number}").X_FM()
+        np.testing.assert_allclose(
+            RollPitchYaw(weld.rotation()).vector(), [0, angle, 0], atol=1e-15
+        )
+    with pytest.raises(ScenarioError, match=r"j1 = 5 rad, as .* is coupled to has it, is outside"):
+        scenario_model(load_scenario(path, ["robot.locked.j2=-2.4"]))
+
+
+DRIVEN = """
+robot: {file: ROBOT}
+outputs: [!JointPositions {joints: [joint1]}]
+references: {joint1: 0}
+"""
+
+
+def test_actuators_of_the_file_stay_or_go(tmp_path):
+    """The two-link arm has two: u has the order of the file, limits those of the scenario."""
+    path = tmp_path / "driven.yaml"
+    path.write_text(DRIVEN.replace("ROBOT", "package://drake_dae_models/two_link_arm.urdf"))
+
+    def links(*settings: str):
+        outputs = "outputs.0.joints=[joint1, joint2]"
+        values = "references={joint1: 0, joint2: 0}"
+        many = [outputs, values] if "joint2" in settings[0] or "all" in settings[0] else []
+        return scenario_model(load_scenario(path, [*settings, *many])).links
+
+    own = links("robot.actuators=all")
+    assert len(own.actuator_signals) == 2
+    one = links("robot.actuators=[joint1]")
+    assert [signal.name for signal in one.actuator_signals] == [own.actuator_signals[0].name]
+    np.testing.assert_array_equal(one.effort_limits, own.effort_limits[:1])
+    limited = links("robot.actuators={joint2: 7, joint1: null}")
+    assert limited.actuator_signals == own.actuator_signals
+    np.testing.assert_array_equal(limited.effort_limits, [own.effort_limits[0], 7.0])
+
+
+def test_limits_of_the_scenario_are_those_of_actuators_that_it_adds(tmp_path):
+    links = scenario_model(load_scenario(files(tmp_path, MOBILE))).links
+    np.testing.assert_array_equal(links.effort_limits, [60.0, 87.0])
+
+
+@pytest.mark.parametrize("text", [PANDA, MOBILE], ids=["arm", "cart"])
+def test_a_saved_scenario_is_read_back_equal(text, tmp_path):
+    scenario = load_scenario(files(tmp_path, text))
+    save_scenario(scenario, tmp_path / "saved.yaml")
+    assert load_scenario(tmp_path / "saved.yaml") == scenario
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["robot.base=null"], ["body 'panda_link0' is free", "base: {weld: panda_link0}", "free"]),
+        (["robot.base={}"], ["robot.base: needs the key 'weld'; keys: weld, pose"]),
+        (["robot.base.wold=x"], ["robot.base: has no key 'wold'; did you mean 'weld'?"]),
+        (["robot.base=panda_link0"], ["robot.base: expected", "'panda_link0'"]),
+        (["robot.base.weld=panda_lnk0"], ["robot.base.weld: ", "did you mean 'panda_link0'?"]),
+        (["robot.base.weld=panda_hand"], ["robot.base.weld: ", "joint 'panda_hand_joint'"]),
+        (["robot.base.weld=world"], ["robot.base.weld: the world"]),
+        (["robot.base.pose.rpy_deg=[0, 0]"], ["robot.base.pose.rpy_deg: expected 3 numbers"]),
+        (["robot.free=[panda_link0]"], ["robot.free: ", "joint 'world_welds_to_panda_link0'"]),
+        (["robot.locked={panda_joint8: 0}"], ["robot.locked: ", "did you mean 'panda_joint"]),
+        (["robot.locked={panda_hand_joint: 0}"], ["robot.locked: ", "'panda_hand_joint'", "there"]),
+        (["robot.locked={panda_joint1: 3}"], ["robot.locked: ", "3 rad is outside", "-2.9 to 2.9"]),
+        (["robot.locked={panda_finger_joint1: 0.1}"], ["robot.locked: ", "0 to 0.04 m"]),
+        (["robot.locked.panda_finger_joint2=0"], ["robot.locked: ", "lock one of them"]),
+        (["robot.locked={panda_joint1: a}"], ["robot.locked.panda_joint1: expected a number"]),
+        (["robot.locked=[panda_joint1]"], ["robot.locked: expected names with values"]),
+        (["robot.locked.panda_joint7=0"], ["outputs.1: ", "'panda_joint7'", "there are"]),
+        (["robot.actuators=null"], ["robot.actuators: no joint of 'panda.urdf' is driven", "all"]),
+        (["robot.actuators=[]"], ["robot.actuators: no joint of 'panda.urdf' is driven"]),
+        (["robot.actuators=some"], ["robot.actuators: expected all, a list", "'some'"]),
+        (["robot.actuators=[1]"], ["robot.actuators: expected all, a list"]),
+        (["robot.actuators=[panda_joint0]"], ["robot.actuators: ", "did you mean 'panda_joint"]),
+        (["robot.actuators=[panda_finger_joint1]"], ["robot.actuators: ", "'panda_finger_joint1'"]),
+        (["robot.actuators={panda_joint1: 0}"], ["robot.actuators: ", "panda_joint1", "positive"]),
+        (["robot.actuators={panda_joint1: true}"], ["robot.actuators: ", "positive", "True"]),
+        (["robot.actuators=!Some {}"], ["robot.actuators: expected all"]),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_key(settings, words, tmp_path):
+    with pytest.raises(ScenarioError) as caught:
+        scenario_model(load_scenario(files(tmp_path, PANDA), settings), SceneGraph())
+    message = str(caught.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+    assert not re.search(r"plant\.\w+\(|Finalize", message)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "limits"),
+    [
+        ("all", dict.fromkeys(ARM, 87.0)),
+        (
+            "{panda_joint3: 12.5, panda_joint1: null}",
+            {"panda_joint3": 12.5, "panda_joint1": 87.0},
+        ),
+        ("[panda_joint2]", {"panda_joint2": 87.0}),
+    ],
+)
+@pytest.mark.parametrize("file", ["panda_description/urdf/panda.urdf", "arm.dmd.yaml"])
+def test_effort_limits_are_those_of_the_file_where_none_is_given(actuators, limits, file, tmp_path):
+    path = files(tmp_path, PANDA)
+    (tmp_path / "arm.dmd.yaml").write_text(
+        "directives: [{add_model: {name: arm, file: package://panda_description/urdf/panda.urdf}}]"
+    )
+    settings = [f"robot.actuators={actuators}", f"robot.file={file}"]
+    settings += ["robot.packages.panda_description=panda_description"]
+    chosen = load_scenario(path, settings).robot
+    plant, efforts = read_robot(chosen)
+    change_robot(chosen, plant, efforts)
+    found = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
+    assert {actuator.name(): actuator.effort_limit() for actuator in found} == limits
+    assert [actuator.name() for actuator in found] == list(limits)
+
+
+@pytest.mark.parametrize("effort", ["0", "none", ""])
+def test_an_effort_limit_that_tells_nothing_is_none(effort, tmp_path):
+    file = tmp_path / "robot.urdf"
+    file.write_text(robot("one", joint("j", "a", "b", "0 0 1")).replace("87.0", effort))
+    assert read_efforts({"": file}) == {}
+
+
+FRICTION = """
+robot: {file: arm.urdf, base: {weld: base}, actuators: all, leave_out: [joint_friction]}
+outputs: [!JointPositions {joints: [j]}]
+references: {j: 0}
+"""
+
+
+def test_joint_friction_is_left_out_where_the_scenario_says_so(tmp_path):
+    friction = '<dynamics damping="0.5" friction="1.0"/>'
+    arm = joint("j", "base", "arm", "0 1 0", rest=friction)
+    (tmp_path / "arm.urdf").write_text(robot("arm", link("base", 1), link("arm", 1), arm))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
+    assert links.plant.GetJointByName("j").default_damping() == 0.5
+    with pytest.raises(ScenarioError) as caught:
+        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[]"]))
+    message = str(caught.value)
+    assert message.startswith(f"robot.file: {tmp_path / 'arm.urdf'}:")
+    assert "joint 'j': Coulomb friction" in message
+    assert "leave_out: [joint_friction] under robot" in message
+    with pytest.raises(
+        ScenarioError,
+        match=r"leave_out\.0: expected one of joint_friction, inertia, constraints, got 'x'",
+    ):
+        load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[x]"])
+
+
+def test_an_inertia_that_no_body_has_is_that_of_a_ball_of_water_where_the_scenario_says_so(
+    tmp_path,
+):
+    """Moments (2, 1, 0.1) kg m^2 are none: 2 > 1 + 0.1. A ball of 1 kg has 2/5 m r^2."""
+    wrong = link("arm", 1).replace('ixx="0.02"', 'ixx="2"').replace('iyy="0.02"', 'iyy="1"')
+    (tmp_path / "arm.urdf").write_text(
+        robot("arm", link("base", 1), wrong, joint("j", "base", "arm", "0 1 0"))
+    )
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    links = scenario_model(
+        load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[inertia]"])
+    ).links
+    body = links.plant.GetBodyByName("arm")
+    radius = np.cbrt(3 / (4 * np.pi) * 1e-3)  # Of a kilogramme of water, m.
+    assert body.default_mass() == pytest.approx(1.0)
+    moments = body.default_unit_inertia().get_moments()
+    lever = 0.01**2 + 0.02**2 + 0.12**2 - np.square([0.01, 0.02, 0.12])
+    np.testing.assert_allclose(moments, 0.4 * radius**2 + lever, rtol=1e-9)
+    with pytest.raises(ScenarioError, match=r"link 'arm': .* leave_out: \[inertia\] under robot"):
+        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[]"]))
+
+
+def test_a_transmission_without_effort_needs_actuators(tmp_path):
+    """Drake leaves such a transmission out; whoever names the driven joints has answered it."""
+    drive = (
+        "<transmission><type>transmission_interface/SimpleTransmission</type>"
+        '<joint name="j"/><actuator name="m"/></transmission>'
+    )
+    arm = joint("j", "base", "arm", "0 1 0", effort=0.0)
+    (tmp_path / "arm.urdf").write_text(robot("arm", link("base", 1), link("arm", 1), arm, drive))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
+    np.testing.assert_array_equal(links.effort_limits, [np.inf])
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*joint 'j'.* under robot\.actuators"):
+        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))
+
+
+def test_what_drake_refuses_to_change_is_told(tmp_path):
+    """An actuator of the file has the name that the one of another joint would get."""
+    drive = (
+        "<transmission><type>transmission_interface/SimpleTransmission</type>"
+        '<joint name="j"/><actuator name="k"/></transmission>'
+    )
+    bodies = [link(name, 1) for name in ("base", "arm", "hand")]
+    joints = [joint("j", "base", "arm", "0 1 0"), joint("k", "arm", "hand", "0 1 0")]
+    (tmp_path / "arm.urdf").write_text(robot("arm", *bodies, *joints, drive))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*'k'"):
+        scenario_model(load_scenario(tmp_path / "arm.yaml"))

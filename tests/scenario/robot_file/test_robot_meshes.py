@@ -1,0 +1,248 @@
+"""Meshes that Drake cannot read or draw are left out by name; the rest of a robot is as it was."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import Role, SceneGraph
+from runs import run_scenario
+from vendors import COLLADA, binary_stl, write_panda, write_ur5
+
+from drake_dae import build_scenario, load_scenario
+from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
+from drake_dae.pictures.view import start_meshcat
+from drake_dae.scenario.parts import Robot
+from drake_dae.scenario.robot_file.reading import read_robot
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def count(scene_graph: SceneGraph, role: Role) -> int:
+    return len(scene_graph.model_inspector().GetAllGeometryIds(role))
+
+
+def read(file: Path, scene_graph: SceneGraph, **more: object):
+    return read_robot(Robot(str(file), **more), scene_graph)[0]
+
+
+def test_collision_meshes_are_left_out_by_name_and_the_rest_stays(tmp_path: Path):
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning) as told:
+        plant = read(write_panda(tmp_path), scene_graph)
+    (message,) = (str(warning.message) for warning in told)
+    assert all(f"'panda_link{k}.stl'" in message for k in range(8))
+    assert "'finger.stl'; no equation needs it" in message
+    assert "\n" not in message
+    assert (plant.num_joints(), plant.num_constraints()) == (10, 1)
+    assert count(scene_graph, Role.kProximity) == 0
+    assert count(scene_graph, Role.kIllustration) == 11
+
+
+def test_names_beside_the_file_lead_to_the_same_meshes(tmp_path: Path):
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning, match=r"'link\.stl'; no"):
+        read(write_ur5(tmp_path), scene_graph)
+    inspector = scene_graph.model_inspector()
+    drawn = {
+        Path(inspector.GetShape(one).source().path()).resolve()
+        for one in inspector.GetAllGeometryIds(Role.kIllustration)
+    }
+    assert drawn == {tmp_path / "meshes" / "link.dae"}
+
+
+def test_a_collision_that_drake_can_read_stays(tmp_path: Path):
+    file = write_ur5(tmp_path)
+    (tmp_path / "meshes" / "good.obj").write_text(OBJ)
+    text = file.read_text()
+    file.write_text(text.replace("link.stl", "good.obj", 3))
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning, match=r"left out: 'link\.stl'; no"):
+        read(file, scene_graph)
+    assert count(scene_graph, Role.kProximity) == 3
+    file.write_text(text.replace("link.stl", "good.obj"))
+    read(file, scene_graph := SceneGraph())
+    assert count(scene_graph, Role.kProximity) == 7
+
+
+def test_a_material_keeps_the_colour_that_it_has_first(tmp_path: Path):
+    """Drake refuses a URDF that gives a name two colours, other readers take one."""
+    part = (
+        '<visual><geometry><sphere radius="0.1"/></geometry>\n<material name="paint">'
+        '<color\n rgba="{} 0 0 1"/></material></visual>\n'
+    )
+    links = "".join(
+        f'<link name="{n}">{part.format(red)}</link>' for n, red in (("a", 1), ("b", 0))
+    )
+    joint = '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
+    (tmp_path / "paint.urdf").write_text(f'<robot name="r">{links}{joint}</robot>')
+    scene_graph = SceneGraph()
+    read(tmp_path / "paint.urdf", scene_graph)
+    inspector = scene_graph.model_inspector()
+    found = [
+        inspector.GetProperties(one, Role.kIllustration).GetProperty("phong", "diffuse").r()
+        for one in inspector.GetAllGeometryIds(Role.kIllustration)
+    ]
+    assert found == [1.0, 1.0]
+
+
+def test_a_collision_with_too_few_points_is_left_out(tmp_path: Path):
+    file = write_ur5(tmp_path)
+    (tmp_path / "meshes" / "link.obj").write_text("v 0 0 0\n")
+    file.write_text(file.read_text().replace("link.stl", "link.obj"))
+    with pytest.warns(GeometryWarning, match=r"'link\.obj'"):
+        read(file, SceneGraph())
+
+
+def test_models_of_directives_are_read_so_too(tmp_path: Path):
+    write_panda(tmp_path)
+    (tmp_path / "cell.dmd.yaml").write_text(
+        "directives:\n"
+        + "".join(
+            f"- add_model: {{name: {name}, file: "
+            "'package://panda_description/urdf/panda.urdf'}\n"
+            f"- add_weld: {{parent: world, child: '{name}::panda_link0'}}\n"
+            for name in ("left", "right")
+        )
+    )
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning, match=r"'hand\.stl'"):
+        plant = read(tmp_path / "cell.dmd.yaml", scene_graph)
+    assert plant.HasModelInstanceNamed("left")
+    assert plant.num_joints() == 22
+    assert count(scene_graph, Role.kIllustration) == 22
+
+
+SDF = """<sdf version="1.9"><model name="m">
+<!-- <collision name="old"><geometry><mesh><uri>none.stl</uri></mesh></geometry></collision> -->
+<link name="a"><collision name="c"><geometry><mesh><uri>a.stl</uri></mesh></geometry></collision>
+<visual name="v"><geometry><mesh><uri>a.dae</uri></mesh></geometry></visual>
+<collision name="d"><geometry><sphere><radius>0.1</radius></sphere></geometry></collision></link>
+</model></sdf>"""
+
+
+def test_sdformat_is_read_so_too(tmp_path: Path):
+    (tmp_path / "a.stl").write_bytes(binary_stl())
+    (tmp_path / "a.dae").write_text(COLLADA)
+    (tmp_path / "robot.sdf").write_text(SDF)
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning, match=r"left out: 'a\.stl'; no"):
+        read(tmp_path / "robot.sdf", scene_graph)
+    assert count(scene_graph, Role.kProximity) == 1
+    assert count(scene_graph, Role.kIllustration) == 1
+
+
+def test_what_meshcat_cannot_draw_is_named(tmp_path: Path):
+    file = write_ur5(tmp_path)
+    text = file.read_text().replace("link.dae", "link.stl")
+    file.write_text(text.replace("<collision>", "<!--").replace("</collision>", "-->"))
+    with pytest.warns(GeometryWarning, match=r"left out of the picture: 'link\.stl'; it draws"):
+        read(file, SceneGraph())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("<limit", "<limit ><limit", ["ur5.urdf:", "error"]),
+        ('<mass value="4.0"/>', '<mass value="-4.0"/>', ["link 'base_link'", "mass is positive"]),
+        ("link.dae", "none.dae", ["none.dae", "not exist"]),
+    ],
+)
+def test_other_faults_of_a_file_are_told_as_before(old: str, new: str, words, tmp_path: Path):
+    """The message has the file that the user has, not the copy, and the line in it."""
+    file = write_ur5(tmp_path)
+    text = file.read_text().replace(old, new, 1)
+    if old == "<limit":
+        text = text.replace("</robot>", "")
+    file.write_text(text)
+    line = 1 + text[: text.index(new)].count("\n")
+    with pytest.raises(ModelError) as caught:
+        read(file, SceneGraph())
+    message = str(caught.value)
+    assert str(file) in message
+    assert old == "<limit" or f"{file}:{line}" in message
+    assert [word for word in words if word not in message] == []
+
+
+UR5 = """
+robot: {file: robots/ur5.urdf, base: {weld: base_link}, actuators: all}
+outputs:
+- !JointPositions
+  joints: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint,
+    wrist_3_joint]
+gains: !Poles {all: [-3.0]}
+references: {shoulder_pan_joint: 0.2, shoulder_lift_joint: 0.3, elbow_joint: 0.4,
+  wrist_1_joint: 0.1, wrist_2_joint: 0.2, wrist_3_joint: 0.3}
+"""
+
+
+def test_a_robot_with_meshes_is_drawn(tmp_path: Path):
+    write_ur5(tmp_path)
+    (tmp_path / "ur5.yaml").write_text(UR5)
+    with pytest.warns(GeometryWarning, match="no equation needs it"):
+        loop, context = build_scenario(load_scenario(tmp_path / "ur5.yaml"), start_meshcat())
+    loop.diagram.ForcedPublish(context)
+
+
+def test_what_a_left_out_robot_names_outside_of_its_folder_is_refused(tmp_path: Path):
+    write_ur5(tmp_path)
+    (tmp_path / "ur5.yaml").write_text(UR5)
+    (tmp_path / "package.xml").unlink()
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(load_scenario(tmp_path / "ur5.yaml"))
+    assert "outside of the model's package or folder" in str(caught.value)
+    assert "robot.packages" in str(caught.value)
+
+
+MJCF = """<mujoco model="arm"><compiler angle="radian" meshdir="assets"/>
+<asset><mesh name="upper" file="upper.stl"/><mesh file="lower.obj"/>
+<!-- <mesh name="old" file="old.stl"/> --></asset>
+<worldbody><body name="a"><inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>
+<joint name="j1" type="hinge" axis="0 1 0"/><geom type="mesh" mesh="upper"/>
+<body name="b" pos="0 0 0.4"><inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.2 0.1"/>
+<joint name="j2" type="hinge" axis="0 1 0"/><geom type="mesh" mesh="lower"/></body></body>
+</worldbody>
+<actuator><motor joint="j1"/><motor joint="j2"/></actuator></mujoco>"""
+
+ARM = """
+robot: {file: arm.xml}
+outputs: [!JointPositions {joints: [j1, j2]}]
+gains: !Poles {all: [-3.0]}
+references: {j1: 0.2, j2: 0.3}
+start: {errors: {j1: 0.1}}
+duration: 0.5
+"""
+
+
+def write_mjcf(folder: Path, text: str = MJCF) -> Path:
+    (folder / "assets").mkdir()
+    (folder / "assets" / "upper.stl").write_bytes(binary_stl())
+    (folder / "assets" / "lower.obj").write_text(OBJ)
+    (folder / "arm.xml").write_text(text)
+    (folder / "arm.yaml").write_text(ARM)
+    return folder / "arm.yaml"
+
+
+def test_an_mjcf_robot_runs_without_the_meshes_that_drake_cannot_read(tmp_path: Path):
+    """Its masses are those of the file; the accuracy of a step, 1e-6, is in the prediction."""
+    path = write_mjcf(tmp_path)
+    scene_graph = SceneGraph()
+    with pytest.warns(GeometryWarning, match=r"left out: 'upper\.stl'; no equation"):
+        plant = read(tmp_path / "arm.xml", scene_graph)
+    assert [plant.GetBodyByName(name).default_mass() for name in "ab"] == [1.0, 2.0]
+    assert count(scene_graph, Role.kProximity) == 1
+    with pytest.warns(GeometryWarning):
+        loop, _, record = run_scenario(load_scenario(path))
+    predicted = loop.predicted_error(record)
+    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-5)
+
+
+@pytest.mark.parametrize("head", ['meshdir="assets"', 'meshdir="assets" inertiafromgeom="true"'])
+def test_an_mjcf_body_that_weighs_what_its_mesh_does_is_refused(head: str, tmp_path: Path):
+    text = MJCF.replace('meshdir="assets"', head)
+    if "inertiafromgeom" not in head:
+        text = text.replace('<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>', "")
+    path = write_mjcf(tmp_path, text)
+    with pytest.raises(
+        ScenarioError, match=r"robot\.file: body 'a' has its mass from .*upper\.stl"
+    ):
+        build_scenario(load_scenario(path))

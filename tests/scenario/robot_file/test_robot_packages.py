@@ -1,0 +1,151 @@
+"""Packages are found where ROS finds them, and a message says where to name the others."""
+
+from pathlib import Path
+
+import pytest
+from vendors import write_panda
+
+from drake_dae import load_scenario
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.model import scenario_model
+
+SCENARIO = """
+robot: {file: FILE, base: {weld: panda_link0}, locked: {panda_finger_joint1: 0.02}, actuators: all}
+outputs:
+- !JointPositions
+  joints: [panda_joint1, panda_joint2, panda_joint3, panda_joint4, panda_joint5, panda_joint6,
+    panda_joint7]
+references: {panda_joint1: 0.2, panda_joint2: 0.3, panda_joint3: 0.4, panda_joint4: -0.5,
+  panda_joint5: 0.6, panda_joint6: 0.7, panda_joint7: 0.8}
+"""
+PACKAGE = "<package><name>{}</name></package>"
+
+pytestmark = [
+    # Its collision meshes are left out.
+    pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),
+    pytest.mark.usefixtures("no_ros"),
+]
+
+
+@pytest.fixture
+def no_ros(monkeypatch):
+    monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
+
+
+def joints(folder: Path, file: str = "panda_description/urdf/panda.urdf", *settings: str) -> int:
+    (folder / "panda.yaml").write_text(SCENARIO.replace("FILE", file))
+    return len(
+        scenario_model(load_scenario(folder / "panda.yaml", settings)).links.position_signals
+    )
+
+
+def away(folder: Path) -> str:
+    """Puts the file far from its package, whose folder has another name."""
+    file = write_panda(folder)
+    (folder / "robots").mkdir()
+    file.rename(folder / "robots" / "panda.urdf")
+    (folder / "workspace").mkdir()
+    (folder / "panda_description").rename(folder / "workspace" / "panda")
+    return "robots/panda.urdf"
+
+
+def test_the_package_of_the_file_is_found(tmp_path: Path):
+    write_panda(tmp_path)
+    assert joints(tmp_path) == 7
+
+
+def test_its_name_is_that_of_package_xml_and_not_of_the_folder(tmp_path: Path):
+    write_panda(tmp_path)
+    (tmp_path / "panda_description").rename(tmp_path / "clone")
+    assert joints(tmp_path, "clone/urdf/panda.urdf") == 7
+
+
+def test_a_package_beside_that_of_the_file_is_found(tmp_path: Path):
+    file = write_panda(tmp_path)
+    (tmp_path / "my_cell" / "robots").mkdir(parents=True)
+    file.rename(tmp_path / "my_cell" / "robots" / "panda.urdf")
+    assert joints(tmp_path, "my_cell/robots/panda.urdf") == 7
+
+
+def test_a_package_in_ros_package_path_is_found(tmp_path: Path, monkeypatch):
+    file = away(tmp_path)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/none:{tmp_path}/workspace")
+    assert joints(tmp_path, file) == 7
+
+
+def test_the_file_itself_may_be_in_ros_package_path(tmp_path: Path, monkeypatch):
+    write_panda(tmp_path)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
+    assert joints(tmp_path, "package://panda_description/urdf/panda.urdf") == 7
+
+
+def test_packages_of_the_scenario_come_first(tmp_path: Path):
+    """The meshes of the file's own package are no more: those of the named one are read."""
+    write_panda(tmp_path)
+    (tmp_path / "panda_description" / "meshes").rename(tmp_path / "meshes")
+    with pytest.raises(ScenarioError, match="not exist"):
+        joints(tmp_path)
+    setting = "robot.packages.panda_description=."
+    assert joints(tmp_path, "panda_description/urdf/panda.urdf", setting) == 7
+
+
+def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypatch):
+    write_panda(tmp_path)
+    cell = tmp_path / "cell"
+    (cell / "models").mkdir(parents=True)
+    (cell / "package.xml").write_text(PACKAGE.format("cell"))
+    (cell / "models" / "all.dmd.yaml").write_text(
+        "directives: [{add_directives: {file: package://cell/models/one.dmd.yaml}}]"
+    )
+    (cell / "models" / "one.dmd.yaml").write_text(
+        "directives: [{add_model: {name: arm, file: package://panda_description/urdf/panda.urdf}}]"
+    )
+    assert joints(tmp_path, "cell/models/all.dmd.yaml") == 7
+
+
+def test_an_unknown_package_names_the_key_and_what_would_be_right(tmp_path: Path):
+    file = away(tmp_path)
+    with pytest.raises(ScenarioError) as caught:
+        joints(tmp_path, file)
+    message = str(caught.value)
+    assert message.startswith("robot.file: unknown package 'panda_description', which 'panda.urdf'")
+    assert "package.xml" in message
+    assert "ROS_PACKAGE_PATH" in message
+    assert "robot.packages, as packages: {panda_description: <folder>}" in message
+    assert joints(tmp_path, file, "robot.packages.panda_description=workspace/panda") == 7
+
+
+def test_a_folder_without_a_package_xml_is_no_package(tmp_path: Path):
+    """A file from a stranger must not make a package of whatever lies near it."""
+    write_panda(tmp_path)
+    (tmp_path / "panda_description" / "package.xml").unlink()
+    with pytest.raises(ScenarioError, match="unknown package 'panda_description'"):
+        joints(tmp_path)
+
+
+def test_a_package_that_nothing_needs_may_be_unknown(tmp_path: Path):
+    file = write_panda(tmp_path)
+    text = file.read_text()
+    gazebo = "<gazebo><plugin><file>package://other/a.so</file></plugin></gazebo></robot>"
+    comment = "<!-- package://none/a.stl -->"
+    file.write_text(text.replace("</robot>", comment + gazebo))
+    assert joints(tmp_path) == 7
+    file.write_text(file.read_text().replace("panda_link7.dae", "lost.dae"))
+    with pytest.raises(ScenarioError, match=r"lost\.dae"):
+        joints(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "settings", "words"),
+    [
+        ("package://non/a.urdf", (), ["robot.file: unknown package 'non' is", "robot.packages"]),
+        ("a.urdf", ("robot.packages.x=none",), ["robot.packages.x: no package in", "/none'"]),
+        ("a.urdf", ("robot.packages.drake=.",), ["robot.packages.drake: ", "drake"]),
+        ("a.urdf", ("robot.packages=[x]",), ["robot.packages: expected names with values"]),
+    ],
+)
+def test_packages_that_are_none(file: str, settings: tuple[str, ...], words, tmp_path: Path):
+    (tmp_path / "a.urdf").write_text("<robot name='a'><link name='b'/></robot>")
+    with pytest.raises(ScenarioError) as caught:
+        joints(tmp_path, file, *settings)
+    assert [word for word in words if word not in str(caught.value)] == [], str(caught.value)

@@ -1,0 +1,159 @@
+"""What a scenario with Drake's contact uses where nothing is said, and its observer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from runs import scenario
+
+from drake_dae import build_scenario, contact_gains, load_scenario
+from drake_dae.cli import main
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario import parts as parts
+from drake_dae.scenario.advice import advised
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.model import scenario_model, scenario_structure
+from drake_dae.scenario.scenario import Scenario, save_scenario
+
+PLANT = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, friction: 0.3}"
+STILL = "references={tool.z: 0.3, wall.force: 20}"
+LATE = "sampling={period: 1.0e-3, delay: 1.0e-3}"
+
+
+def two_link(*settings: str) -> Scenario:
+    found = scenario("two_link_wall", "duration=0.02", PLANT, STILL, LATE, "gains=", *settings)
+    found.start.errors.clear()
+    return found
+
+
+def chosen(found: Scenario) -> Scenario:
+    return build_completed(found)[0].scenario
+
+
+def test_what_is_left_out_is_advised_and_told():
+    found = two_link("constraints.0.friction=0.0")
+    completed, loop = build_completed(found)
+    assert len(completed.notes) == 1
+    assert "1e+05 N/m" in completed.notes[0]
+    assert "friction of: wall" in completed.notes[0]
+    model = scenario_model(found)
+    structure = scenario_structure(model)
+    mobility = structure.constraint_matrix(structure.states[0]).item()
+    wanted = contact_gains(1e5, mobility, 1e-3, 1)
+    run = completed.scenario
+    assert run.integral == ["tool.z", "wall.force"]
+    assert run.gains.outputs["tool.z"] == pytest.approx(wanted.position_gains(3), rel=1e-2)
+    assert run.gains.outputs["wall.force"] == [pytest.approx(wanted.force_gain, rel=1e-2)]
+    assert run.constraint_damping.all == [pytest.approx(-wanted.constraint_damping, rel=1e-2)]
+    assert run.observer.rate == pytest.approx(wanted.observer_rate, rel=1e-2)
+    assert run.observer.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
+    assert run.force == parts.MeasuredForce(sample_period=1e-3)
+    assert loop.observer is not None
+    assert loop.observer.friction_signals[0].name == "wall.friction"
+
+
+def test_advice_takes_the_noise_of_the_encoders():
+    found = chosen(two_link("encoders={velocity_noise: 2.0e-3}"))
+    usual = chosen(two_link())
+    assert found.observer.rate == pytest.approx(usual.observer.rate / 2.0, rel=1e-2)
+
+
+def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
+    run = chosen(two_link("constraints.0.friction=0.0"))
+    save_scenario(run, tmp_path / "run.yaml")
+    again = load_scenario(tmp_path / "run.yaml")
+    assert again == run
+    completed, _ = build_completed(again)
+    assert completed.notes == ()
+    assert completed.scenario == run
+
+
+def test_run_tells_its_advice_and_what_it_identified(tmp_path, capsys):
+    out = tmp_path / "run"
+    write = "write={record: false, plots: false, animation: false}"
+    command = ["simulate", "wall_point_contact", "--out", str(out)]
+    assert main([*command, "--set", "duration=0.01", "--set", write]) == 0
+    assert "advised for a contact of 1e+05 N/m" in capsys.readouterr().out
+    told = (out / "summary.txt").read_text()
+    assert "advised for a contact of 1e+05 N/m" in told
+    assert "identified           wall.friction = " in told
+    assert load_scenario(out / "scenario.yaml").observer.friction == ["wall"]
+
+
+def test_what_is_said_stays():
+    own = "observer={rate: 5, friction_rate: 1}", "integral=[wall.force]"
+    found = chosen(two_link(*own, "constraint_damping={all: [-40]}"))
+    assert (found.observer.rate, found.integral) == (5, ["wall.force"])
+    assert found.constraint_damping.all == [-40]
+
+
+def test_gains_that_are_given_leave_all_else_as_it_was():
+    found = two_link("gains={all: [-25]}")
+    assert chosen(found) == found
+    assert found.integral == []
+    assert found.observer is None
+
+
+def test_nothing_is_advised_behind_springs():
+    found = two_link("actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]")
+    with pytest.raises(
+        ScenarioError, match=r"gains: behind springs, .* nothing is advised"
+    ) as told:
+        build_completed(found)
+    assert "wall_flexible_contact" in str(told.value)
+
+
+def test_ideal_plants_are_not_advised():
+    found = replace(two_link(), plant=parts.IdealConstraints())
+    assert found.gains == parts.Poles(all=[-4.0])
+    model = scenario_model(found)
+    assert advised(found, model, scenario_structure(model)).scenario is found
+
+
+def test_stiffness_of_a_patch_is_that_of_drakes():
+    """k = dF/dphi between two depths: within a fifth of 2 sqrt(pi E R F / h), E = 1e7 Pa, R = h.
+
+    Drake's patches have few faces. In a step of 1 us nothing moves.
+    """
+    plant = "plant=!MultibodyPlant {time_step: 1.0e-6, contact_model: hydroelastic, modulus: 1.0e7}"
+    loop, context = build_scenario(two_link(plant, "sampling="))
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    inner = loop.plant.GetMutableSubsystemContext(loop.plant.multibody, own)
+    found = []
+    for depth in (5.0e-4, 5.5e-4):
+        q = loop.plant.model.configuration(None, [1.2, -1.6], parameters(loop, 1.2 + depth))
+        loop.plant.multibody.SetPositionsAndVelocities(inner, [*q, 0.0, 0.0])
+        context.SetTime(0.0)
+        Simulator(loop.diagram, context).AdvanceTo(2e-6)
+        found.append(loop.plant.GetOutputPort("constraint_force").Eval(own).item())
+    mean = sum(found) / 2.0
+    stiffness = (found[1] - found[0]) / 5e-5
+    assert 5.0 < mean < 15.0
+    assert stiffness == pytest.approx(2.0 * np.sqrt(np.pi * 1e7 * mean), rel=0.2)
+
+
+def parameters(loop, wall):
+    """Those of the model with the wall elsewhere."""
+    dae = loop.plant.model.dae
+    values = dae.parameter_values
+    values[dae.parameter_slice("wall.position")] = [wall, 0.0, 0.0]
+    return values
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["observer={rate: -1}"], "rate must be positive"),
+        (["observer={rate: 5, friction: [wal]}"], "'wal' is no constraint with friction"),
+        (["observer={rate: 5, friction: [wall]}"], "give it friction: 0.0"),
+        (["observer={rate: 5}", "gains={all: [-9]}"], "needs the measured force"),
+        (
+            ["observer={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],
+            "observes at samples",
+        ),
+    ],
+)
+def test_observer_that_does_not_fit_is_refused(settings, message):
+    with pytest.raises(ScenarioError, match=message):
+        build_scenario(two_link(*settings))

@@ -1,0 +1,166 @@
+"""References in scenarios: each kind as a file says it, what is refused, and a run behind them."""
+
+import jsonschema
+import numpy as np
+import pytest
+from runs import run_scenario, scenario, scenario_validator
+
+from drake_dae import (
+    CircleReference,
+    CsvReference,
+    LineReference,
+    PathLimits,
+    PolylineReference,
+    SpiralReference,
+    TextReference,
+    WaypointsReference,
+    build_scenario,
+    load_scenario,
+)
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.scenario import save_scenario, scenario_data
+from drake_dae.scenario.shipped import find_scenario
+
+GENTLE = "limits: {speed: 0.2, acceleration: 1}"
+LIMITS = PathLimits(0.2, 1.0)
+FORMS = {
+    f"!Line {{start: [0, 1], end: [1, 2], {GENTLE}}}": LineReference([0, 1], [1, 2], LIMITS),
+    "!Circle {center: [0, 1], radius: 0.1, period: 3}": CircleReference([0, 1], 0.1, 3.0),
+    f"!Circle {{center: [0, 1], radius: 0.1, turns: -2, phase: 0.5, {GENTLE}}}": CircleReference(
+        [0, 1], 0.1, limits=LIMITS, turns=-2.0, phase=0.5
+    ),
+    f"!Spiral {{center: [0, 1], start_radius: 0, end_radius: 0.1, pitch: 0.02, {GENTLE}}}": (
+        SpiralReference([0, 1], 0.0, 0.1, 0.02, LIMITS)
+    ),
+    f"!Polyline {{points: [[0, 0], [1, 0], [1, 1]], corner: 0.1, order: 3, {GENTLE}}}": (
+        PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3)
+    ),
+    "!Waypoints {points: [[0, 0], [1, 0]], times: [0, 2], order: 2}": (
+        WaypointsReference([[0, 0], [1, 0]], [0, 2], order=2)
+    ),
+    f"!Waypoints {{points: [[0, 0], [1, 0], [0, 1]], {GENTLE}}}": (
+        WaypointsReference([[0, 0], [1, 0], [0, 1]], limits=LIMITS)
+    ),
+    "!Csv {file: /a.csv, columns: [y, z], smoothing: 0.1, start_time: 2}": CsvReference(
+        "/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0
+    ),
+    f"!Text {{text: A B, origin: [0, 0], height: 0.1, along: [-1, 0], press: [9, 1], {GENTLE}}}": (
+        TextReference("A B", [0, 0], 0.1, LIMITS, along=[-1, 0], press=[9, 1])
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_form_is_its_reference_and_is_written_as_such(form, tmp_path):
+    chosen = scenario("two_link_wall", f"references={{tool: {form}}}")
+    assert chosen.references == {"tool": FORMS[form]}
+    save_scenario(chosen, tmp_path / "copy.yaml")
+    assert load_scenario(tmp_path / "copy.yaml").references == chosen.references
+
+
+def test_the_schema_knows_all():
+    forms = ", ".join(f"'{place}': {form}" for place, form in enumerate([*FORMS, "2.0"]))
+    data = scenario_data(scenario("two_link_wall", f"references={{{forms}}}"))
+    scenario_validator().validate(data)
+    data["references"]["0"]["limit"] = {}
+    with pytest.raises(jsonschema.ValidationError):
+        scenario_validator().validate(data)
+
+
+def refusal(form):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(scenario("two_link_wall", f"references.tool.z={form}"))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ("!Line {start: [0.2], end: [0.3], limits: {speed: 1}}", ".limits: needs the key 'accele"),
+        (
+            "!Line {start: [0.2], end: [0.3], limits: {speed: 1, acceleration: 0}}",
+            ".limits: acceleration must be positive, got 0",
+        ),
+        (
+            "!Line {start: [0.2], end: [0.3], limits: {speed: 1, acelleration: 1}}",
+            ".limits: has no key 'acelleration'; did you mean 'acceleration'?",
+        ),
+        (
+            "!Line {start: [0.2], end: [0.3], limits: 3}",
+            ".limits: expected keys speed, acceleration, jerk, got 3",
+        ),
+        (f"!Line {{start: [0.2], end: 1, {GENTLE}}}", ".end: expected a list, got 1"),
+        (f"!Line {{start: [0.2], end: [0.2], {GENTLE}}}", ": start and end must differ"),
+        (f"!Line {{start: [0.2], end: [1], order: 99, {GENTLE}}}", ": order must be from 2 to 12"),
+        ("!Circle {center: [0, 0], radius: 1}", ": a circle takes either a period"),
+        ("!Circle {center: [0, 0], radius: 1, period: 2}", ": 2 values for 1 output: tool.z"),
+        ("!Circle {center: [0], radius: 1, period: 2}", ": center must be finite and of shape (2,"),
+        (
+            f"!Spiral {{center: [0, 0], start_radius: 1, end_radius: 1, pitch: 1, {GENTLE}}}",
+            ": start_radius and end_radius must differ",
+        ),
+        (f"!Polyline {{points: [0, 1], corner: 1, {GENTLE}}}", ".points.0: expected a list, got 0"),
+        (
+            f"!Polyline {{points: [[0], [0]], corner: 0.1, {GENTLE}}}",
+            ": points 0 and 1 are the same, (0.0,)",
+        ),
+        ("!Waypoints {points: [[0], [1]]}", ": waypoints take either times, or limits"),
+        ("!Waypoints {points: [[0], [1]], times: [0, 0]}", ": times must increase from 0 or later"),
+        ("!Csv {file: none.csv, columns: [z]}", "scenarios/none.csv': No such file"),
+        ("!Csv {file: 'a\0b', columns: [z]}", ""),
+        ("!Csv {file: biped.yaml, columns: [z]}", "no column 'time'; "),
+        ("!Csv {file: a.csv, columns: z}", ".columns: expected a list, got 'z'"),
+        (f"!Text {{text: é, origin: [0, 0], height: 1, {GENTLE}}}", ": text: no letter 'É'; there"),
+        (
+            f"!Text {{text: A, origin: [0, 0], height: 1, press: 3, {GENTLE}}}",
+            ".press: expected a list",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_key(form, message):
+    found = refusal(form)
+    assert found.startswith("references.tool.z")
+    assert message in found
+
+
+@pytest.mark.slow
+def test_a_robot_follows_what_a_file_tells(tmp_path):
+    """The file lies beside the scenario. The law's model is exact: accuracy 1e-8 leaves 1e-7."""
+    times = np.arange(0.0, 1.01, 0.05)
+    lines = [f"{t},{0.3 + 0.1 * np.sin(2 * t)},{20 + 5 * t}" for t in times]
+    (tmp_path / "way.csv").write_text("\n".join(["time,z,push", *lines]))
+    text = find_scenario("two_link_wall").read_text()
+    before, after = text.split("references:")[0], text[text.index("start:") :]
+    form = "{'tool.z, wall.force': !Csv {file: way.csv, columns: [z, push]}}"
+    (tmp_path / "own.yaml").write_text(f"{before}references: {form}\n{after}")
+    chosen = load_scenario(tmp_path / "own.yaml", ["duration=1", "start.errors={}"])
+    assert chosen.references["tool.z, wall.force"].file == str(tmp_path / "way.csv")
+    loop, _, record = run_scenario(chosen)
+    predicted = loop.predicted_error(record)
+    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-6)
+    middle = (record.time > 0.2) & (record.time < 0.8)
+    wanted = 0.3 + 0.1 * np.sin(2 * record.time[middle])
+    np.testing.assert_allclose(record["desired_output"][middle, 0], wanted, atol=5e-4)
+
+
+@pytest.mark.slow
+def test_the_writing_arm_writes_a_letter_and_presses_as_told():
+    """The D, from (0.2, 0.5) to the left: 0.1 m wide, 0.15 m high, after the start errors are gone.
+
+    Double poles at -4 leave 0.1 of 0.03 m when it begins at 1.5 s, and 0.2 mm 1.5 s later.
+    """
+    loop, _, record = run_scenario(
+        scenario("seven_joint_writing", "duration=5.5", "compiled=false")
+    )
+    np.testing.assert_allclose(
+        record["tracking_error"], loop.predicted_error(record), rtol=0, atol=1e-6
+    )
+    force = record["constraint_force"][:, 0]
+    np.testing.assert_allclose(force[record.time < 4.2], 20.0, atol=1e-9)
+    assert force.min() == pytest.approx(5.0, abs=1e-9)
+    drawn = (record.time > 3.0) & (force > 19.0) & (record.time < 4.6)
+    y, z = 0.2 - record["controlled_output"][drawn, 0], record["controlled_output"][drawn, 1] - 0.5
+    top, slope = 0.05 + 0.15 - z, 0.05 + z  # Of its corners cut at 45 degrees.
+    side = np.where(np.abs(z - 0.075) < 0.025, np.abs(y - 0.1), np.abs(y - np.minimum(top, slope)))
+    assert np.count_nonzero(drawn) > 40
+    assert np.minimum(side, np.abs(z)).max() < 3e-3

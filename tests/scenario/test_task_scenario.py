@@ -1,0 +1,183 @@
+"""Tasks in scenario files: the shipped one, its pictures, and what is refused."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from runs import run_scenario, scenario
+
+from drake_dae import Record, build_scenario, load_scenario, simulate, start_meshcat
+from drake_dae.cli import main
+from drake_dae.diagrams.task_loop import TaskLoop
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.build import build_loop
+from drake_dae.scenario.feasibility.feasibility import find_feasibility
+
+# At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
+SHORT = """
+robot: {file: package://drake_dae_models/two_link_arm.urdf}
+constraints:
+- {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
+outputs:
+- {frame: tool, axes: z}
+gains: {all: [-25]}
+task:
+  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
+  phases:
+  - !Approach {speed: 0.1, over: 0.1}
+  - !Press {force: 10, over: 0.1}
+  - !Move {references: {tool.z: 0.31, wall.force: 12}, duration: 0.2, over: 0.2}
+start: {positions: {joint1: 1.1653, joint2: -1.8326}}
+duration: 1.0
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+@pytest.mark.slow
+def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
+    """Its plots and its animation tell the phases."""
+    words = ["--set", "plant=!MultibodyPlant {radius: 1.0e-5}", "--set", "duration=0.3"]
+    words += ["--set", "constraint_damping={all: [-250]}"]
+    assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
+    told = capsys.readouterr().out
+    assert "wall.distance" in told
+    assert "\n0 s: Approach, the task begins; 0 N, 0.0" in told
+    assert ": Press, after a force of 0.5 N; " in told
+    assert (tmp_path / "run" / "outputs.png").stat().st_size > 10_000
+    page = (tmp_path / "run" / "animation.html").read_text()
+    assert '"phases": [[0.0, "Approach"], [0.' in page
+
+
+@pytest.mark.slow
+def test_command_runs_a_task_in_the_ideal_contact(file, tmp_path, capsys):
+    """Its contact opens and closes: the record has the impact, plots and animation show it."""
+    words = ["--set", "duration=0.3", "--set", "plant=!Unilateral {restitution: {wall: 0.0}}"]
+    assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
+    told = capsys.readouterr().out
+    assert "\nTracked as predicted" in told
+    assert "impact" in told
+    record = Record.load(tmp_path / "run" / "record.npz")
+    assert record.events[0].contacts == ("wall",)
+    assert_allclose(record.events[0].time, 0.25, atol=1e-3)
+    assert (tmp_path / "run" / "animation.html").exists()
+
+
+@pytest.mark.slow
+def test_live_view_draws_a_task(file):
+    meshcat = start_meshcat()
+    words = ["plant=!MultibodyPlant {radius: 1.0e-5}", "constraint_damping={all: [-250]}"]
+    found = load_scenario(file, words)
+    loop, context = build_scenario(found, meshcat)
+    simulate(loop.diagram, context, 0.02, found.integrator)
+    assert meshcat.HasPath("/contact/wall/surface")
+
+
+@pytest.mark.slow
+def test_shipped_task_touches_as_designed_and_is_as_predicted():
+    """Friction 0.3 at 0.03 m/s: the speed to 1e-5, outputs to 5e-5 of N and m, with 1e-6 a step.
+
+    The approach takes 1 s and half a ramp of 0.5 s, after 2.1 s on the way.
+    """
+    loop, context, record = run_scenario(
+        scenario("wall_polish", "duration=3.5", "integrator.accuracy=1e-6")
+    )
+    assert isinstance(loop, TaskLoop)
+    touch = loop.changes(context)[2]
+    assert touch.phase == "Press"
+    assert_allclose(touch.time, 2.1 + 1.0 + 0.25, atol=1e-5)
+    before = record.time < touch.time - 1e-6
+    assert_allclose(record["distance"][before][-1, 1], -0.03, atol=1e-5)
+    assert np.abs(record["tracking_error"] - loop.predicted_error(record)).max() < 5e-5
+
+
+def test_analysis_of_a_task_is_that_of_its_contact(file):
+    found = find_feasibility(load_scenario(file))
+    assert found.problems == ()
+    assert found.analysis.motion is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("task.phases=[]", "task: a task needs phases"),
+        ("task.phases.0.speed=-1", r"task\.phases\.0: Approach: speed must be positive, got -1"),
+        ("task.phases.0.sped=1", r"task\.phases\.0: !Approach has no key 'sped'"),
+        ("task.phases.1.if_lost=wait", r"task\.phases\.1\.if_lost: .*approach"),
+        ("task.phases.2.references={tool.x: 1}", "phase 3 of the task, Move: reference 'tool.x'"),
+        ("task.contact=floor", r"task\.contact: 'floor' is no constraint with one force"),
+        ("task.gains={all: [5]}", r"task\.gains: the error dynamics \(30\) are not Hurwitz"),
+        ("references={tool.z: 0.3}", "references: a task has the references of its phases"),
+        ("saturation=true", "saturation: the drives of a task have no limits"),
+        ("start.errors={tool.z: 0.1}", r"start\.errors: a task begins at start\.positions"),
+        ("start={}", r"start\.positions: needed"),
+        ("integral=[wall.force]", "integral: by the model the law meets 'wall.force' at once"),
+    ],
+)
+def test_what_does_not_fit_is_named_by_its_key(file, change, message):
+    with pytest.raises(ScenarioError, match=message):
+        build_scenario(load_scenario(file, [change]))
+
+
+def test_what_knows_no_tasks_says_so(file):
+    with pytest.raises(ScenarioError, match="task: sweeps and exports know `references` alone"):
+        build_loop(load_scenario(file))
+
+
+def test_a_rollout_of_a_task_is_refused_in_its_words(file, tmp_path, capsys):
+    assert main(["simulate", str(file), "--rollout", "--out", str(tmp_path / "run")]) == 1
+    assert "a rollout does not know tasks" in capsys.readouterr().err
+
+
+def test_a_task_that_begins_in_contact_starts_on_it(file):
+    """The positions of the file are 20 mm before the wall."""
+    change = ["task.phases=[!Press {force: 10}]", "start.positions.joint1=1.2"]
+    loop, context = build_scenario(load_scenario(file, change))
+    own = loop.plant.GetMyContextFromRoot(context)
+    assert abs(loop.plant.GetOutputPort("gap").Eval(own).item()) < 1e-12
+
+
+def test_a_task_has_the_noise_of_its_seed(file):
+    noisy = "force=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
+    found = []
+    for seed in (1, 2, 1):
+        loop, context = build_scenario(load_scenario(file, [noisy, f"force.seed={seed}"]))
+        own = loop.noise.GetMyContextFromRoot(context)
+        found.append(loop.noise.get_output_port().Eval(own).item())
+    assert found[0] == found[2] != found[1]
+
+
+def test_a_link_is_heavier_in_either_plant(file):
+    """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
+    sagged = []
+    for plant in ("!Unilateral {}", "!MultibodyPlant {time_step: 1.0e-4}"):
+        change = [f"plant={plant}", "plant_parameters={link2.mass: 13}", "duration=0.05"]
+        found = load_scenario(file, change)
+        loop, context = build_scenario(found)
+        simulate(loop.diagram, context, found.duration, found.integrator)
+        sagged.append(loop.record(context)["tracking_error"][-1, 0])
+    assert abs(sagged[0]) > 1e-3
+    assert sagged[1] == pytest.approx(sagged[0], rel=5e-3)
+
+
+def test_a_phase_takes_a_file_beside_the_scenario(file):
+    (file.parent / "path.csv").write_text("time,z\n0,0.30\n0.1,0.31\n0.2,0.32\n")
+    rows = "!Csv {file: path.csv, columns: [z]}"
+    loop, _ = build_scenario(load_scenario(file, [f"task.phases.2.references.tool.z={rows}"]))
+    reference = loop.controller.task.phases[2].references["tool.z"]
+    assert reference.file == str(file.parent / "path.csv")
+
+
+def test_a_summary_tells_that_a_task_stops_its_run(file, tmp_path, capsys):
+    words = ["--set", "task.phases.0.within=0.1", "--set", "task.phases.0.if_late=stop"]
+    words += ["--set", "write={plots: false, animation: false}", "--out", str(tmp_path / "run")]
+    assert main(["simulate", str(file), *words]) == 0
+    told = capsys.readouterr().out
+    assert "\n0.1 s: held, Approach has waited 0.1 s for a force of 0.5 N;" in told
+    assert "\nThe task stops the run there, 0.9 s early.\n" in told
+    assert main(["simulate", str(file), *words, "--set", "duration=0.05"]) == 0
+    assert "early" not in capsys.readouterr().out

@@ -1,0 +1,212 @@
+"""MJCF and SDFormat files as a user has them, with several constraints and meshes, unedited."""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import run_scenario
+
+from drake_dae import ClosedLoop, Record, load_scenario
+from drake_dae.errors import GeometryWarning, ScenarioError
+from drake_dae.scenario.model import scenario_model
+
+ROBOTS = Path(__file__).parent / "robots"
+
+SINE = "{offset: %s, amplitudes: [%s], frequencies: [2]}"
+REST = """
+gains: {all: [-4]}
+duration: 0.3
+integrator: {max_step_size: 0.01, use_error_control: false}
+"""
+ARM = f"""
+robot: {{file: {ROBOTS}/leaning_arm.xml}}
+constraints:
+- {{name: table, frame: palm, surface: {{point: [0, 0, 0.35], normal: [0, 0, 1]}}}}
+- name: wall
+  frame: finger
+  point: [0.12, 0, 0]
+  surface: {{point: [0.7, 0, 0], normal: [-1, 0, 0]}}
+outputs:
+- {{frame: palm, axes: x}}
+- {{frame: finger, point: [0.12, 0, 0], axes: z, name: tip}}
+references:
+  palm.x: 0.537
+  tip.z: !Sinusoids {SINE % (0.55, 0.03)}
+  table.force: 40
+  wall.force: !Sinusoids {SINE % (15, 5)}
+start:
+  positions: {{shoulder: -0.2, elbow: 1.355, wrist: -1.575, knuckle: -1.315}}
+  errors: {{tip.z: 0.02}}
+{REST}"""
+FIVE_BAR = f"""
+robot: {{file: {ROBOTS}/five_bar.sdf}}
+constraints:
+- name: wall
+  frame: right_rod
+  point: [0.3, 0, 0]
+  surface: {{point: [0.02, 0, 0], normal: [-1, 0, 0]}}
+outputs:
+- {{frame: right_rod, point: [0.3, 0, 0], axes: z, name: tip}}
+forces: [wall.force]
+references:
+  tip.z: !Sinusoids {SINE % (0.36, 0.03)}
+  wall.force: !Sinusoids {SINE % (15, 5)}
+start: {{errors: {{tip.z: 0.02}}}}
+{REST}"""
+
+
+def run(folder: Path, text: str, *settings: str) -> tuple[ClosedLoop, Record]:
+    (folder / "mine.yaml").write_text(text)
+    loop, _, record = run_scenario(load_scenario(folder / "mine.yaml", settings))
+    return loop, record
+
+
+def held_as_predicted(loop: ClosedLoop, record: Record) -> None:
+    """RK5 at 10 ms leaves 1e-8."""
+    predicted = loop.predicted_error(record)
+    assert np.max(np.abs(predicted)) > 0.01
+    np.testing.assert_allclose(record["tracking_error"], predicted, rtol=0, atol=1e-7)
+    assert np.max(np.abs(record["constraint_residual"])) < 1e-7
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory) -> tuple[ClosedLoop, Record]:
+    with pytest.warns(GeometryWarning, match=r"left out: 'hand\.stl'"):
+        return run(tmp_path_factory.mktemp("chain"), FIVE_BAR)
+
+
+@pytest.mark.slow
+def test_an_arm_of_mjcf_on_a_table_and_a_wall(tmp_path, caplog):
+    """Classes, an .obj and an .stl, sites and sensors; what no equation has is no noise."""
+    with pytest.warns(GeometryWarning, match=r"left out: 'hand\.stl'"):
+        loop, record = run(tmp_path, ARM)
+    held_as_predicted(loop, record)
+    forces = record["constraint_force"]
+    np.testing.assert_allclose(forces[:, 0], 40.0, atol=1e-9)
+    np.testing.assert_allclose(forces[:, 1], 15.0 + 5.0 * np.sin(2.0 * record.time), atol=1e-9)
+    assert not [one for one in caplog.messages if "leaning_arm.xml" in one]
+
+
+@pytest.mark.slow
+def test_a_closed_chain_of_sdformat_on_a_wall(chain):
+    """Its fifth joint closes the loop, and is a constraint of its name in the loop's plane."""
+    loop, record = chain
+    held_as_predicted(loop, record)
+    names = [signal.name for signal in record.signals["constraint_force"].signals]
+    assert names == ["wall.force", "pin.fx", "pin.fy"]
+    assert [signal.name for signal in record.signals["control"].signals] == [
+        "left_motor",
+        "right_motor",
+    ]
+    # The rods meet, by the plant's own kinematics.
+    plant = loop.plant.model.links.plant
+    context = plant.CreateDefaultContext()
+    for state in record["state"][::10]:
+        plant.SetPositions(context, state[: plant.num_positions()])
+        ends = [
+            plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(f"{side}_rod")) @ [0.3, 0.0, 0.0]
+            for side in ("left", "right")
+        ]
+        np.testing.assert_allclose(*ends, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_it_does_not_matter_where_a_loop_is_cut(chain, tmp_path):
+    """With the damped pin first in the file another joint is cut: the motors do the same."""
+    text = (ROBOTS / "five_bar.sdf").read_text()
+    start = text.index('    <joint name="pin"')
+    end = text.index("</joint>", start) + len("</joint>\n")
+    pin, rest = text[start:end], text[:start] + text[end:]
+    place = rest.index('    <link name="left_crank">')
+    text = re.sub(r"<(visual|collision).*</\1>", "", rest[:place] + pin + rest[place:])
+    (tmp_path / "five_bar.sdf").write_text(text)
+    _, first = chain
+    loop, second = run(tmp_path, FIVE_BAR, "robot.file=five_bar.sdf")
+    names = [signal.name for signal in second.signals["constraint_force"].signals]
+    assert names == ["wall.force", "right_joint.fx", "right_joint.fy"]
+    assert loop.plant.model.constraints[-1].name == "right_joint"
+    for name in ("control", "tracking_error"):
+        np.testing.assert_allclose(first[name], second[name], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        first["constraint_force"][:, 0], second["constraint_force"][:, 0], atol=1e-6
+    )
+
+
+SLIDER = """<sdf version="1.8"><model name="press">
+<link name="crank"><inertial><pose>0.1 0 0 0 0 0</pose><mass>1</mass></inertial></link>
+<joint name="motor" type="revolute"><parent>world</parent><child>crank</child>
+<axis><xyz>0 1 0</xyz><limit><effort>9</effort></limit></axis></joint>
+<link name="rod"><pose relative_to="crank">0.2 0 0 0 0.3 0</pose>
+<inertial><mass>1</mass></inertial></link>
+<joint name="big_end" type="revolute"><parent>crank</parent><child>rod</child>
+<axis><xyz>0 1 0</xyz><limit><effort>0</effort></limit></axis></joint>
+<link name="piston"><pose>0.5 0 0 0 0 0</pose><inertial><mass>1</mass></inertial></link>
+<joint name="small_end" type="revolute"><parent>rod</parent><child>piston</child>
+<axis><xyz>0 1 0</xyz><limit><effort>0</effort></limit></axis></joint>
+<joint name="barrel" type="TYPE"><parent>world</parent><child>piston</child>
+<axis><xyz>1 0 0</xyz><limit><lower>-0.4</lower><upper>0.4</upper><effort>0</effort></limit>
+<dynamics><damping>3</damping></dynamics></axis></joint></model></sdf>"""
+PRESS = """
+robot: {file: press.sdf}
+outputs: [!JointPositions {joints: [motor]}]
+forces: []
+references: {motor: -0.3}
+"""
+
+
+def press(folder: Path, kind: str):
+    (folder / "press.sdf").write_text(SLIDER.replace("TYPE", kind))
+    (folder / "mine.yaml").write_text(PRESS)
+    return scenario_model(load_scenario(folder / "mine.yaml"))
+
+
+def test_a_joint_that_slides_closes_a_loop(tmp_path):
+    """With its damping and its limits, held across the plane's normal alone."""
+    (barrel,) = press(tmp_path, "prismatic").constraints
+    assert (barrel.name, barrel.normal, barrel.axis) == ("barrel", "x", "z")
+    assert (barrel.damping, barrel.lower, barrel.upper) == (3.0, -0.4, 0.4)
+    assert len(barrel.force_signals) == 2
+
+
+def test_a_loop_that_cannot_be_cut_says_what_to_do(tmp_path):
+    joint = '<joint name="%s" type="fixed"><parent>%s</parent><child>%s</child></joint>'
+    links = "".join(
+        f'<link name="{name}"><inertial><mass>1</mass></inertial></link>' for name in "ab"
+    )
+    ends = ("one", "world", "a"), ("two", "a", "b"), ("three", "world", "b")
+    joints = "".join(joint % end for end in ends)
+    model = f'<sdf version="1.8"><model name="m">{links}{joints}</model></sdf>'
+    (tmp_path / "press.sdf").write_text(model)
+    (tmp_path / "mine.yaml").write_text(PRESS)
+    with pytest.raises(ScenarioError, match="joint 'three' closes a loop, and neither turns nor"):
+        scenario_model(load_scenario(tmp_path / "mine.yaml"))
+
+
+LINKED = """<mujoco model="m"><worldbody>
+<body name="a"><joint name="j1" type="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/></body>
+<body name="b" pos="1 0 0"><joint name="j2" type="hinge" axis="0 1 0"/>
+<geom size="0.1" pos="0 0 0.1" mass="1"/></body></worldbody>
+<equality><joint joint1="j1" joint2="j2" polycoef="0 2 0 0 0"/></equality>
+<actuator><motor joint="j1"/></actuator></mujoco>"""
+LINKED_SCENARIO = """
+robot: {file: linked.xml}
+constraints: [!JointCoupler {follower: j1, leader: j2, ratio: 2}]
+outputs: [!JointPositions {joints: [j1]}]
+forces: []
+references: {j1: 0.3}
+gains: {all: [-4]}
+"""
+
+
+def test_constraints_of_a_file_may_be_left_out_and_written_in_the_scenario(tmp_path):
+    (tmp_path / "linked.xml").write_text(LINKED)
+    (tmp_path / "mine.yaml").write_text(LINKED_SCENARIO)
+    with pytest.raises(ScenarioError, match=r"leave_out: \[constraints\] under robot"):
+        scenario_model(load_scenario(tmp_path / "mine.yaml"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        chosen = load_scenario(tmp_path / "mine.yaml", ["robot.leave_out=[constraints]"])
+        (coupler,) = scenario_model(chosen).constraints
+    assert (coupler.follower, coupler.ratio) == ("j1", 2.0)

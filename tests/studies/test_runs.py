@@ -1,0 +1,195 @@
+"""Runs of a study against the same scenarios run alone, and how each ends."""
+
+import numpy as np
+import pytest
+from runs import run_scenario, scenario
+
+from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
+from drake_dae.simulation.figures import run_figures
+from drake_dae.simulation.summary import Limits
+from drake_dae.studies.runs import (
+    Outcome,
+    Runner,
+    RunResult,
+    batches,
+    lasting,
+    structure_key,
+)
+
+SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
+
+# All of them live in a context of one closed loop.
+NUMBERS = [
+    {},
+    {"start.errors.tool.z": 0.02},
+    {"start.positions.joint1": 1.1},
+    {"plant_parameters.link1.mass": 11.0},
+    {"plant_parameters.link1.mass": [11.0]},
+    {"plant_parameters": {"wall.position": [1.21, 0.0, 0.0]}},
+    {"gains.all": [-8.0]},
+    {"gains": {"outputs": {"tool.z": [-3.0, -5.0]}}},
+    {"integrator.accuracy": 1e-4, "duration": 0.2},
+    {"integrator.start_time": 0.5},
+    {"write.plots": False, "description": "other"},
+    {},
+]
+
+
+def alone(base, changes):
+    """The figures of a variation in a closed loop of its own."""
+    chosen = read_scenario(varied_data(base, changes))
+    loop, _, record = run_scenario(chosen)
+    return run_figures(record, Limits.of(loop.plant.model))
+
+
+def check(base, changes, result, tolerance=0.0):
+    assert (result.outcome, result.reason) == (Outcome.FINISHED, "")
+    figures = dict(result.figures)
+    assert figures.pop("steps") >= 1
+    expected = alone(base, changes)
+    assert list(figures) == list(expected)
+    np.testing.assert_allclose(
+        list(figures.values()), list(expected.values()), rtol=tolerance, atol=tolerance
+    )
+
+
+@pytest.mark.slow
+def test_runs_that_share_a_loop_equal_runs_alone():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    assert len({structure_key(varied_data(base, changes), base) for changes in NUMBERS}) == 1
+    runner = Runner(base)
+    found = list(runner.run_all(list(enumerate(NUMBERS))))
+    assert runner.builds == 1
+    assert [result.run for result in found] == list(range(len(NUMBERS)))
+    for changes, result in zip(NUMBERS, found, strict=True):
+        # To the last bit, but where the nominal state of the model is another one, and a start is
+        # found from there by Newton's method to round-off.
+        check(base, changes, result, 1e-9 if "start.positions.joint1" in changes else 0.0)
+    assert found[0].figures == found[-1].figures
+    assert found[3].figures == found[4].figures != found[0].figures
+
+
+@pytest.mark.slow
+def test_seeds_of_the_sensor():
+    base = scenario_data(scenario("two_link_measured_force", "duration=0.05", "compiled=false"))
+    runner = Runner(base)
+    seeds = [1, 2, 1]
+    found = list(runner.run_all([(i, {"force.seed": seed}) for i, seed in enumerate(seeds)]))
+    assert runner.builds == 1
+    for seed, result in zip(seeds, found, strict=True):
+        check(base, {"force.seed": seed}, result)
+    assert found[0].figures == found[2].figures != found[1].figures
+
+
+def test_seed_of_encoders_needs_no_loop_of_its_own():
+    base = scenario_data(scenario("two_link_wall", "encoders={position_noise: 1.0e-5, seed: 1}"))
+    keys = {structure_key(varied_data(base, {"encoders.seed": seed}), base) for seed in (1, 2)}
+    assert len(keys) == 1
+
+
+def test_what_drakes_contact_has_otherwise_needs_a_loop_of_its_own():
+    """Its geometry and its masses are built in, and are not in a context."""
+    base = scenario_data(scenario("two_link_wall", "plant=!MultibodyPlant {}"))
+    moved = {"plant_parameters.wall.position": [1.21, 0.0, 0.0]}
+    assert structure_key(varied_data(base, moved), base) != structure_key(base, base)
+
+
+@pytest.mark.slow
+def test_what_is_advised_is_advised_anew_where_the_contact_is_another_one():
+    base = scenario_data(scenario("wall_point_contact"))
+    assert base["gains"] is None
+    stiff, later = ({"plant.stiffness": 1e6}, {"duration": 1.0})
+    assert structure_key(varied_data(base, later), base) == structure_key(base, base)
+    assert structure_key(varied_data(base, stiff), base) != structure_key(base, base)
+    given = varied_data(base, {"gains": {"all": [-8.0]}})
+    assert structure_key(given, base) != structure_key(base, base)
+
+
+def test_another_structure_is_built():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    variations = [
+        {"constraints.0.surface.point": [1.25, 0.0, 0.0]},
+        {"references.tool.z.offset": 0.2},
+        {"gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}},
+        {"actuation": [{"_tag": "!DcMotors", "torque_constant": 0.5, "inductance": 1e-2,
+                        "resistance": 1.0, "gear_ratio": 100.0}],
+         "integrator.max_step_size": 1e-3},
+    ]  # fmt: skip
+    assert len({structure_key(varied_data(base, v), base) for v in [*variations, {}]}) == 5
+    runner = Runner(base)
+    for changes, result in zip(
+        variations, runner.run_all(list(enumerate(variations))), strict=True
+    ):
+        check(base, changes, result)
+    assert runner.builds == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("total", [None, 1.0])
+def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
+    """By Drake's Simulator, and by rollouts."""
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    far = {"references.tool.z.offset": 1.0, "references.tool.z.amplitudes": [0.9], "duration": 2.0}
+    cases = [
+        ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "found no configuration"),
+        ({"start.positions.joint1": 9.0}, Outcome.REFUSED, "outside its limits"),
+        ({"plant_parameters.link7.mass": 1.0}, Outcome.REFUSED, "no parameter 'link7.mass'"),
+        ({"gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
+        ({"constraints": []}, Outcome.REFUSED, ": "),
+        ({"constraints": []}, Outcome.REFUSED, ": "),
+        ({"gains.all": [4.0]}, Outcome.REFUSED, "gains: "),
+        ({"duration": -1.0}, Outcome.REFUSED, "a duration must be positive"),
+        (far, Outcome.FAILED, "the simulation cannot go on at t = "),
+        ({}, Outcome.FINISHED, ""),
+    ]
+    runner = Runner(base, total)
+    results = list(runner.run_all([(i, changes) for i, (changes, _, _) in enumerate(cases)]))
+    assert runner.builds == 6  # A structure that is refused twice was sought once.
+    for (_, outcome, words), result in zip(cases, results, strict=True):
+        assert result.outcome is outcome, result
+        assert words in result.reason
+        assert bool(result.figures) == (outcome in (Outcome.FAILED, Outcome.FINISHED))
+        assert RunResult.from_dict(result.to_dict()) == result
+        if outcome is Outcome.FAILED:
+            assert 0.0 < result.figures["end [s]"] < 2.0
+
+
+def test_what_no_rollout_has_is_told_with_a_remedy():
+    base = scenario_data(scenario("two_link_wall", *SHORT, "sampling={period: 0.001}"))
+    assert Runner(base).why_not({}) is None
+    assert "run the loop by simulate" in str(Runner(base, 1.0).why_not({}))
+
+
+@pytest.mark.slow
+def test_tasks_vary_as_references_do():
+    """Their gains are built in; a rollout knows none of them."""
+    base = scenario_data(scenario("wall_polish", "duration=0.1", "compiled=false"))
+    slower = {"gains.all": [-20.0]}
+    assert structure_key(varied_data(base, slower), base) != structure_key(base, base)
+    (found,) = Runner(base).run_all([(0, slower)])
+    check(base, slower, found)
+    assert "rollouts know no tasks" in str(Runner(base, 1.0).why_not({}))
+
+
+def test_how_long_runs_of_one_structure_last():
+    base = scenario_data(scenario("two_link_wall", *SHORT))
+    walls = [{"constraints.0.surface.point": [x, 0.0, 0.0]} for x in (1.2, 1.25)]
+    starts = [{"start.errors.tool.z": z, "duration": 0.6} for z in (0.0, 0.01)]
+    assert lasting(base, [*starts, *walls]) == pytest.approx((2 * 0.6 + 2 * 0.3) / 2)
+
+
+def test_batches_have_one_structure_and_all_runs():
+    base = scenario_data(scenario("two_link_wall"))
+    walls = [1.2, 1.25, 1.3]
+    runs = [
+        (i, {"constraints.0.surface.point": [walls[i % 3], 0, 0], "start.errors.tool.z": 1e-5 * i})
+        for i in range(3000)
+    ]
+    found = batches(base, runs, workers=2)
+    assert sorted(pair for batch in found for pair in batch) == runs
+    for batch in found:
+        assert 1 <= len(batch) <= 32
+        assert len({run % 3 for run, _ in batch}) == 1
+    assert max(map(len, found)) > 1
+    # With few runs no worker waits for another one.
+    assert [len(batch) for batch in batches(base, runs[:5], workers=2)] == [1] * 5

@@ -1,0 +1,150 @@
+"""Grids, random and listed variations, and how the command line writes them."""
+
+import itertools
+
+import numpy as np
+import pytest
+from runs import scenario
+
+from drake_dae import grid_variations, listed_variations, random_variations
+from drake_dae.errors import ScenarioError
+from drake_dae.studies.variations import parse_variations
+
+
+def test_a_grid_has_every_combination_the_last_key_first():
+    values = {"a.b": [1, 2, 3], "c": ["x", "y"], "d": np.array([0.5])}
+    found = grid_variations(values)
+    assert found == [
+        {"a.b": a, "c": c, "d": d} for a, c, d in itertools.product([1, 2, 3], "xy", [0.5])
+    ]
+    assert type(found[0]["d"]) is float
+
+
+def test_listed_values_go_together():
+    assert listed_variations({"a": [1, 2], "b": [[3.0], [4.0]]}) == [
+        {"a": 1, "b": [3.0]},
+        {"a": 2, "b": [4.0]},
+    ]
+
+
+def test_a_seed_determines_random_values():
+    ranges = {"a": (-1.0, 3.0), "b": range(5), "c": ["x", "y"]}
+    first = random_variations(ranges, 50, seed=3)
+    assert first == random_variations(ranges, 50, seed=3)
+    assert first != random_variations(ranges, 50, seed=4)
+    # More runs, or other keys beside, change none that were there.
+    assert random_variations(ranges, 80, seed=3)[:50] == first
+    alone = random_variations({"b": range(5)}, 50, seed=3)
+    assert [changes["b"] for changes in alone] == [changes["b"] for changes in first]
+
+
+def test_random_values_are_even():
+    """By mean and variance of the uniform distributions, within five of their standard errors."""
+    count = 4000
+    found = random_variations({"a": (-1.0, 3.0), "b": range(2, 7), "c": [[1], [2]]}, count)
+    for values, mean, variance in (
+        ([v["a"] for v in found], 1.0, 16.0 / 12.0),
+        ([v["b"] for v in found], 4.0, 24.0 / 12.0),
+        ([v["c"][0] for v in found], 1.5, 1.0 / 4.0),
+    ):
+        assert abs(np.mean(values) - mean) < 5.0 * np.sqrt(variance / count)
+        # The variance of a square is at most that of the uniform distribution's, variance^2 * 0.8.
+        assert abs(np.var(values) - variance) < 5.0 * variance / np.sqrt(count)
+    assert min(v["a"] for v in found) >= -1.0
+    assert max(v["a"] for v in found) <= 3.0
+    assert {v["b"] for v in found} == {2, 3, 4, 5, 6}
+    assert all(type(v["b"]) is int for v in found)
+
+
+def parsed(*texts, count=None, seed=0, together=False):
+    chosen = scenario("two_link_measured_force")
+    return parse_variations(texts, chosen, count, seed, together)
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("duration=1..2:3", [1, 1.5, 2]),
+        ("duration=[1, 2.5]", [1, 2.5]),
+        ("duration=1.5", [1.5]),
+        ("force.seed=1..3:3", [1, 2, 3]),
+        ("start.errors.tool.z=-1e-2..1e-2:2", [-0.01, 0.01]),
+        ("gains.all=[[-4], [-8]]", [[-4], [-8]]),
+        ("gains=[!Poles {all: [-4]}]", [{"_tag": "!Poles", "all": [-4]}]),
+    ],
+)
+def test_values_of_an_option(text, values):
+    key = text.partition("=")[0]
+    assert parsed(text) == [{key: value} for value in values]
+
+
+def test_options_make_a_grid_or_go_together():
+    options = ("duration=[1, 2]", "force.seed=5..6:2")
+    assert len(parsed(*options)) == 4
+    assert parsed(*options, together=True) == [
+        {"duration": 1, "force.seed": 5},
+        {"duration": 2, "force.seed": 6},
+    ]
+
+
+def test_a_random_range_is_whole_where_the_key_is():
+    found = parsed("force.seed=1..9", "duration=1..9", "start.errors.tool.z=[0, 1]", count=30)
+    assert {type(v["force.seed"]) for v in found} == {int}
+    assert {type(v["duration"]) for v in found} == {float}
+    assert {v["start.errors.tool.z"] for v in found} == {0, 1}
+    assert max(v["force.seed"] for v in found) <= 9
+
+
+def test_ranges_within_a_value_are_drawn_each_on_its_own():
+    option = "plant_parameters.wall.position=[[1.19..1.21, 0, 0.5..0.6], [1.3, 0, 0]]"
+    found = [v["plant_parameters.wall.position"] for v in parsed(option, count=200, seed=3)]
+    drawn = np.array([value for value in found if value != [1.3, 0, 0]])
+    assert 60 < len(drawn) < 140
+    assert np.all(np.abs(drawn[:, 0] - 1.2) < 0.01)
+    assert np.all(np.abs(drawn[:, 2] - 0.55) < 0.05)
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2])[0, 1]) < 0.5
+    assert found[:50] == [
+        v["plant_parameters.wall.position"] for v in parsed(option, count=50, seed=3)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("texts", "options", "words"),
+    [
+        (["duration"], {}, "--vary duration.*KEY=VALUES|duration: expected KEY=VALUES"),
+        (["duration="], {}, "expected KEY=VALUES"),
+        ([".a=1"], {}, "expected KEY=VALUES"),
+        (["duration=[]"], {}, "duration: expected at least one value"),
+        (["duration=2..1:3"], {}, "duration: 2..1:3 is an empty range"),
+        (["duration=1..1"], {"count": 3}, "duration: 1..1 is an empty range"),
+        (["duration=1..2:1"], {}, "at least 2 values"),
+        (["duration=1..2"], {}, "1..2:11, or --random COUNT"),
+        (["start.errors=[{tool.z: 2..1}]"], {"count": 3}, "2..1 is an empty range"),
+        (["duration=[1"], {}, "duration: line 1"),
+        (["duration=1", "duration=2"], {}, "duration: the key varies twice"),
+        (["duration=[1, 2]", "force.seed=1"], {"together": True}, "duration has 2, force.seed has"),
+        (["duration=1..2"], {"count": 0}, "count must be a whole number from 1, got 0"),
+        (["duration=1..2"], {"count": 1, "seed": -1}, "seed must be a whole number from 0, got -1"),
+        (["duration=1..2:900000", "force.seed=1..9:9"], {}, "at most 1000000 runs, got 8100000"),
+        (["duration=1..2:900000000"], {}, "at most 1000000 runs"),
+    ],
+)
+def test_what_cannot_be_read_is_told(texts, options, words):
+    with pytest.raises(ScenarioError, match=words):
+        parsed(*texts, **options)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({"a": (1.0, 1.0)}, "the range .* is empty"),
+        ({"a": (1.0, float("inf"))}, "must be finite"),
+        ({"a": range(0)}, "at least one value"),
+        ({"a": []}, "at least one value"),
+        ({"a": "text"}, "expected a list of values"),
+        ({"a": [object()]}, "expected plain data"),
+    ],
+)
+def test_ranges_that_make_no_sense_are_refused(ranges, words):
+    with pytest.raises(ValueError, match=words):
+        random_variations(ranges, 2)

@@ -1,0 +1,136 @@
+"""Members of the families of robots that the package does not know: one class each.
+
+They show what it takes to add one, and keep the contracts as those of the package do.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from drake_dae import ForceOutput, PointOnSurface
+from drake_dae.dae.system.signals import Signal
+from drake_dae.robots.actuation.numbers import diagonal_parameter
+from drake_dae.robots.actuation.stage import AttachedStage, Stage
+from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots.surfaces.surface import Surface
+
+
+@dataclass(frozen=True)
+class RubbingPoint(PointOnSurface):
+    """A point on a surface with friction whose numbers are no parameters."""
+
+    coefficient: float = 0.3
+    speed: float = 0.05
+    is_ideal: ClassVar[bool] = False
+
+    def _sliding(self, kinematics):
+        """s = v_t / sqrt(|v_t|^2 + speed^2), shape (3, 1)."""
+        normal = self.surface.unit_normal(self.offset(kinematics))
+        velocity = kinematics.velocity(self.frame, self.point)
+        across = velocity - normal * ca.dot(normal, velocity)
+        return across / ca.sqrt(ca.sumsqr(across) + self.speed**2)
+
+    def reaction(self, kinematics, constraint_force):
+        rubbing = -self.coefficient * constraint_force * self._sliding(kinematics)
+        pushed = super().reaction(kinematics, constraint_force)
+        return pushed + kinematics.push(self.frame, rubbing, self.point)
+
+    def applications(self, kinematics):
+        (own,) = super().applications(kinematics)
+        rubbing = -self.coefficient * self._sliding(kinematics)
+        return (Application(own.point, own.force_axes + rubbing, own.moment_axes, self.frame),)
+
+
+@dataclass(frozen=True)
+class Mirror(Constraint):
+    """Two angles turn against each other, q_i + q_j = sum; its moment acts at no known frame."""
+
+    first: int
+    second: int
+    sum: float
+    name: str = "mirror"
+
+    @property
+    def force_signals(self):
+        return (Signal(f"{self.name}.moment", "N m"),)
+
+    @property
+    def residual_signals(self):
+        return (Signal(f"{self.name}.slip", "rad"),)
+
+    def residual(self, frames):
+        return frames.q[self.first] + frames.q[self.second] - self.sum
+
+    def applications(self, kinematics):
+        return ()
+
+
+@dataclass(frozen=True)
+class Saddle(Surface):
+    """z = bend (x^2 - y^2) above a point; the free side is above."""
+
+    point: tuple
+    bend: float
+
+    @property
+    def position(self):
+        return self.point
+
+    def distance(self, offset):
+        x, y, z = ca.vertsplit(offset)
+        slope = 2.0 * self.bend * ca.sqrt(x**2 + y**2)
+        return (z - self.bend * (x**2 - y**2)) / ca.sqrt(1.0 + slope**2)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueLag(Stage):
+    """Drives whose torque follows the control with a lag: T tau' = u - tau."""
+
+    time_constant: float | np.ndarray
+
+    def attach(self, links):
+        count = len(links.actuator_signals)
+        parameter, T = diagonal_parameter(
+            "torque_lag.time_constant", self.time_constant, count, "s", positive=True
+        )
+        torque = ca.SX.sym("tau", count)
+        return AttachedStage(
+            state=torque,
+            state_signals=tuple(Signal(f"{s.name}.torque", s.unit) for s in links.actuator_signals),
+            mass=ca.diag(T),
+            drift=lambda position, velocity: -torque,
+            drive_matrix=ca.SX.eye(count),
+            drive_signals=tuple(links.actuator_signals),
+            force=lambda position, velocity: torque,
+            parameters=(parameter,),
+            ports={"lagged_torque": slice(0, count)},
+        )
+
+
+def subclasses(family, package="drake_dae"):
+    """Every class of a family that the package has and that can be made."""
+    found, waiting = set(), [family]
+    while waiting:
+        for cls in waiting.pop().__subclasses__():
+            waiting.append(cls)
+            if cls.__module__.startswith(package) and not cls.__abstractmethods__:
+                found.add(cls)
+    return found
+
+
+@dataclass(frozen=True)
+class Pull(ForceOutput):
+    """What a constraint exerts on a frame along an axis of that frame, a unit vector."""
+
+    frame: str
+    constraint: str
+    axis: tuple[float, float, float]
+
+    def expression(self, constraints, kinematics, constraint_force):
+        _, force = constraints.force_on(self.frame, self.constraint, kinematics, constraint_force)
+        return ca.dot(ca.mtimes(kinematics.rotation(self.frame), ca.DM(self.axis)), force)
+
+    def signals(self, constraints):
+        return (Signal(f"{self.constraint}.pull", "N"),)

@@ -1,0 +1,71 @@
+"""Scenarios and closed loops, run into records."""
+
+from collections.abc import Callable, Iterable
+from functools import cache
+from typing import Any
+
+import jsonschema
+import pytest
+from _pytest.mark import ParameterSet
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context
+
+from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
+from drake_dae.scenario.scenario import Scenario, scenario_schema
+from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
+
+DEAR = (
+    "planar_3rrr",
+    "seven_joint_dome",
+    "seven_joint_flexible",
+    "seven_joint_pipe",
+    "seven_joint_writing",
+    "slider_crank",
+    "two_arms",
+    "two_arms_free_box",
+    "two_link_flexible",
+)
+"""Scenarios that show nothing which cheaper ones do not, where code is made of all of them."""
+
+
+def each_scenario(left_out: Callable[[str], bool]) -> list[ParameterSet]:
+    """The shipped scenarios but for some: all slow but the first one, the dear ones thorough."""
+    marks = {
+        "two_link_wall": [],
+        **{name: [pytest.mark.slow, pytest.mark.thorough] for name in DEAR},
+    }
+    return [
+        pytest.param(name, marks=marks.get(name, [pytest.mark.slow]))
+        for name in shipped_scenarios()
+        if not left_out(name)
+    ]
+
+
+def some(cases: Iterable[Any]) -> list[ParameterSet]:
+    """Cases of which every second one is thorough: they show the same."""
+    marks = ([], [pytest.mark.thorough])
+    return [pytest.param(case, marks=marks[i % 2]) for i, case in enumerate(cases)]
+
+
+def scenario(name: str, *settings: str) -> Scenario:
+    """A shipped scenario, with settings as those of `--set`."""
+    return load_scenario(find_scenario(name), settings)
+
+
+@cache
+def scenario_validator() -> jsonschema.Draft202012Validator:
+    """Of the JSON Schema of scenarios, which takes a second to check itself."""
+    schema = scenario_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+def run(loop: ClosedLoop, context: Context, duration: float, config: SimulatorConfig) -> Record:
+    simulate(loop.diagram, context, duration, config)
+    return loop.record(context)
+
+
+def run_scenario(chosen: Scenario) -> tuple[ClosedLoop, Context, Record]:
+    """A scenario from its start to its end, without Meshcat."""
+    loop, context = build_scenario(chosen)
+    return loop, context, run(loop, context, chosen.duration, chosen.integrator)

@@ -1,0 +1,76 @@
+"""Two of the shipped seven-joint arms that hold one object: 14 actuators, a loop of 6 equations."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae import (
+    AxisCoordinates,
+    ConstantReference,
+    JointPositions,
+    PointCoordinates,
+    RobotModel,
+    SinusoidReference,
+    WeldedFrames,
+)
+from drake_dae.robots.actuation.stage import Stage
+from drake_dae.scenario.shipped import FOLDER
+
+APART = 1.8
+LENGTH = 0.2
+"""Of the bases and of the object, in m, as in two_arms.dmd.yaml and held_box.urdf."""
+
+NOMINAL = np.tile([0.0, -0.7162933, 0.0, -1.7685105, 0.0, 0.9140075, 0.0], 2)
+"""Both elbows up, the object level, 0.4 m above the floor, midway between the bases."""
+
+GRASP = WeldedFrames(
+    "object",
+    "right::tool",
+    RigidTransform(RollPitchYaw(0.0, np.pi / 2, np.pi), [LENGTH / 2, 0.0, 0.0]),
+    name="grasp",
+)
+"""The right tool on the right end of the object; its fx presses the object together."""
+
+REFERENCES = [
+    SinusoidReference(APART / 2, 0.05, 2.0),
+    SinusoidReference(0.0, 0.05, 3.0),
+    SinusoidReference(0.4, 0.04, 2.5),
+    ConstantReference([0.0, 0.0]),
+    SinusoidReference(0.0, 0.1, 2.0),
+    ConstantReference([0.0, 0.0]),
+    SinusoidReference(40.0, 15.0, 4.0),
+    ConstantReference([0.0, 0.0]),
+    SinusoidReference(0.0, 1.0, 3.0),
+    ConstantReference([0.0, 0.0]),
+]
+"""The object moves and turns about x; fx presses with 40 N, mx twists, the rest stays zero."""
+
+
+def two_arms_plant() -> MultibodyPlant:
+    """Arms "left" and "right", and the object of 4 kg, which is fixed to the left tool."""
+    plant = MultibodyPlant(0.0)
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
+    parser.AddModelsFromUrl("package://drake_dae_models/two_arms.dmd.yaml")
+    plant.Finalize()
+    return plant
+
+
+def two_arms(actuation: Sequence[Stage] = ()) -> RobotModel:
+    """z_1 is the object's position, its orientation, and one joint of each arm's redundancy."""
+    return RobotModel.from_multibody(
+        two_arms_plant(),
+        constraints=[GRASP],
+        positions=[
+            PointCoordinates("object", "xyz"),
+            AxisCoordinates("object", "x", "yz"),
+            AxisCoordinates("object", "y", "z"),
+            JointPositions(["left::joint3", "right::joint3"]),
+        ],
+        nominal_positions=NOMINAL,
+        name="two arms",
+        actuation=actuation,
+    )

@@ -1,0 +1,139 @@
+"""Python frees what a closed loop was made of when nobody needs the loop any more."""
+
+import gc
+import sys
+from collections.abc import Callable
+from weakref import ref
+
+import arms
+import numpy as np
+import polishing
+import pytest
+from campaign.memory import resident
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import FirstOrderTaylorApproximation
+from runs import scenario
+
+from drake_dae import (
+    Approach,
+    ClosedLoop,
+    ConstantReference,
+    ForceSensor,
+    NormalForm,
+    RobotPlant,
+    StateRealization,
+    Task,
+    TaskController,
+    TrackingController,
+    build_scenario,
+    make_closed_loop,
+    simulate,
+    start_meshcat,
+)
+from drake_dae.systems.control.references import ReferenceGenerator
+
+
+def plant(feedback: bool = False) -> RobotPlant:
+    arm = arms.arm("two_link")
+    return RobotPlant(arm.model, structure=arm.structure, feedback=feedback)
+
+
+def loop(feedback: bool = False) -> ClosedLoop:
+    return make_closed_loop(plant(feedback), arms.law("two_link"), [ConstantReference([0.3, 15.0])])
+
+
+SYSTEMS = {
+    "plant": plant,
+    "controller": lambda: TrackingController(arms.law("two_link")),
+    "task": lambda: TaskController(Task([Approach()]), *polishing.laws()),
+    "references": lambda: ReferenceGenerator([ConstantReference([0.3, 15.0])], (2, 0)),
+    "sensor": lambda: ForceSensor(1, 0.01, 0.001, noise_deviation=0.1),
+    "realization": lambda: StateRealization(NormalForm(arms.arm("two_link").model.dae)),
+    "converted": lambda: plant().ToAutoDiffXd(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", SYSTEMS.values(), ids=SYSTEMS)
+def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], LeafSystem]):
+    system = make()
+    last = ref(system)
+    if "AutoDiff" not in type(system).__name__:
+        builder = DiagramBuilder()
+        builder.AddSystem(system)
+        diagram = builder.Build()
+        context = diagram.CreateDefaultContext()
+        diagram.GetSubsystemContext(system, context)
+        del builder, diagram, context
+    del system
+    gc.collect()
+    assert last() is None
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_a_loop_that_ran_is_freed_with_its_context_and_logs(feedback: bool):
+    made = loop(feedback)
+    context = made.diagram.CreateDefaultContext()
+    simulate(made.diagram, context, 0.02, arms.fixed_step())
+    made.record(context)
+    lasts = [ref(each) for each in (made, made.diagram, made.plant, made.controller)]
+    del made, context
+    gc.collect()
+    assert [last() for last in lasts] == [None] * 4
+
+
+def test_a_drawn_scenario_is_freed_with_its_model_and_its_geometry():
+    meshcat = start_meshcat()
+    made, context = build_scenario(scenario("two_link_wall"), meshcat)
+    simulate(made.diagram, context, 0.02, arms.fixed_step())
+    links = made.plant.model.links
+    forces = made.diagram.GetSubsystemByName("constraint_force_visualizer")
+    lasts = [ref(each) for each in (made.plant, forces, made.plant.model, links.plant)]
+    del made, context, links, forces
+    gc.collect()
+    assert [last() for last in lasts] == [None] * 4
+
+
+def test_a_linearized_loop_is_freed():
+    made = loop()
+    context = made.diagram.CreateDefaultContext()
+    FirstOrderTaylorApproximation(made.diagram, context)
+    last = ref(made.plant)
+    del made, context
+    gc.collect()
+    assert last() is None
+
+
+def test_a_loop_lives_as_long_as_its_simulator():
+    made = loop()
+    context = made.diagram.CreateDefaultContext()
+    simulator = Simulator(made.diagram, context)
+    size = made.plant.dae.num_states
+    del made, context
+    gc.collect()
+    simulator.AdvanceTo(0.02)
+    state = simulator.get_context().get_continuous_state_vector().CopyToVector()
+    assert state.shape == (size,)
+    assert np.all(np.isfinite(state))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize(("again", "count"), [("loop", 200), ("scenario", 20)])
+def test_memory_does_not_grow_with_the_number_of_loops(again: str, count: int):
+    chosen = scenario("two_link_wall")
+
+    def once() -> None:
+        if again == "scenario":
+            build_scenario(chosen)
+        else:
+            loop().diagram.CreateDefaultContext()
+
+    for _ in range(count // 4):  # What CasADi, Drake and the allocator keep once.
+        once()
+    before = resident()
+    for _ in range(count):
+        once()
+    # A loop takes 700 kB, a scenario 1,000 kB; what is measured is 0 to 20 kB, the noise of pages.
+    assert (resident() - before) / count < 100.0

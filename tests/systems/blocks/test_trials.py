@@ -1,0 +1,371 @@
+"""Trial and accepted: what leaves its domain in a stage of a step that is then made shorter."""
+
+import itertools
+import re
+
+import casadi as ca
+import numpy as np
+import pytest
+from arms import error_controlled, fixed_step
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from drake_dae import (
+    ConstantReference,
+    DaePlant,
+    DaeSystem,
+    ForceSensor,
+    NormalForm,
+    StateRealization,
+    TrackingController,
+    TrackingLaw,
+    poles,
+    simulate,
+)
+from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
+from drake_dae.systems.control.references import ReferenceGenerator
+
+ERROR_CONTROLLED = (
+    "bogacki_shampine3",
+    "implicit_euler",
+    "radau1",
+    "radau3",
+    "runge_kutta3",
+    "runge_kutta5",
+    "velocity_implicit_euler",
+)
+
+
+def tank(f=lambda x: -500 * (ca.sqrt(x) - 0.1), start=1.0):
+    """x' = f(x) + u; by default a tank that runs empty to 0.01 within some hundredths of a s."""
+    return DaeSystem.from_functions(
+        ["x"],
+        f=lambda s: [f(s[0])],
+        h=lambda s: [1],
+        l=lambda s: [s[0]],
+        nominal_state=[start],
+        name="tank",
+    )
+
+
+def leaking_tank_with_force():
+    """The tank, and a constraint whose force is the root of its level: y' = sqrt(x) + v, y = 0."""
+    return DaeSystem.from_functions(
+        ["x", "y"],
+        f=lambda s: [-500 * (ca.sqrt(s[0]) - 0.1), ca.sqrt(s[0])],
+        g=lambda s: [0, 1],
+        h=lambda s: [1, 0],
+        k=lambda s: [s[1]],
+        l=lambda s: [s[0]],
+        m=lambda s: [[0]],
+        nominal_state=[1.0, 0.0],
+        name="tank",
+    )
+
+
+def alone(block, control=0.0):
+    """A block with a constant control, and the log of its state."""
+    builder = DiagramBuilder()
+    builder.AddSystem(block)
+    source = builder.AddSystem(ConstantVectorSource([control]))
+    builder.Connect(source.get_output_port(), block.GetInputPort("control"))
+    logger = LogVectorOutput(block.GetOutputPort("state"), builder)
+    return builder.Build(), logger
+
+
+def by_drake(diagram, duration, config, context=None):
+    context = diagram.CreateDefaultContext() if context is None else context
+    simulator = Simulator(diagram, context)
+    ApplySimulatorConfig(config, simulator)
+    simulator.AdvanceTo(duration)
+    return context
+
+
+def by_us(diagram, duration, config, context=None):
+    context = diagram.CreateDefaultContext() if context is None else context
+    simulate(diagram, context, duration, config)
+    return context
+
+
+RUNS = {"Drake's Simulator": by_drake, "simulate": by_us}
+
+
+def scheme(name, accuracy=1e-6):
+    return SimulatorConfig(integration_scheme=name, accuracy=accuracy, use_error_control=True)
+
+
+def level(time):
+    """s = sqrt(x) has 2 s s' = -500 (s - 0.1): 2 (1 - s) + 0.2 log(0.9 / (s - 0.1)) = 500 t."""
+    low, high = 0.1, 1.0
+    for _ in range(200):
+        s = (low + high) / 2
+        passed = 2 * (1 - s) + 0.2 * np.log(0.9 / (s - 0.1)) if s > 0.1 else np.inf
+        low, high = (s, high) if passed > 500 * time else (low, s)
+    return high**2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ERROR_CONTROLLED)
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_a_trial_that_leaves_the_domain_makes_the_step_shorter(run, name):
+    """The first step of 0.1 s tries x = -44, and the motion never does."""
+    diagram, logger = alone(DaePlant(tank()))
+    context = run(diagram, 0.02, scheme(name))
+    log = logger.FindLog(context)
+    assert log.data().min() >= 0.01 - 1e-5
+    # The accuracy that was asked for is one for each step, and there are up to 1300.
+    np.testing.assert_allclose(log.data()[0], [level(t) for t in log.sample_times()], atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["bogacki_shampine3", "runge_kutta2", "runge_kutta3"])
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_a_fixed_step_that_fails_names_where_it_began(run, name):
+    """No nan gets into the log, and the state is one that was reached."""
+    diagram, logger = alone(DaePlant(tank()))
+    config = SimulatorConfig(integration_scheme=name, max_step_size=0.05, use_error_control=False)
+    reason = r"from t = 0 s, state \[1\.\], to t = 0\.05 s .* not finite: .*smaller steps"
+    context = diagram.CreateDefaultContext()
+    with pytest.raises(NonFiniteError, match=reason) as caught:
+        run(diagram, 1.0, config, context)
+    assert (caught.value.time, *caught.value.state) == (0.0, 1.0)
+    assert np.isfinite(logger.FindLog(context).data()).all()
+
+
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_an_accepted_state_out_of_the_domain_is_told(run):
+    """Euler's step of 0.05 s ends at 1 - 0.05 * 450 without a trial."""
+    diagram, _ = alone(DaePlant(tank()))
+    config = SimulatorConfig(
+        integration_scheme="explicit_euler", max_step_size=0.05, use_error_control=False
+    )
+    with pytest.raises(NonFiniteError, match=r"not finite at t = 0\.05 s, state \[-21\.5\]"):
+        run(diagram, 1.0, config)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ERROR_CONTROLLED)
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_a_motion_that_ends_in_the_domain_ends_the_run(run, name):
+    """x' = -1 / (2 sqrt(x)) from 1 is (1 - 3 t / 4)^(2/3), and is over at t = 4/3.
+
+    Drake's implicit integrators end it themselves, by the length of their steps.
+    """
+    diagram, logger = alone(DaePlant(tank(lambda x: -1 / (2 * ca.sqrt(x)))))
+    context = diagram.CreateDefaultContext()
+    with pytest.raises((SimulationError, RuntimeError)):
+        run(diagram, 2.0, scheme(name, 1e-4), context)
+    # Euler's method of first order loses 0.01 s on the way.
+    assert context.get_time() == pytest.approx(4 / 3, abs=2e-2)
+    assert np.isfinite(logger.FindLog(context).data()).all()
+
+
+def test_when_no_step_leads_on_the_state_is_the_last_one_reached():
+    """x' = 1 - sqrt(-x) reaches x = 0 with speed 1, and no trial beyond it has a value."""
+    diagram, _ = alone(DaePlant(tank(lambda x: 1 - ca.sqrt(-x), start=-0.5)))
+    reason = (
+        "(?s)no step leads on from t = .*, state .*, since each .* however short: tank dynamics"
+    )
+    with pytest.raises(NonFiniteError, match=reason) as caught:
+        by_drake(diagram, 10.0, scheme("runge_kutta3"))
+    # From s = sqrt(-x): dt = 2 s ds / (1 - s) backwards, t = 2 (-s0 - log(1 - s0)), s0^2 = 1/2.
+    root = np.sqrt(0.5)
+    assert caught.value.time == pytest.approx(2 * (-root - np.log(1 - root)), abs=1e-3)
+    assert -1e-3 < caught.value.state[0] <= 0.0
+
+
+class Broken(LeafSystem):
+    """A control that is nan from a time on."""
+
+    def __init__(self, since):
+        super().__init__()
+        self.DeclareVectorOutputPort(
+            "u", 1, lambda c, out: out.SetFromVector([np.nan if c.get_time() >= since else 0.0])
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "since"), [*itertools.product(ERROR_CONTROLLED, (0.0, 0.3))], ids=str
+)
+def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
+    """Where Drake's error control alone would make steps shorter for ever."""
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(tank(lambda x: -x)))
+    source = builder.AddSystem(Broken(since))
+    builder.Connect(source.get_output_port(), plant.get_input_port())
+    logger = LogVectorOutput(plant.GetOutputPort("state"), builder)
+    simulator = Simulator(builder.Build())
+    ApplySimulatorConfig(scheme(name), simulator)
+    with pytest.raises(NonFiniteError, match="input u0 is not finite at t = ") as caught:
+        simulator.AdvanceTo(1.0)
+    assert caught.value.time == pytest.approx(since, abs=1e-6)
+    assert np.isfinite(logger.FindLog(simulator.get_context()).data()).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [DaePlant, lambda s: StateRealization(NormalForm(s))])
+def test_a_closed_loop_with_both_plants(make):
+    """Of poles at -500 rk3 tries x = -24 at first; the law then cancels the root it lacks there."""
+    system = tank()
+    law = TrackingLaw(system, poles(-500.0))
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(make(system))
+    controller = builder.AddSystem(TrackingController(law))
+    reference = builder.AddSystem(ReferenceGenerator([ConstantReference([0.04])], law.degrees))
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    builder.Connect(reference.get_output_port(), controller.GetInputPort("reference"))
+    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
+    logs = [
+        LogVectorOutput(port, builder)
+        for port in (plant.GetOutputPort("state"), controller.GetOutputPort("control"))
+    ]
+    context = by_drake(builder.Build(), 0.03, scheme("runge_kutta3", 1e-8))
+    state, control = (log.FindLog(context) for log in logs)
+    exact = 0.04 + 0.96 * np.exp(-500 * state.sample_times())
+    np.testing.assert_allclose(state.data()[0], exact, atol=1e-6)
+    assert np.isfinite(control.data()).all()
+
+
+def test_a_sensor_feels_what_a_trial_does_not_have():
+    """Its state, like that of the plant, is finite at each step; tau f' = -sqrt(x) - f."""
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(leaking_tank_with_force()))
+    sensor = builder.AddSystem(ForceSensor(1, 0.01))
+    source = builder.AddSystem(ConstantVectorSource([0.0]))
+    builder.Connect(source.get_output_port(), plant.get_input_port())
+    builder.Connect(plant.GetOutputPort("constraint_force"), sensor.get_input_port())
+    logger = LogVectorOutput(sensor.get_output_port(), builder)
+    context = by_drake(builder.Build(), 0.5, error_controlled(1e-6))
+    # At rest: the level is 0.01, its root 0.1.
+    assert logger.FindLog(context).data()[0, -1] == pytest.approx(-0.1, abs=1e-4)
+
+
+class Reading(LeafSystem):
+    """Compares each entry of a plant's ports with those of its state, in each derivative."""
+
+    def __init__(self, plant):
+        super().__init__()
+        self.plant, self.count, self.stale = plant, 0, 0
+        self.DeclareVectorInputPort("x", 1)
+        self.DeclareContinuousState(1)
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        (x,) = self.get_input_port().Eval(context)
+        self.count += 1
+        self.stale += x != self.plant.state(self.own)[0]
+        derivatives.get_mutable_vector().SetFromVector([0.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ERROR_CONTROLLED)
+def test_after_a_rejected_step_no_port_shows_the_state_of_the_trial(name):
+    """Drake's own DeclareStateOutputPort does, with two of its integrators.
+
+    A tank that follows sin 50 t quickly: some per cent of the steps are rejected.
+    """
+    system = DaeSystem.from_functions(
+        ["x", "s", "c"],
+        f=lambda x: [-200 * (x[0] - x[1]), 50 * x[2], -50 * x[1]],
+        h=lambda x: [1, 0, 0],
+        l=lambda x: [x[0]],
+        nominal_state=[0.0, 0.0, 1.0],
+    )
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(system))
+    reading = builder.AddSystem(Reading(plant))
+    source = builder.AddSystem(ConstantVectorSource([0.0]))
+    builder.Connect(source.get_output_port(), plant.get_input_port())
+    builder.Connect(plant.GetOutputPort("controlled_output"), reading.get_input_port())
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    reading.own = plant.GetMyContextFromRoot(context)
+    by_drake(diagram, 0.2, scheme(name, 1e-4), context)
+    assert reading.count > 50
+    assert reading.stale == 0
+
+
+def test_nothing_is_a_trial_outside_of_a_simulation():
+    """A context that was simulated: at its time, and before it, a failure raises."""
+    plant = DaePlant(tank())
+    diagram, _ = alone(plant)
+    context = by_drake(diagram, 0.1, scheme("runge_kutta3"))
+    own = plant.GetMyMutableContextFromRoot(context)
+    for time in (0.1, 0.05):
+        context.SetTime(time)
+        plant.set_state(own, [-1.0])
+        with pytest.raises(NonFiniteError, match="left its domain"):
+            plant.EvalTimeDerivatives(own)
+    fresh = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(fresh, [0.0])
+    fresh.SetTime(7.0)
+    plant.set_state(fresh, [-1.0])
+    with pytest.raises(NonFiniteError, match="left its domain"):
+        plant.EvalTimeDerivatives(fresh)
+
+
+def test_contexts_do_not_share_what_is_known_of_their_runs():
+    """A run in one context; a clone of it, and a second run from a new start, know their own."""
+    plant = DaePlant(tank())
+    diagram, _ = alone(plant)
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scheme("runge_kutta3"), simulator)
+    simulator.AdvanceTo(0.1)
+    clone = simulator.get_context().Clone()
+    other = Simulator(diagram, clone)
+    ApplySimulatorConfig(scheme("runge_kutta3"), other)
+    clone.SetTime(0.0)
+    plant.set_state(plant.GetMyMutableContextFromRoot(clone), [1.0])
+    other.Initialize()
+    other.AdvanceTo(0.02)
+    assert clone.get_continuous_state_vector()[0] == pytest.approx(level(0.02), abs=1e-4)
+    simulator.AdvanceTo(0.2)
+    assert simulator.get_context().get_continuous_state_vector()[0] == pytest.approx(0.01, abs=1e-4)
+
+
+def test_an_overflow_is_not_called_singular():
+    """det [[1 + x^2, x], [x, 1]] = 1 for all x, and at 1e40 cancels to 0."""
+    system = DaeSystem.from_functions(
+        ["x", "a", "b"],
+        f=lambda s: [s[0], 0, 0],
+        g=lambda s: [[0, 0], [1 + s[0] ** 2, s[0]], [s[0], 1]],
+        h=lambda s: [1, 0, 0],
+        k=lambda s: [s[1], s[2]],
+        l=lambda s: [s[0]],
+        m=lambda s: [[0, 0]],
+        name="growth",
+    )
+    plant = DaePlant(system)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, [0.0])
+    plant.set_state(context, [1e40, 0.0, 0.0])
+    with pytest.raises(NonFiniteError, match=r"input x is beyond all measure at t = 0 s") as caught:
+        plant.EvalTimeDerivatives(context)
+    assert not isinstance(caught.value, SingularityError)
+
+
+def test_a_simulator_of_drake_ends_a_state_that_grows_without_bound():
+    """x' = x^2 from 1 is 1 / (1 - t): ever shorter steps, each of them accepted."""
+    diagram, _ = alone(DaePlant(tank(lambda x: x**2)))
+    with pytest.raises(SimulationError, match=r"last 1000 steps led from .* without bound"):
+        by_drake(diagram, 2.0, scheme("runge_kutta5", 1e-6))
+
+
+def test_how_slow_is_endless():
+    """A thousand steps of 2 ns add 2e-9 of the 1000 s that were simulated before."""
+    diagram, _ = alone(DaePlant(tank(lambda x: -x)))
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(fixed_step(1.0), simulator)
+    simulator.AdvanceTo(1000.0)
+    simulator.get_mutable_integrator().set_maximum_step_size(2e-9)
+    with pytest.raises(SimulationError, match="led from"):
+        simulator.AdvanceTo(1000.1)
+    assert simulator.get_context().get_time() < 1000.0001
+
+
+def test_messages_are_in_order():
+    """No comma stands before another mark."""
+    diagram, _ = alone(DaePlant(tank()))
+    with pytest.raises(NonFiniteError) as caught:
+        by_drake(diagram, 1.0, fixed_step(0.05))
+    assert not re.search(r",[:.,]|\s\s", str(caught.value))

@@ -1,0 +1,256 @@
+"""Integral action of the law, against the prediction and closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arms import arm, error_controlled, law, numbers, touching
+from numpy.testing import assert_allclose
+
+from drake_dae import (
+    ConstantReference,
+    DcMotors,
+    FlexibleJoints,
+    ForceSensor,
+    KnownForce,
+    RobotModel,
+    RobotPlant,
+    SinusoidReference,
+    TrackingController,
+    TrackingLaw,
+    build_scenario,
+    find_structure,
+    linearize_loop,
+    load_scenario,
+    make_closed_loop,
+    poles,
+    simulate,
+)
+from drake_dae.errors import GainError, ModelError, WiringError
+from drake_dae.scenario.shipped import find_scenario
+
+WANTED = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
+
+
+def follow(model, tracking, duration, *, start=None, change=None, wanted=WANTED, sensor=None):
+    """The closed loop and its record, from rest with errors, or with other plant parameters."""
+    plant = RobotPlant(model, structure=tracking.structure)
+    loop = make_closed_loop(plant, tracking, wanted, sensor=sensor)
+    context = loop.diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    q = model.configuration([0.28], [1.2, -1.6])
+    plant.set_consistent_state(own, model.rest_state(q, [18.0]))
+    for name, value in (change or {}).items():
+        plant.set_parameter(own, name, value)
+    if start is not None:
+        controller = loop.controller.GetMyMutableContextFromRoot(context)
+        loop.controller.set_integral(controller, start)
+    simulate(loop.diagram, context, duration, error_controlled(1e-9))
+    return loop, loop.record(context)
+
+
+def test_errors_are_those_of_one_more_pole():
+    """s^3 + ... = (s + 4)^3 for the position, s + 6 for the force from a chosen start.
+
+    e_2(0) = -6 sigma(0), and the integrals are those of the recorded errors.
+    """
+    model, structure = arm("two_link").model, arm("two_link").structure
+    tracking = TrackingLaw(
+        model.dae,
+        poles({"tool.z": -4.0, "wall.force": -6.0}),
+        structure=structure,
+        measured_force=True,
+        integral=["tool.z", "wall.force"],
+    )
+    assert tracking.gains.degrees == (3, 1)
+    assert not tracking.control_takes_force
+    loop, record = follow(model, tracking, 2.0, start=[0.01, 0.5])
+    predicted = loop.predicted_error(record)
+    assert predicted[0] == pytest.approx([-0.02, -3.0])
+    assert predicted[:, 1] == pytest.approx(-3.0 * np.exp(-6.0 * record.time), abs=1e-12)
+    assert_allclose(record["tracking_error"][:, 0], predicted[:, 0], atol=1e-9)
+    assert_allclose(record["tracking_error"][:, 1], predicted[:, 1], atol=1e-7)
+    steps = np.diff(record.time)[:, None]
+    means = (record["tracking_error"][1:] + record["tracking_error"][:-1]) / 2.0
+    summed = np.array([0.01, 0.5]) + np.cumsum(steps * means, axis=0)
+    assert_allclose(record["integral"][1:], summed, atol=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "stage", [DcMotors(0.5, 0.01, 1.0, 100.0), FlexibleJoints(8000.0, inertia=1.0)]
+)
+@pytest.mark.parametrize("measured", [False, True])
+def test_behind_motors_and_springs_too(stage, measured):
+    """With mu of the force 1 and 2 it takes 2 and 3 poles, with its model or a measurement."""
+    model = touching("two_link", [stage])
+    structure = find_structure(model.dae)
+    tracking = TrackingLaw(
+        model.dae,
+        poles(-5.0),
+        structure=structure,
+        measured_force=measured,
+        integral=["wall.force"],
+    )
+    assert tracking.gains.degrees == (structure.output_degrees[0], structure.output_degrees[1] + 1)
+    loop, record = follow(model, tracking, 2.0, start=[0.1])
+    predicted = loop.predicted_error(record)
+    assert np.abs(predicted[:, 1]).max() > 1.0
+    assert_allclose(record["tracking_error"][:, 0], predicted[:, 0], atol=1e-7)
+    assert_allclose(record["tracking_error"][:, 1], predicted[:, 1], atol=1e-4)
+
+
+def test_a_push_that_the_law_does_not_know_is_integrated_away():
+    """At rest A_h F / w^2 off without, with A_h by MultibodyPlant; nothing with it."""
+    push = KnownForce("tool", name="push")
+    smooth = touching("two_link")
+    model = RobotModel(
+        smooth.links, smooth.constraints, smooth.positions, [1.2, -1.6], loads=[push]
+    )
+    structure = find_structure(model.dae)
+    wanted, ends = [ConstantReference(0.3), ConstantReference(20.0)], {}
+    for names in ([], ["tool.z"]):
+        tracking = TrackingLaw(model.dae, poles(-8.0), structure=structure, integral=names)
+        _, record = follow(
+            model, tracking, 4.0, change={"push.force": [0.0, 0.0, 6.0]}, wanted=wanted
+        )
+        ends[bool(names)] = record["tracking_error"][-1, 0], record["state"][-1]
+    n = numbers("two_link", *np.split(ends[False][1], 2))
+    J, P = n.constraint_jacobian, n.output_jacobian
+    free = np.linalg.solve(n.mass, np.eye(2))
+    along = P @ (free - free @ J.T @ np.linalg.solve(J @ free @ J.T, J @ free)) @ P.T
+    # The law holds z'' as if the force were the model's: F moves it through M^-1, less what the
+    # wall takes of it.
+    assert ends[False][0] == pytest.approx(along.item() * 6.0 / 64.0, rel=1e-5)
+    assert abs(ends[True][0]) < 1e-6 < 1e-3 < abs(ends[False][0])
+
+
+def test_a_force_that_friction_falsifies_is_integrated_away():
+    """lambda A / A_0 = r_2 - K_i sigma at each step, with A by MultibodyPlant; 50 times better."""
+    smooth = touching("two_link")
+    wall = replace(smooth.constraints[0], friction=0.0, stiction_tolerance=0.05)
+    model = RobotModel(smooth.links, [wall], smooth.positions, [1.2, -1.6])
+    structure, errors = find_structure(model.dae), {}
+    wanted = [SinusoidReference(0.3, 0.2, 0.5), ConstantReference(20.0)]
+    for names in ([], ["wall.force"]):
+        tracking = TrackingLaw(
+            model.dae,
+            poles({"tool.z": -5.0, "*": -50.0} if names else -5.0),
+            structure=structure,
+            measured_force=bool(names),
+            integral=names,
+        )
+        _, record = follow(model, tracking, 2.0, change={"wall.friction": 0.4}, wanted=wanted)
+        late = record.time > 0.5
+        errors[bool(names)] = np.sqrt(np.mean(record["tracking_error"][late, 1] ** 2))
+    assert errors[True] < errors[False] / 20.0
+    for i in range(0, len(record.time), 20):
+        q, v = np.split(record["state"][i], 2)
+        n = numbers("two_link", q, v)
+        J, P = n.constraint_jacobian[0], n.output_jacobian[0]
+        rub = 0.4 * P * (P @ v) / np.hypot(P @ v, 0.05)
+        A_0, A = (J @ np.linalg.solve(n.mass, column) for column in (J, J - rub))
+        pressed = 20.0 - 50.0 * record["integral"][i, 0]
+        assert record["constraint_force"][i, 0] == pytest.approx(pressed * A_0 / A, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_proportional_action_beside_it_needs_a_sensor():
+    """K_p closes an algebraic loop, the integral does not; with a sensor both go together."""
+    model, structure = arm("two_link").model, arm("two_link").structure
+    both = TrackingLaw(
+        model.dae,
+        poles(-5.0),
+        structure=structure,
+        measured_force=True,
+        force_gain=2.0,
+        integral=["wall.force"],
+    )
+    assert both.control_takes_force
+    with pytest.raises(WiringError, match="algebraic loop"):
+        make_closed_loop(RobotPlant(model, structure=structure), both, WANTED)
+    _, record = follow(model, both, 3.0, sensor=ForceSensor(1, 0.01), start=[0.3])
+    assert abs(record["tracking_error"][-1, 1]) < 0.1
+
+
+def controller_of(limits=np.inf):
+    found = arm("two_link")
+    tracking = TrackingLaw(
+        found.model.dae, poles(-4.0), structure=found.structure, integral=["tool.z"]
+    )
+    controller = TrackingController(tracking, integral_limits=limits)
+    context = controller.CreateDefaultContext()
+    state = found.structure.states[1]
+    controller.GetInputPort("estimated_state").FixValue(context, state)
+    z = controller.law.error_coordinates(state, np.zeros(4))[1]
+    controller.GetInputPort("reference").FixValue(context, [z - 0.1, 0.0, 0.0, 20.0])
+    return controller, context
+
+
+def rate(controller, context):
+    return controller.EvalTimeDerivatives(context).CopyToVector()
+
+
+def test_the_integral_stops_at_its_limit_and_where_it_is_held():
+    """e = 0.1: at the upper limit it stays, at the lower one it comes back."""
+    controller, context = controller_of(0.5)
+    assert rate(controller, context) == pytest.approx([0.1])
+    controller.set_integral(context, [0.5])
+    assert rate(controller, context) == [0.0]
+    controller.set_integral(context, [-0.5])
+    assert rate(controller, context) == pytest.approx([0.1])
+    controller.GetInputPort("hold").FixValue(context, [1.0])
+    assert rate(controller, context) == [0.0]
+    controller.GetInputPort("hold").FixValue(context, [0.0])
+    assert rate(controller, context) == pytest.approx([0.1])
+
+
+def test_the_control_is_that_of_the_law_and_converts():
+    controller, context = controller_of()
+    controller.set_integral(context, [0.3])
+    state = controller.GetInputPort("estimated_state").Eval(context)
+    reference = controller.GetInputPort("reference").Eval(context)
+    control = controller.GetOutputPort("control").Eval(context)
+    assert_allclose(control, controller.law.control(state, reference, integral=[0.3]))
+    assert np.any(control != controller.law.control(state, reference))
+    converted = controller.ToAutoDiffXd()
+    other = converted.CreateDefaultContext()
+    other.SetTimeStateAndParametersFrom(context)
+    for name in ("estimated_state", "reference"):
+        values = controller.GetInputPort(name).Eval(context)
+        converted.GetInputPort(name).FixValue(other, values)
+    found = [entry.value() for entry in converted.GetOutputPort("control").Eval(other)]
+    assert_allclose(found, control)
+    assert converted.EvalTimeDerivatives(other).CopyToVector()[0].value() == pytest.approx(0.1)
+
+
+def test_what_makes_no_sense_is_refused():
+    found = arm("two_link")
+    system, known = found.model.dae, {"structure": found.structure}
+    with pytest.raises(GainError, match=r"the law meets 'wall\.force' at once"):
+        TrackingLaw(system, poles(-4.0), integral=["wall.force"], **known)
+    with pytest.raises(GainError, match=r"'tool\.z' stands twice"):
+        TrackingLaw(system, poles(-4.0), integral=["tool.z", "tool.z"], **known)
+    with pytest.raises(GainError, match=r"integral: .*tool\.y"):
+        TrackingLaw(system, poles(-4.0), integral=["tool.y"], **known)
+    with pytest.raises(ModelError, match="integral_limits must be a positive number"):
+        controller_of(-1.0)
+    controller = TrackingController(law("two_link"))
+    with pytest.raises(ModelError, match="integrates nothing"):
+        controller.set_integral(controller.CreateDefaultContext(), [0.0])
+    controller, context = controller_of()
+    with pytest.raises(ModelError, match="integral"):
+        controller.set_integral(context, [0.0, 0.0])
+    state = found.structure.states[0]
+    with pytest.raises(ModelError, match="a state of its own"):
+        linearize_loop(controller.law, state, np.zeros(4))
+
+
+def test_a_scenario_names_what_is_integrated():
+    scenario = load_scenario(
+        find_scenario("two_link_measured_force"), ["integral=[tool.z, wall.force]"]
+    )
+    loop, context = build_scenario(scenario)
+    assert loop.controller.law.gains.degrees == (3, 1)
+    simulate(loop.diagram, context, 0.1, scenario.integrator)
+    assert loop.record(context)["integral"].shape[1] == 2

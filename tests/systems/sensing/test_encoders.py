@@ -1,0 +1,209 @@
+"""Encoders, against maps written by hand and the noise of rounding."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput, RandomSource, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+from runs import run, run_scenario, scenario
+
+from drake_dae import Encoders, StateSensor, build_scenario
+from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.build import start_scenario
+
+T, W = 1e-3, 300.0
+A = np.exp(-W * T)
+
+
+def measure(encoders, q, v, duration, seed=0):
+    """What one encoder tells of a position q(t), a polynomial by its factors, at the samples."""
+    builder = DiagramBuilder()
+    polynomials = [np.polynomial.Polynomial(factors) for factors in (q, v)]
+    ends = [0.0, duration + T]
+    degree = max(len(q), len(v))
+    # Hermite data of one piece hold any polynomial of degree 3.
+    assert degree <= 4
+    course = PiecewisePolynomial.CubicHermite(
+        ends,
+        np.array([[p(t) for t in ends] for p in polynomials]),
+        np.array([[p.deriv()(t) for t in ends] for p in polynomials]),
+    )
+    source = builder.AddSystem(TrajectorySource(course))
+    sensor = builder.AddSystem(StateSensor(2, 1, encoders, T))
+    builder.Connect(source.get_output_port(), sensor.GetInputPort("state"))
+    if encoders.has_noise:
+        noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 2, T))
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    log = LogVectorOutput(sensor.GetOutputPort("estimated_state"), builder, T)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    diagram.SetRandomContext(context, RandomGenerator(seed))
+    simulator.AdvanceTo(duration)
+    found = log.FindLog(context)
+    times = found.sample_times()
+    true = np.array([p(times) for p in polynomials])
+    return times, found.data(), true
+
+
+def test_it_is_the_map_by_hand():
+    """qm_k is rounded, vm_k = a vm_(k-1) + (1 - a) (qm_k - qm_(k-1)) / T from v_0."""
+    delta = 2e-4
+    _, found, (q, v) = measure(Encoders(delta, W), [0.1, 0.7, -2.0, 1.0], [0.7, -4.0, 3.0], 0.2)
+    rounded = delta * np.round(q / delta)
+    by_hand = [v[0]]
+    for step in np.diff(rounded):
+        by_hand.append(A * by_hand[-1] + (1.0 - A) * step / T)
+    assert_allclose(found[0], rounded, atol=1e-15)
+    assert_allclose(found[1], by_hand, atol=1e-12)
+
+
+def test_velocity_is_late_by_its_lag():
+    """At a constant acceleration of 2 it is 2 lag behind, when exp(-W t) has died."""
+    encoders = Encoders(velocity_bandwidth=W)
+    _, found, (_, v) = measure(encoders, [0.0, 0.5, 1.0], [0.5, 2.0], 0.2)
+    lag = encoders.velocity_lag(T)
+    assert_allclose(v[-1] - found[1, -1], 2.0 * lag, rtol=1e-9)
+    assert_allclose(lag, 1.0 / W, rtol=1e-2)  # To (W T)^2 / 12.
+    assert Encoders().velocity_lag(T) == 0.0
+
+
+@pytest.mark.parametrize("delta", [1e-5, 1e-4])
+def test_rounding_is_noise_of_its_deviation(delta):
+    """delta / sqrt(12) of positions, and what the filter passes of it in velocities.
+
+    The motion passes 30 to 70 multiples a sample at a rate that changes. Of 3000 samples a
+    deviation is known to 1 / sqrt(6000) = 1.3 %; three of these are allowed.
+    """
+    speed = 3e4 * delta
+    q = [0.0, speed, 0.2 * speed, 0.02 * speed]
+    v = [speed, 0.4 * speed, 0.06 * speed]
+    encoders = Encoders(delta, W)
+    _, found, true = measure(encoders, q, v, 3.0)
+    exact = measure(Encoders(velocity_bandwidth=W), q, v, 3.0)[1]
+    assert_allclose(np.std(found[0] - true[0]), encoders.position_deviation, rtol=0.04)
+    assert_allclose(encoders.position_deviation, delta / np.sqrt(12.0))
+    # What rounding adds to a filtered difference without it.
+    off = (found - exact)[1]
+    assert_allclose(np.std(off[200:]), encoders.velocity_deviation(T), rtol=0.04)
+
+
+def test_deviation_of_velocities_is_the_norm_of_the_impulse_response():
+    response = [1.0 - A]
+    response += [(1.0 - A) * (A**n - A ** (n - 1)) for n in range(1, 400)]
+    found = Encoders(position_noise=2e-6, velocity_bandwidth=W).velocity_deviation(T)
+    assert_allclose(found, 2e-6 * np.linalg.norm(response) / T, rtol=1e-12)
+
+
+def test_noise_has_its_deviation_and_its_seed():
+    encoders = Encoders(position_noise=5e-6, velocity_noise=1e-3, position_bias=-2e-3)
+    first, again, other = (measure(encoders, [0.1], [0.0], 2.0, seed)[1] for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert_allclose(np.mean(first[0]), 0.1 - 2e-3, atol=5 * 5e-6 / np.sqrt(2000))
+    # Of 2000 samples to 1.6 %.
+    assert_allclose(np.std(first, axis=1), [5e-6, 1e-3], rtol=0.05)
+
+
+SAMPLED = ("sampling={period: 2.0e-3, delay: 0.0}", "duration=0.1", "gains.all=[-10.0]")
+ROUGH = "encoders={resolution: 1.0e-4, velocity_bandwidth: 200.0, position_noise: 1.0e-5}"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param(SAMPLED, id="ideal"),
+        pytest.param(
+            (
+                "plant=!MultibodyPlant {time_step: 1.0e-3}",
+                "sampling={period: 2.0e-3, delay: 1.0e-3}",
+                "duration=0.1",
+            ),
+            id="contact",
+        ),
+    ],
+)
+def test_law_reads_what_was_measured_at_its_samples(settings):
+    """What acts is the law of the estimated state of that instant, and of no other."""
+    loop, _, record = run_scenario(scenario("two_link_wall", ROUGH, *settings))
+    law = loop.controller.law
+    late = 0 if loop.plant.time_step == 0.0 else 1e-3
+    samples = np.searchsorted(record.time, 2e-3 * np.arange(1, 49) - 1e-9)
+    wanted = [law.control(record["estimated_state"][k], record["reference"][k]) for k in samples]
+    acting = np.searchsorted(record.time, record.time[samples] + late + 5e-4)
+    assert_allclose(record["control"][acting], wanted, rtol=1e-12)
+    off = np.abs(record["estimated_state"] - record["state"])[samples, :2]
+    assert 2e-5 < off.max() < 1e-4
+
+
+@pytest.mark.slow
+def test_error_of_the_loop_is_what_the_encoders_drive_into_it():
+    """xi_(k+1) = F xi_k - Gamma K (xi_k + n_k), n_k what the encoders add to (z, z').
+
+    B and a at the measured state are left out: they change as gravity does, 10 1/s^2 beside gains
+    of 625 1/s^2. What is left without rounding is the lag of the velocities. Ten times the
+    resolution makes ten times the rest: of 0.6 s the poles at -25 1/s leave some 15 independent
+    values, so that the ratio is known to a quarter; two of these are allowed.
+    """
+    period, w = 2e-3, 25.0
+    settings = (f"sampling={{period: {period}}}", f"gains.all=[-{w}]", "duration=0.6")
+    exact = run_scenario(scenario("two_link_wall", *settings))[2]
+    errors = []
+    for delta in (0.0, 2e-5, 2e-4):
+        rough = f"encoders={{resolution: {delta}, velocity_bandwidth: 400.0}}"
+        loop, _, record = run_scenario(scenario("two_link_wall", rough, *settings))
+        law = loop.controller.law
+        xi, found = np.zeros(2), []
+        for k in np.searchsorted(record.time, period * np.arange(300) - 1e-9):
+            found.append(xi[0])
+            states = (record[name][k] for name in ("estimated_state", "state"))
+            measured, true = (law.error_coordinates(x, record["reference"][k]) for x in states)
+            push = -(w * w * (xi[0] + (measured - true)[0]))
+            push -= 2.0 * w * (xi[1] + (measured - true)[1])
+            xi = np.array([xi[0] + period * xi[1] + period**2 / 2 * push, xi[1] + period * push])
+        times = period * np.arange(300)
+        added = np.interp(times, record.time, record["tracking_error"][:, 0])
+        added -= np.interp(times, exact.time, exact["tracking_error"][:, 0])
+        errors.append(added)
+        assert_allclose(added, found, atol=0.1 * np.abs(found).max())
+    fine, coarse = (np.std(error - errors[0]) for error in errors[1:])
+    assert_allclose(coarse / fine, 10.0, rtol=0.5)
+
+
+def test_seed_is_that_of_the_scenario():
+    found = scenario("two_link_wall", ROUGH, *SAMPLED)
+    loop, _ = build_scenario(found)
+
+    def end(seed):
+        chosen = scenario("two_link_wall", ROUGH, *SAMPLED, f"encoders.seed={seed}")
+        context = start_scenario(chosen, loop)
+        return run(loop, context, 0.05, chosen.integrator)["state"][-1]
+
+    first = end(0)
+    assert np.array_equal(end(0), first)
+    assert not np.array_equal(end(3), first)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["encoders={resolution: -1.0}"], "resolution of encoders must be 0 or more"),
+        (["encoders={resolution: [1.0e-5, 1.0e-5, 1.0e-5]}"], "3 entries, the robot has 2 pos"),
+        (["encoders={velocity_bandwidth: 0.0}"], "velocity_bandwidth of encoders must be positive"),
+        (["encoders={velocity_bandwidth: 9.0, velocity_noise: 1.0}"], "either a velocity_bandw"),
+        (["encoders={position_bias: [[1.0, 2.0]]}"], "position_bias of encoders must be finite"),
+        (["encoders={seed: -1}"], "seed of encoders"),
+        (["encoders={}", "sampling="], "give it a sampling"),
+    ],
+)
+def test_what_no_encoder_can_be_is_refused(settings, message):
+    with pytest.raises(ScenarioError, match=f"encoders: .*{message}"):
+        build_scenario(scenario("two_link_wall", SAMPLED[0], *settings))
+
+
+def test_a_sensor_needs_positions_and_velocities():
+    with pytest.raises(ModelError, match="size must be a whole number from 4"):
+        StateSensor(3, 2, Encoders(), T)

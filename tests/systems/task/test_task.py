@@ -1,0 +1,438 @@
+"""Tasks in phases: touches as designed, changes without bumps, reactions, and what is refused."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from arms import arm, numbers, touching
+from numpy.testing import assert_allclose
+from polishing import (
+    CLIMB,
+    FAR,
+    OVER,
+    POLE,
+    SPEED,
+    WHOLE,
+    add_arm,
+    laws,
+    push,
+    run_on,
+    started,
+    task_loop,
+)
+from pydrake.systems.analysis import SimulatorConfig
+
+from drake_dae import (
+    Approach,
+    ConstantReference,
+    ContactMaterial,
+    ContactPlant,
+    Dwell,
+    FlexibleJoints,
+    Move,
+    Press,
+    Release,
+    Retreat,
+    Sampling,
+    Task,
+    TaskController,
+    TrackingLaw,
+    UnilateralRobotPlant,
+    make_task_loop,
+    open_contact,
+    poles,
+    simulate,
+)
+from drake_dae.errors import ModelError, SimulationError, WiringError
+from drake_dae.pictures.phases import phase_spans, phases_at
+from drake_dae.systems.task.fade import fade
+
+TOUCH = FAR / SPEED + OVER / 2.0
+"""The speed rises for OVER, on its mean half of it: v OVER / 2 less on the way."""
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The whole task on the ideal plant: loop, context after it, and record."""
+    loop = task_loop(WHOLE)
+    context = started(loop)
+    run_on(loop, context, 2.6, accuracy=1e-8)
+    return loop, context, loop.record(context)
+
+
+def changes(loop, context):
+    found = loop.changes(context)
+    return {change.phase: change for change in found}
+
+
+def test_phases_follow_each_other_and_say_why(whole):
+    loop, context, record = whole
+    found = loop.changes(context)
+    names = ["Approach", "Press", "Move", "Release", "Retreat", "done"]
+    assert [change.phase for change in found] == names
+    assert [change.place for change in found] == list(range(6))
+    assert [change.in_contact for change in found] == [False, True, True, True, False, False]
+    assert found[1].reason == "after a force of 0.5 N"
+    assert str(found[1]).startswith(f"{TOUCH:.6g} s: Press, after a force of 0.5 N; ")
+    # A sample at the moment of a change shows what was before.
+    places = np.searchsorted([c.time for c in found[1:]], record.time)
+    assert_allclose(np.argmax(record["phase"], axis=1), places)
+    assert_allclose(record["phase"].sum(axis=1), 1.0)
+    spans = phase_spans(record)
+    assert [span.name for span in spans] == [*names[:-1], "end"]
+    assert_allclose([span.begin for span in spans], [change.time for change in found])
+    middles = np.array([(span.begin + span.end) / 2.0 for span in spans])
+    assert phases_at(record, middles) == [span.name for span in spans]
+
+
+def test_it_touches_when_and_as_fast_as_designed(whole):
+    """Reference and motion agree from the start; steps of 1e-8 leave 3e-7 of it."""
+    loop, context, record = whole
+    impact = loop.plant.events(loop.plant.GetMyContextFromRoot(context))[0]
+    assert abs(impact.time - TOUCH) < 1e-6
+    before = np.flatnonzero(record.time <= impact.time)[-1]
+    assert_allclose(record["distance"][before], [0.0, -SPEED], atol=1e-6)
+    # The impulse that takes this speed, by MultibodyPlant.
+    found = numbers("two_link", *np.split(record["state"][before], 2))
+    J = found.constraint_jacobian[0]
+    assert_allclose(impact.impulses, SPEED / (J @ np.linalg.solve(found.mass, J)), rtol=1e-5)
+    # The change follows at once, with no step between.
+    assert changes(loop, context)["Press"].time - impact.time < 1e-9
+
+
+def test_references_begin_as_those_before_end(whole):
+    """Values and all derivatives, to round-off; a force as measured, a distance as it is."""
+    loop, context, _ = whole
+    own = loop.controller.GetMyContextFromRoot(context)
+    for before, after in pairwise(loop.controller.segments(own)):
+        time = after.change.time
+        old, new = before.reference(time), after.reference(time)
+        assert_allclose(new[:3], old[:3], atol=1e-9)  # tool.z, its derivatives.
+        if before.change.in_contact == after.change.in_contact:
+            assert_allclose(new, old, atol=1e-9)
+        elif after.change.in_contact:
+            assert_allclose(new[3], after.change.force, rtol=1e-14)
+        else:
+            wanted = [after.change.distance, after.change.distance_rate, 0.0]
+            assert_allclose(new[3:], wanted, atol=1e-12)
+
+
+def test_control_jumps_by_what_the_laws_explain_otherwise_and_no_more(whole):
+    """By M, J and P of MultibodyPlant: at the touch B du = lambda (A M [P; J]^-1 (0, 1) - J')."""
+    loop, context, record = whole
+    law, free = laws()
+    own = loop.controller.GetMyContextFromRoot(context)
+    for before, after in pairwise(loop.controller.segments(own)):
+        time, change = after.change.time, after.change
+        state = record["state"][np.searchsorted(record.time, time)]
+        controls = [
+            (law if one.change.in_contact else free).control(state, one.reference(time))
+            for one in (before, after)
+        ]
+        found = numbers("two_link", *np.split(state, 2))
+        J, P, wanted = found.constraint_jacobian, found.output_jacobian, np.zeros(2)
+        if not before.change.in_contact and change.in_contact:
+            A = (J @ np.linalg.solve(found.mass, J.T)).item()
+            pushed = found.mass @ np.linalg.solve(np.vstack([P, J]), [0.0, 1.0])
+            wanted = change.force * (A * pushed - J[0])
+        elif before.change.in_contact and not change.in_contact:
+            wanted = change.force * J[0]
+            assert change.force <= loop.controller.task.contact_force
+        # The state moves by 1e-9 between the samples and the change.
+        assert_allclose(controls[1] - controls[0], wanted, atol=1e-6)
+
+
+def test_run_is_as_predicted(whole):
+    """e'' = -K e from each change on, force on its reference; the integrator has 1e-8 a step."""
+    loop, _, record = whole
+    off = record["tracking_error"] - loop.predicted_error(record)
+    assert np.abs(off).max() < 1e-6
+    pressing, places = record["phase"][:, 1] > 0.0, np.argmax(record["phase"], axis=1)
+    assert np.abs(record["tracking_error"][pressing, 1]).max() < 1e-9
+    assert np.abs(record["tracking_error"][:, 0]).max() > 1e-5  # The impact.
+    moved = places >= 3
+    assert_allclose(record["desired_output"][moved, 0], 0.4, atol=1e-12)
+    assert_allclose(record["controlled_output"][-1, 2], 0.03, atol=1e-7)
+
+
+def test_another_context_is_another_run(whole):
+    """What a run did stands in its context alone."""
+    loop, context, _ = whole
+    before = loop.changes(context)
+    again = started(loop, distance=0.5 * FAR)
+    assert loop.changes(again) == ()
+    run_on(loop, again, 0.4, accuracy=1e-8)
+    assert loop.changes(context) == before
+    times = [change.time for change in loop.changes(again)]
+    assert_allclose(times, [0.0, 0.5 * FAR / SPEED + OVER / 2.0], atol=1e-6)
+    copy = again.Clone()
+    run_on(loop, copy, 0.55)
+    assert len(loop.changes(copy)) == 3
+    assert len(loop.changes(again)) == 2
+
+
+HOLDING = Approach(0.1, over=0.1)
+
+
+@pytest.mark.parametrize("reaction", ["approach", "hold", "stop", "fail"])
+def test_lost_contact_leads_to_the_chosen_reaction(reaction):
+    """A hand pulls with 40 N where the arm presses with 10 N."""
+    phases = (HOLDING, Press(10.0, over=0.1), Dwell(5.0, if_lost=reaction))
+    loop = task_loop(phases, patience=0.02)
+    context = started(loop, distance=0.01)
+    run_on(loop, context, 0.4)
+    assert loop.changes(context)[-1].phase == "Dwell"
+    push(loop, context, -40.0)
+    if reaction == "fail":
+        with pytest.raises(SimulationError, match=r"the contact of Dwell is lost, at t = 0\.42 s"):
+            run_on(loop, context, 0.5)
+        return
+    found = run_on(loop, context, 0.5)
+    last = loop.changes(context)[-1]
+    assert_allclose(last.time, 0.42, atol=1e-6)
+    assert last.reason == "the contact of Dwell is lost"
+    assert last.distance > 0.0
+    push(loop, context, 0.0)
+    if reaction == "stop":
+        assert_allclose(found.simulated_time, 0.02, atol=1e-6)
+        assert last.phase == "held"
+        return
+    run_on(loop, context, 1.0 if reaction == "approach" else 1.5)
+    record = loop.record(context)
+    if reaction == "approach":
+        names = [change.phase for change in loop.changes(context)]
+        assert names == ["Approach", "Press", "Dwell"] * 2
+        assert_allclose(record["constraint_force"][-1], 10.0, atol=1e-9)
+    else:
+        assert (last.phase, last.in_contact) == ("held", False)
+        assert record["constraint_force"][-1] == 0.0
+        assert_allclose(record["distance"][-1, 1], 0.0, atol=3e-3)
+
+
+def test_patience_goes_on_from_phase_to_phase():
+    """Two phases of 15 ms each are shorter than it; a hand pulls in the first one."""
+    short = [Dwell(0.015, over=0.01), Dwell(0.015, over=0.01, if_lost="hold")]
+    loop = task_loop([HOLDING, Press(10.0, over=0.1), *short], patience=0.02)
+    context = started(loop, distance=0.01)
+    run_on(loop, context, 0.255)
+    assert loop.changes(context)[-1].phase == "Dwell"
+    push(loop, context, -40.0)
+    run_on(loop, context, 0.4)
+    last = loop.changes(context)[-1]
+    assert (last.phase, last.reason) == ("held", "the contact of Dwell is lost")
+    assert_allclose(last.time, 0.275, atol=1e-6)
+
+
+def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
+    """A reference below zero pulls it off, and it has gone when the last phase ends."""
+    pulled = Move({"wall.force": -5.0}, 0.05, over=0.01)
+    loop = task_loop([HOLDING, Press(10.0, over=0.1), pulled])
+    context = started(loop, distance=0.01)
+    run_on(loop, context, 1.5)
+    last = loop.changes(context)[-1]
+    assert (last.phase, last.in_contact) == ("done", False)
+    assert_allclose(loop.record(context)["distance"][-1, 1], 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("reaction", ["hold", "fail"])
+def test_guard_that_never_fires_is_told(reaction):
+    """The wall is 20 mm away, and 0.2 s are not enough."""
+    loop = task_loop([Approach(SPEED, within=0.2, if_late=reaction), Press(20.0)])
+    context = started(loop)
+    if reaction == "fail":
+        message = r"Approach has waited 0\.2 s for a force of 0\.5 N, at t = 0\.2 s, with a force "
+        with pytest.raises(SimulationError, match=message):
+            run_on(loop, context, 1.0)
+        return
+    run_on(loop, context, 1.0)
+    assert loop.changes(context)[-1].phase == "held"
+    assert loop.record(context)["constraint_force"].max() == 0.0
+
+
+def test_task_may_begin_in_contact():
+    loop = task_loop([Press(5.0, over=0.05), Release(over=0.05), Retreat(0.001, over=0.05)])
+    context = started(loop, distance=0.0)
+    run_on(loop, context, 0.17)
+    record = loop.record(context)
+    assert record["constraint_force"].max() == pytest.approx(5.0, abs=1e-9)
+    assert loop.changes(context)[-1].phase == "done"
+
+
+def test_robot_rests_after_a_release_as_a_free_one():
+    """It was let go at 0.5 N, and stays where it is."""
+    loop = task_loop([Press(5.0, over=0.02), Release(over=0.02)])
+    context = started(loop, distance=0.0)
+    run_on(loop, context, 0.1)
+    last = loop.changes(context)[-1]
+    assert (last.phase, last.in_contact) == ("done", False)
+    assert_allclose(loop.record(context)["distance"][-1], 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_arm_with_springs_in_its_joints_touches_and_presses():
+    """Degrees 4 and 2: the force has a derivative, and goes on from it; 1e-8 a step."""
+    model = touching("two_link", [FlexibleJoints(stiffness=8000.0, inertia=0.5)])
+    law = TrackingLaw(model.dae, poles(-20.0))
+    free = TrackingLaw(open_contact(model.dae, "wall.force"), poles(-20.0))
+    assert (law.degrees, free.degrees) == ((4, 2), (4, 4))
+    controller = TaskController(
+        Task([Approach(0.1, over=0.1), Press(20.0, over=0.1), Dwell(0.05)]), law, free
+    )
+    loop = make_task_loop(UnilateralRobotPlant(model, {"wall": 0.0}), controller)
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, controller.rest_state([0.3, 0.005], model.dae.nominal_state))
+    run_on(loop, context, 0.24, accuracy=1e-8)
+    press = loop.changes(context)[1]
+    # The impact bends the springs, and these press: 0.5 N are there some time after it.
+    impact = loop.plant.events(loop.plant.GetMyContextFromRoot(context))[0]
+    assert_allclose(impact.time, 0.005 / 0.1 + 0.05, atol=1e-6)
+    assert_allclose(press.force, 0.5, atol=1e-6)
+    record = loop.record(context)
+    off = (record["tracking_error"] - loop.predicted_error(record))[record.time > press.time]
+    assert np.abs(off).max() < 1e-5
+    assert_allclose(record["constraint_force"][-1], 20.0, atol=1e-4)
+
+
+def test_law_may_have_another_wall(whole):
+    """It believes the wall 5 mm nearer, and comes as far as its wall is with the wrong distance."""
+    loop, _, _ = whole
+    context = started(loop)
+    own = loop.controller.GetMyMutableContextFromRoot(context)
+    loop.controller.set_parameter(own, "wall.position", [1.195, 0.0, 0.0])
+    run_on(loop, context, TOUCH + 0.01, accuracy=1e-8)
+    touch = loop.changes(context)[1]
+    assert_allclose(touch.time, TOUCH, atol=1e-6)
+    assert_allclose(touch.distance, -0.005, atol=1e-9)
+
+
+def test_fade_begins_as_given_and_ends_at_rest():
+    """Rows are derivatives of each other, by NumPy's polynomials; 0 and 1 to round-off."""
+    offset, over = np.array([0.7, -2.0, 5.0, 3.0, 1.0, 2.0, 3.0, 4.0, 5.0]), 0.4
+    factors = fade(offset, [2, 0, 4], over)
+    assert_allclose(factors[:, 0], offset, rtol=1e-14)
+    assert_allclose(factors.sum(axis=1), 0.0, atol=1e-8)
+    for first, last in ((0, 2), (4, 8)):
+        for row in range(first, last):
+            derivative = np.polynomial.polynomial.polyder(factors[row]) / over
+            assert_allclose(factors[row + 1][:-1], derivative, rtol=1e-9, atol=1e-9)
+    # Where the law needs no derivatives the fade has two nevertheless.
+    for order in (1, 2):
+        derivative = np.polynomial.polynomial.polyder(factors[3], order)
+        assert_allclose([derivative[0], derivative.sum()], 0.0, atol=1e-12)
+
+
+def test_free_member_is_the_robot_without_the_wall():
+    """v' by MultibodyPlant alone: z'' and phi'' are as the law wants them."""
+    law = TrackingLaw(open_contact(arm("two_link").model.dae, "wall.force"), poles(POLE))
+    assert [signal.name for signal in law.system.output_signals] == ["tool.z", "wall.distance"]
+    q, v = np.array([1.1, -1.5]), np.array([0.4, -0.7])
+    reference = np.array([0.2, 0.1, -0.3, 0.05, 0.2, 0.4])
+    u = law.control(np.concatenate([q, v]), reference)
+    found = numbers("two_link", q, v)
+    acceleration = np.linalg.solve(found.mass, u - found.bias)
+    moved = found.constraint_jacobian @ acceleration + found.constraint_acceleration
+    distance = arm("two_link").plant
+    context = distance.CreateDefaultContext()
+    distance.SetPositions(context, q)
+    tool = distance.GetFrameByName("tool").CalcPoseInWorld(context).translation()
+    gap, rate = 1.2 - tool[0], found.constraint_jacobian @ v
+    wanted = 0.4 - 16.0 * (rate - 0.2) - 64.0 * (gap - 0.05)
+    assert_allclose(moved, wanted, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_drakes_own_contact_is_the_plant():
+    """1e5 N/m at 1 kHz, one sample late: measured 0.4 N and 0.2 mm off at most in contact.
+
+    It touches as fast as designed but for what a delay of 1 ms does, measured 0.6 %.
+    """
+    found = arm("two_link")
+    plant = ContactPlant(
+        found.model, add_arm, ContactMaterial(radius=1e-5), structure=found.structure
+    )
+    system = found.model.dae
+    law = TrackingLaw(
+        system, poles(-25.0), structure=found.structure, constraint_damping=poles(-250.0)
+    )
+    free = TrackingLaw(
+        open_contact(system, "wall.force"), poles({"tool.z": -25.0, "wall.distance": -8.0})
+    )
+    phases = (
+        Approach(SPEED, over=0.1),
+        Press(20.0, over=0.1),
+        Move({"tool.z": CLIMB}, 0.5, over=0.2),
+        Release(over=0.1),
+        Retreat(0.01, over=0.2),
+    )
+    controller = TaskController(Task(phases), law, free, sample_period=1e-3)
+    loop = make_task_loop(plant, controller, sampling=Sampling(1e-3, 1e-3))
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, controller.rest_state([0.3, 0.25 * FAR], system.nominal_state))
+    simulate(loop.diagram, context, 1.15, SimulatorConfig())
+    changes = loop.changes(context)
+    assert [change.phase for change in changes][-2:] == ["Retreat", "done"]
+    record = loop.record(context)
+    touch = int(np.argmax(record["constraint_force"][:, 0] > 0.0))
+    assert_allclose(record.time[touch], 0.25 * FAR / SPEED + 0.05, atol=2e-3)
+    assert_allclose(record["distance"][touch - 1, 1], -SPEED, atol=5e-4)
+    moving = record["phase"][:, 2] > 0.0
+    assert_allclose(record["tracking_error"][moving, 1], 0.0, atol=0.6)
+    assert_allclose(record["tracking_error"][moving, 0], 0.0, atol=2e-4)
+    assert record["constraint_force"][moving, 0].min() > 19.0
+    assert_allclose(record["distance"][-1, 0], 0.01, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("phases", "message"),
+    [
+        ([], "a task needs phases"),
+        ([Approach(), Retreat(0.1)], "phase 2 of the task, Retreat: .* a Release must"),
+        ([Retreat(0.1), Press(20.0)], "phase 2 of the task, Press: .* an Approach must"),
+        ([Press(20.0, if_lost="approach")], "if_lost: approach goes back to an Approach"),
+    ],
+)
+def test_phases_that_make_no_sense_are_refused(phases, message):
+    with pytest.raises(ModelError, match=message):
+        Task(phases)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Approach(-0.1), "Approach: speed must be positive"),
+        (lambda: Approach(over=0.0), "Approach: over must be positive"),
+        (lambda: Approach(if_late="approach"), "would go on as before"),
+        (lambda: Press(0.0), "Press: force must be positive"),
+        (lambda: Move({}, -1.0), "Move: duration must be positive"),
+        (lambda: Task([Approach()], contact_force=0.0), "contact_force must be positive"),
+        (lambda: TaskController(Task([Approach()]), laws()[0], laws()[0]), "with and without a"),
+        (
+            lambda: TaskController(Task([Move({"tool.x": 1.0}, 1.0)]), *laws()),
+            "phase 1 of the task, Move: reference 'tool.x': no output 'tool.x'",
+        ),
+        (
+            lambda: task_loop([Approach(), Move({"wall.distance": ConstantReference(1.0)}, 1.0)]),
+            "no output 'wall.distance'",
+        ),
+        (
+            lambda: open_contact(laws()[0].system, "floor.force"),
+            "no constraint force 'floor.force'",
+        ),
+    ],
+)
+def test_wrong_numbers_and_names_are_refused(make, message):
+    with pytest.raises(ModelError, match=message):
+        make()
+
+
+def test_run_that_has_not_begun_has_no_references(whole):
+    controller = whole[0].controller
+    with pytest.raises(ModelError, match="has not begun in this context"):
+        controller.desired_along(controller.CreateDefaultContext(), [0.0])
+
+
+def test_discrete_plant_needs_guards_in_samples():
+    found = arm("two_link")
+    plant = ContactPlant(found.model, add_arm, ContactMaterial(), structure=found.structure)
+    with pytest.raises(WiringError, match=r"make the controller with sample_period=0\.001"):
+        make_task_loop(plant, TaskController(Task([Approach()]), *laws()))
