@@ -34,7 +34,7 @@ from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, Scenario
 from drake_dae.pictures.axes import labelled
 from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.parts import Robot
+from drake_dae.scenario.robot_file.robot import Robot
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)

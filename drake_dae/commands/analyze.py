@@ -4,7 +4,7 @@ import argparse
 import json
 
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.running.export.export import export_code
 from drake_dae.scenario.build import build_loop, start_scenario
-from drake_dae.scenario.scenario import Scenario, load_scenario
+from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant

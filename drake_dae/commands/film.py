@@ -6,7 +6,7 @@ from drake_dae.commands.run_folder import FILM, PART, SCENARIO, stage
 from drake_dae.errors import ModelError
 from drake_dae.pictures.film import save_film
 from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.files import load_scenario
 from drake_dae.simulation.records.record import Record
 
 

@@ -36,7 +36,8 @@ from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.view import RobotBlock, start_meshcat
 from drake_dae.scenario.build import build_completed, start_scenario
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario
+from drake_dae.scenario.files import load_scenario, save_scenario
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from drake_dae.errors import ModelError
-from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep

@@ -8,8 +8,8 @@ from drake_dae.dae.beyond.contact_gains import contact_gains
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 

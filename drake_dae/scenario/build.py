@@ -27,7 +27,7 @@ from drake_dae.errors import (
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice import advised
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.keys import at, violated
+from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import (
     completed_model,
     scenario_structure,

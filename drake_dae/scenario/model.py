@@ -26,12 +26,13 @@ from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
-from drake_dae.scenario.keys import at, each
-from drake_dae.scenario.parts import Robot, Written, made
+from drake_dae.scenario.forms.keys import at, each
+from drake_dae.scenario.parts.written import Written, made
 from drake_dae.scenario.robot_file.changes import change_robot, finalize
 from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
 from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
+from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.scenario import Scenario
 
 

@@ -4,7 +4,7 @@ from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.keys import at
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
 
 

@@ -11,7 +11,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.keys import each
+from drake_dae.scenario.forms.keys import each
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial

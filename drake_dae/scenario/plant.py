@@ -4,7 +4,7 @@ from functools import partial
 
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.keys import at
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import add_robot
 from drake_dae.scenario.own_model import check_pushes
 from drake_dae.scenario.scenario import Scenario

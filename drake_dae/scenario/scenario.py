@@ -1,140 +1,46 @@
-"""Scenario files: a robot in contact, what it shall do, and how to simulate it.
+"""The form of a scenario: a robot in contact, what it shall do, and how to simulate it.
 
 A scenario is YAML. What the library has as a dataclass is written with the keys of that dataclass;
 a choice between several is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from casadi import SX
-from numpy.typing import ArrayLike
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import listed
-from drake_dae.dae import references
-from drake_dae.diagrams import unilateral
-from drake_dae.errors import ScenarioError
-from drake_dae.robots import actuation, force_outputs, loads, outputs
-from drake_dae.robots import constraints as contact
-from drake_dae.robots.surfaces import maps, surface, surfaces
-from drake_dae.scenario import parts as parts
-from drake_dae.scenario.forms.forms import (
-    Choice,
-    FileName,
-    Form,
-    Numbers,
-    Pair,
-    Reader,
-    Row,
-    Triple,
+from drake_dae.scenario.forms.forms import Form
+from drake_dae.scenario.forms.reader import Reader
+from drake_dae.scenario.parts import parts as parts
+from drake_dae.scenario.parts.families import (
+    Constraint,
+    Encoders,
+    Force,
+    ForceOutput,
+    Gains,
+    Load,
+    Observer,
+    Output,
+    Payload,
+    Plant,
+    Push,
+    Reference,
+    Sampling,
+    Stage,
+    Task,
+    Tolerances,
 )
-from drake_dae.scenario.forms.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
-from drake_dae.scenario.robot_file import payloads
-from drake_dae.scenario.task import ScenarioTask
+from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import contact_material, pushes
-from drake_dae.systems.sensing import encoders, tolerances
-from drake_dae.systems.task import phases
+from drake_dae.systems.plants.contact import contact_material
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
-
-
-# The families that a tag chooses from. A new member is one line here. Vectors and arrays stand in a
-# file as `_WRITTEN` tells; numbers, text, truth values, Literals, dataclasses, tuples, and lists
-# and dictionaries of these stand for themselves.
-
-_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, maps.Pair: Pair}
-
-Surface = Annotated[
-    surfaces.Plane
-    | surfaces.Sphere
-    | surfaces.Cylinder
-    | surfaces.Ellipsoid
-    | surfaces.Torus
-    | surfaces.ImplicitSurface
-    | maps.HeightMap
-    | maps.MeshSurface,
-    Choice({**_WRITTEN, Callable[..., SX] | str: str}),
-]
-Constraint = Annotated[
-    contact.PointOnSurface
-    | parts.WeldedFrames
-    | contact.CoincidentPoints
-    | contact.FixedDistance
-    | contact.JointCoupler
-    | contact.RevoluteLoopJoint
-    | contact.PrismaticLoopJoint
-    | contact.AxisNormalToSurface
-    | contact.Blade
-    | contact.RollingWheel
-    | contact.RollingBall,
-    Choice({**_WRITTEN, surface.Surface: Surface}),
-]
-Output = Annotated[
-    outputs.PointCoordinates
-    | outputs.AxisCoordinates
-    | parts.SurfaceCoordinates
-    | parts.TiltFromNormal
-    | outputs.JointPositions,
-    Choice(_WRITTEN),
-]
-ForceOutput = Annotated[
-    str | force_outputs.Squeeze | force_outputs.ForceCombination, Choice(_WRITTEN)
-]
-Stage = Annotated[
-    actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
-    Choice(_WRITTEN),
-]
-_PathLimits = Annotated[references.PathLimits, Form()]
-Reference = Annotated[
-    Annotated[references.ConstantReference, Form(tag="!Constant")]
-    | float
-    | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
-    | Annotated[
-        references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
-    ]
-    | Annotated[references.LineReference, Form(tag="!Line")]
-    | Annotated[references.CircleReference, Form(tag="!Circle")]
-    | Annotated[references.SpiralReference, Form(tag="!Spiral")]
-    | Annotated[references.PolylineReference, Form(tag="!Polyline")]
-    | Annotated[references.WaypointsReference, Form(tag="!Waypoints")]
-    | Annotated[references.CsvReference, Form(tag="!Csv")]
-    | Annotated[references.TextReference, Form(tag="!Text")],
-    Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
-]
-Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
-Payload = Annotated[payloads.Payload, Form()]
-Push = Annotated[pushes.Push, Form(_WRITTEN)]
-Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
-Plant = Annotated[
-    parts.IdealConstraints
-    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")]
-    | unilateral.Unilateral,
-    Choice(),
-]
-Sampling = Annotated[sampling.Sampling, Form()]
-Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
-Tolerances = Annotated[tolerances.Tolerances, Form()]
-Observer = Annotated[parts.Observer, Form()]
-_PHASE_DATA = {
-    float | references.Reference: Reference,
-    Mapping[str, references.Reference | float]: dict[str, Reference],
-}
-Phase = Annotated[
-    phases.Approach | phases.Press | phases.Move | phases.Dwell | phases.Release | phases.Retreat,
-    Choice(_PHASE_DATA),
-]
-Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase]})]
-Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
 
 
 def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
@@ -228,7 +134,7 @@ class Scenario:
     """
 
     description: str = field(default="", kw_only=True)
-    robot: parts.Robot
+    robot: Robot
     constraints: list[Constraint] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
     tool_axis: Literal["normal", "fixed", "free"] = "normal"
@@ -286,34 +192,25 @@ class Scenario:
 
     def __eq__(self, other: object) -> bool:
         # Arrays, and Drake's SimulatorConfig, do not compare as a whole.
-        return isinstance(other, Scenario) and _reader().write(self) == _reader().write(other)
+        return isinstance(other, Scenario) and scenario_reader().write(
+            self
+        ) == scenario_reader().write(other)
 
 
 @cache
-def _reader() -> Reader[Scenario]:
+def scenario_reader() -> Reader[Scenario]:
+    """What reads scenarios from plain data, and writes them as such."""
     return Reader(Scenario)
 
 
 def scenario_schema() -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
-    return _reader().schema
+    return scenario_reader().schema
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:
     """A scenario as plain data, of which `read_scenario` makes the same."""
-    return dict(_reader().write(scenario))
-
-
-def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario's plain data with other values at dotted keys.
-
-    Raises:
-        ScenarioError: There is no such place.
-    """
-    varied = deepcopy(dict(data))
-    for key, value in changes.items():
-        put_entry(varied, key, value, _reader().free_names)
-    return varied
+    return dict(scenario_reader().write(scenario))
 
 
 def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
@@ -326,76 +223,4 @@ def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenar
     Raises:
         ScenarioError: Keys are unknown or missing, or values cannot be used; all are told at once.
     """
-    return _reader().read(data, folder)
-
-
-@checked(lambda text: ScenarioError(("", text)))
-def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file.
-
-    Args:
-        path: The file.
-        settings: Changes "key=value" with dotted keys, for example "integrator.accuracy=1e-8" or
-            "constraints.0.surface.point=[0.7, 0, 0]".
-
-    Raises:
-        ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
-            given twice, or values cannot be used; all of these are told at once.
-    """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
-    except (OSError, ValueError) as error:  # A null byte in the path.
-        raise ScenarioError((str(path), str(error))) from None
-    data = load_yaml(text, str(path))
-    data = {} if data is None else data
-    if isinstance(data, dict):
-        # Drake's convention: keys with an underscore are a place for anchors.
-        data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
-    for setting in settings:
-        set_entry(data, setting, _reader().free_names)
-    scenario = _reader().read(data, path.absolute().parent)
-    # Absolute, so that the scenario as run means the same wherever it is written.
-    robot = scenario.robot
-    file = robot.file
-    try:
-        here = path.resolve().parent
-        if file and not file.startswith("package://"):
-            file = str((here / file).resolve())
-        packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
-    except (OSError, RuntimeError, ValueError) as error:
-        # The working directory is gone; a link that leads to itself; a null byte.
-        raise ScenarioError(("robot", f"no path: {error}")) from None
-
-    def located(one: Any) -> Any:
-        if isinstance(one, Mapping):
-            return {name: located(inner) for name, inner in one.items()}
-        if isinstance(one, list):
-            return [*map(located, one)]
-        if isinstance(one, phases.Phase):
-            inside = {part.name: located(getattr(one, part.name)) for part in fields(one)}
-            return replace(one, **inside)
-        return one.beside(here) if isinstance(one, references.Reference) else one
-
-    task = scenario.task
-    return replace(
-        scenario,
-        robot=replace(robot, file=file, packages=packages),
-        references=located(scenario.references),
-        exogenous=located(scenario.exogenous),
-        task=None if task is None else replace(task, phases=located([*task.phases])),
-    )
-
-
-def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
-    """Writes a scenario file that `load_scenario` reads back equal.
-
-    Args:
-        scenario: The scenario.
-        path: The file to write.
-        comment: A first line, with its "#"; empty for none.
-    """
-    head = f"{comment}\n" if comment else ""
-    Path(path).write_text(head + dump_yaml(_reader().write(scenario)), encoding="utf-8")
+    return scenario_reader().read(data, folder)

@@ -11,7 +11,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.keys import at
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant

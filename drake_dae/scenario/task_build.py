@@ -12,7 +12,7 @@ from drake_dae.diagrams.wiring import hold_before
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.keys import at
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import start_guess
 from drake_dae.scenario.plant import contact_plant
 from drake_dae.scenario.scenario import Scenario

@@ -24,8 +24,9 @@ from drake_dae.errors import (
     SimulationError,
 )
 from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.scenario import Scenario, read_scenario, varied_data
+from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.simulation.figures import exceeded, run_figures
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate

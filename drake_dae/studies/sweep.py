@@ -14,8 +14,9 @@ from tqdm import tqdm
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.model import complete_scenario
-from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data, varied_data
+from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.records.interruption import end_at_once, ending_signals
 from drake_dae.simulation.simulate import default_size
 from drake_dae.studies.cluster import Cluster

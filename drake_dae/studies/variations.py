@@ -13,8 +13,9 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, vector
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.forms.typed_yaml import load_yaml
-from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data, varied_data
+from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 
 MOST_RUNS = 1_000_000
 """A study has no more runs than these: they would take weeks."""

@@ -11,7 +11,8 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
 
-from drake_dae.scenario.scenario import Scenario, load_scenario
+from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 

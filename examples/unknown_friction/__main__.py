@@ -31,7 +31,7 @@ from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
 import drake_dae as dd
 from drake_dae.scenario.build import build_completed, start_scenario
 from drake_dae.scenario.model import add_robot
-from drake_dae.scenario.parts import IdealConstraints
+from drake_dae.scenario.parts.parts import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 

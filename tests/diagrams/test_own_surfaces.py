@@ -10,8 +10,8 @@ from runs import run_scenario, scenario
 from drake_dae import load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.remarks import surface_remarks
 from drake_dae.trace.functions import TracedFunction

@@ -10,11 +10,12 @@ from runs import scenario
 from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario import parts as parts
 from drake_dae.scenario.advice import advised
 from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model, scenario_structure
-from drake_dae.scenario.scenario import Scenario, save_scenario
+from drake_dae.scenario.parts import parts as parts
+from drake_dae.scenario.scenario import Scenario
 
 PLANT = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, friction: 0.3}"
 STILL = "references={tool.z: 0.3, wall.force: 20}"

@@ -39,9 +39,12 @@ from drake_dae import (
     load_scenario,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario import parts as forms
+from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.forms.typed_yaml import load_yaml
-from drake_dae.scenario.scenario import Scenario, save_scenario
+from drake_dae.scenario.parts import parts as forms
+from drake_dae.scenario.parts import written
+from drake_dae.scenario.robot_file.robot import Pose, Robot
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.trace.functions import TracedFunction
 
@@ -214,13 +217,13 @@ def test_every_form_reads_back_equal(tmp_path):
     ]
     scenario = Scenario(
         description="on: ä # 'quoted'\nsecond line",
-        robot=forms.Robot("/some/where.urdf", {"other": "/else/where"}),
+        robot=Robot("/some/where.urdf", {"other": "/else/where"}),
         constraints=[
             *[
                 PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
                 for i, surface in enumerate(surfaces)
             ],
-            forms.WeldedFrames("a", "b::c", forms.Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
+            written.WeldedFrames("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
             CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
             FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
             JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
@@ -232,7 +235,7 @@ def test_every_form_reads_back_equal(tmp_path):
         outputs=[
             PointCoordinates("yes", "xy"),
             AxisCoordinates("b", "z", "xy"),
-            forms.SurfaceCoordinates("c0"),
+            written.SurfaceCoordinates("c0"),
             JointPositions(["joint1", "2"]),
         ],
         forces=[
@@ -488,7 +491,7 @@ def test_weld():
         find_scenario("two_arms"),
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
-    assert plain.constraints[0] == forms.WeldedFrames("left::tool", "right::tool", forms.Pose())
+    assert plain.constraints[0] == written.WeldedFrames("left::tool", "right::tool", Pose())
 
 
 def test_coincident_points():

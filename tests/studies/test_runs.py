@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from runs import run_scenario, scenario
 
-from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
+from drake_dae.scenario.files import varied_data
+from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.simulation.figures import run_figures
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.runs import (

@@ -17,7 +17,7 @@ from runs import each_scenario
 
 from drake_dae import DaeSystem, build_scenario
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
-from drake_dae.scenario.scenario import load_scenario
+from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiled import LIMIT, LOOK, Compiler, attempts, find_compiler

@@ -16,10 +16,11 @@ from drake_dae.robots.outputs import (
     PointCoordinates,
     PositionOutput,
 )
-from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion.postures import Posture
 from drake_dae.scenario.completion.tool_axis import ToolAxis, tool_axis
-from drake_dae.scenario.scenario import Output, Scenario
+from drake_dae.scenario.parts.families import Output
+from drake_dae.scenario.parts.written import TiltFromNormal, made
+from drake_dae.scenario.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class Candidates:
         def add(forms: Iterable[Output]) -> list[int]:
             first = len(self.signals)
             for form in forms:
-                output = parts.made(form, bound.constraints)
+                output = made(form, bound.constraints)
                 rows.append(output.expression(links))
                 self._forms.append(form)
                 self.signals += output.signals(links)
@@ -113,7 +114,7 @@ def _points(place: _Place, taken: set[str]) -> list[Output]:
 def _tilts(place: _Place) -> list[Output]:
     axis = place.axis.axis
     others = "xyz".replace(axis, "")
-    return [parts.TiltFromNormal(place.constraint, axis, one) for one in others]
+    return [TiltFromNormal(place.constraint, axis, one) for one in others]
 
 
 def _directions(place: _Place) -> list[Output]:
@@ -123,7 +124,7 @@ def _directions(place: _Place) -> list[Output]:
 _JOINED = {
     PointCoordinates: "axes",
     AxisCoordinates: "components",
-    parts.TiltFromNormal: "components",
+    TiltFromNormal: "components",
     JointPositions: "joints",
 }
 """Which attribute of an output holds its rows."""

@@ -5,26 +5,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.references import Reference
-from drake_dae.dae.references.by_name import meant
-from drake_dae.errors import ReferenceSignalError, ScenarioError
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ScenarioError
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.force_outputs import force_outputs, force_rows
 from drake_dae.robots.links.links import Links
-from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion.candidates import Candidates, merged
 from drake_dae.scenario.completion.choice import best_joints, first_independent
 from drake_dae.scenario.completion.postures import Posture, Postures
+from drake_dae.scenario.completion.referred import ReferredRows, value_at
 from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.scenario.parts.written import made
 from drake_dae.scenario.scenario import Scenario
 
 REGULAR = 1e-3
 """A start whose `independence` is less is singular."""
-
-_TIMES = 25
-"""At so many times along the reference choices are compared."""
 
 _DIGITS = 4
 """Decimals of m and rad with which a start is written."""
@@ -73,7 +69,7 @@ def complete(
         ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
     """
     bound = ConstraintSet([*constraints, *of_plant])
-    given = [parts.made(form, constraints) for form in scenario.outputs]
+    given = [made(form, constraints) for form in scenario.outputs]
     size = sum(len(output.signals(links)) for output in given)
     steered = force_outputs(scenario.forces, bound)
     names = [signal.name for output in steered for signal in output.signals(bound)]
@@ -98,147 +94,45 @@ def complete(
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
     movable = _movable(postures) if missing else []
     along = [row for row in candidates.points(near) if row in movable] if near else []
-    task = _Task(scenario, candidates, size, missing, names, along)
+    referred = ReferredRows(scenario, candidates, size, missing, names, along)
     if missing == 0:
-        return _with_start(scenario, task, postures, guess)
-    return _with_outputs(scenario, task, postures, guess)
-
-
-class _Task:
-    """Which rows have references, and their values.
-
-    Attributes:
-        scenario, candidates: The arguments.
-        given: How many rows the scenario gives.
-        missing: How many are missing.
-        referred: The rows that have references: those that are given, and then those that complete
-            them and are named by references.
-    """
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        candidates: Candidates,
-        given: int,
-        missing: int,
-        forces: Sequence[str],
-        along: Sequence[int],
-    ) -> None:
-        """Finds the rows that references name.
-
-        Args:
-            scenario: The scenario.
-            candidates: Its rows.
-            given: How many of these it gives.
-            missing: How many are missing.
-            forces: The names of the force outputs.
-            along: The rows along the surfaces, near the start.
-
-        Raises:
-            ScenarioError: A name means none of them, or they are too many.
-        """
-        self.scenario, self.candidates = scenario, candidates
-        self.given, self.missing = given, missing
-        self._forces, self._along = forces, along
-        self._rows = {name: self._named(name) for name in scenario.references}
-        named = dict.fromkeys(row for rows in self._rows.values() for row in rows)
-        beside = [row for row in named if row is not None and row >= given]
-        if len(beside) > missing:
-            names = ", ".join(candidates.signals[row].name for row in beside)
-            text = f"{names} are {len(beside)} outputs, but only {missing} are missing"
-            raise ScenarioError(("references", text))
-        left = [candidates.signals[row].name for row in range(given) if row not in named]
-        if left:
-            raise ScenarioError(("references", f"left without one: {', '.join(left)}"))
-        self.referred = [*range(given), *beside]
-
-    def _named(self, name: str) -> list[int | None]:
-        """The rows that a key of the references means; None for a force."""
-        key, found = f"references.{name}", list[int | None]()
-        for part in map(str.strip, name.split(",")):
-            found += self._meant(part, key)
-        reference = self.scenario.references[name]
-        if isinstance(reference, Reference) and reference.size != len(found):
-            text = f"{reference.size} values for {len(found)} outputs"
-            raise ScenarioError((key, text))
-        return found
-
-    def _meant(self, name: str, key: str) -> Sequence[int | None]:
-        signals = [signal.name for signal in self.candidates.signals]
-        known = [*signals[: self.given], *self._forces]
-        degrees = [2] * self.given + [0] * len(self._forces)
-        try:
-            places = meant(name, known, degrees)
-        except ReferenceSignalError as error:
-            if not self.missing:
-                raise ScenarioError((key, str(error))) from None
-        else:
-            return [place if place < self.given else None for place in places]
-        # A name of no output yet: of rows that may complete them.
-        along = [signals[row] for row in self._along]
-        beside = [*along, *(one for one in signals[self.given :] if one not in along)]
-        own = [one for one in along if one.rpartition(".")[0] == name]
-        try:
-            chosen = own or [beside[k] for k in meant(name, beside, [2] * len(beside))]
-        except ReferenceSignalError:
-            text = unknown_name("output", name, [*known, *beside])
-            raise ScenarioError((key, text)) from None
-        return [signals.index(one) for one in chosen]
-
-    def wanted(self, time: float) -> FloatArray:
-        """The values of the referred rows at a time in s, shape (referred,)."""
-        values: dict[int | None, float] = {}
-        for name, rows in self._rows.items():
-            found = _value(self.scenario.references[name], len(rows), time)
-            values.update(zip(rows, found.tolist(), strict=True))
-        return np.array([values[row] for row in self.referred])
-
-    def times(self) -> FloatArray:
-        """Times along the references, in s."""
-        begin = self.scenario.integrator.start_time
-        return np.linspace(begin, begin + self.scenario.duration, _TIMES)
-
-    def at_start(self, rows: Sequence[int]) -> FloatArray:
-        """The values of the referred rows at the start, with start.errors."""
-        errors = self.scenario.start.errors
-        wanted = self.wanted(self.scenario.integrator.start_time)
-        signals = [self.candidates.signals[row] for row in rows]
-        return wanted + np.array([errors.get(signal.name, 0.0) for signal in signals])
+        return _with_start(scenario, referred, postures, guess)
+    return _with_outputs(scenario, referred, postures, guess)
 
 
 def _with_start(
-    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+    scenario: Scenario, referred: ReferredRows, postures: Postures, guess: FloatArray
 ) -> Completed:
     """The scenario with a start, if its default configuration leads to none."""
-    rows = task.referred
-    wanted = task.at_start(rows)
+    rows = referred.rows
+    wanted = referred.at_start(rows)
     near = near_posture(postures, rows, wanted, guess)
     # The structure is found at the guess itself.
     if near is not None and all(
         posture.independence(rows) > REGULAR for posture in (near, postures.at(guess))
     ):
         return Completed(scenario)
-    found = _found(task, postures, rows, wanted, guess)
-    return Completed(_started(scenario, task, found), (_start_note(task, found),))
+    found = _found(referred, postures, rows, wanted, guess)
+    return Completed(_started(scenario, referred, found), (_start_note(referred, found),))
 
 
 def _with_outputs(
-    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+    scenario: Scenario, referred: ReferredRows, postures: Postures, guess: FloatArray
 ) -> Completed:
     """The scenario with all outputs and a start."""
-    candidates, referred = task.candidates, task.referred
-    posture, is_normal = _posture(task, postures, referred, guess)
+    candidates, named = referred.candidates, referred.rows
+    posture, is_normal = _posture(referred, postures, named, guess)
     # What completes the outputs, in the order of their worth.
-    open_points = [row for row in candidates.points(posture) if row not in referred]
-    room = task.missing - len(referred) + task.given
-    along = first_independent(posture, referred, open_points, room)
-    rows = [*referred, *along]
+    open_points = [row for row in candidates.points(posture) if row not in named]
+    room = referred.missing - len(named) + referred.given
+    along = first_independent(posture, named, open_points, room)
+    rows = [*named, *along]
     room -= len(along)
     axes = [row for row in candidates.axes if row not in rows]
     held = first_independent(posture, rows, axes, len(axes))
     held = held if len(held) <= room else []
     rows += held
-    wanted = [task.wanted(time)[: len(referred)] for time in task.times()]
+    wanted = [referred.wanted(time)[: len(named)] for time in referred.times()]
     free = [row for row in candidates.joints if row not in rows]
     joints = best_joints(postures, posture, rows, free, room - len(held), np.array(wanted))
     if joints is None:
@@ -246,11 +140,11 @@ def _with_outputs(
         raise ScenarioError(
             (
                 "outputs",
-                f"{task.missing} are missing, and no positions of joints beside {names} leave "
+                f"{referred.missing} are missing, and no positions of joints beside {names} leave "
                 "B(x) regular; name them",
             )
         )
-    chosen, resting = [*referred[task.given :], *along, *held, *joints], [*along, *held, *joints]
+    chosen, resting = [*named[referred.given :], *along, *held, *joints], [*along, *held, *joints]
     values = _rounded(posture.rows)
     if is_normal:
         values[candidates.tilts] = 0.0
@@ -263,7 +157,7 @@ def _with_outputs(
     names = ", ".join(candidates.signals[row].name for row in chosen)
     reason = " (joints so that B(x) is best conditioned)" if joints else ""
     note = f"outputs completed by {names}{reason}"
-    return Completed(_started(completed, task, posture), (note, _start_note(task, posture)))
+    return Completed(_started(completed, referred, posture), (note, _start_note(referred, posture)))
 
 
 def _movable(postures: Postures) -> list[int]:
@@ -273,16 +167,16 @@ def _movable(postures: Postures) -> list[int]:
 
 
 def _posture(
-    task: _Task,
+    referred: ReferredRows,
     postures: Postures,
     rows: Sequence[int],
     guess: FloatArray,
 ) -> tuple[Posture, bool]:
     """Where the robot starts, and whether its tools are then normal to their surfaces."""
-    candidates, wanted = task.candidates, task.at_start(rows)
+    candidates, wanted = referred.candidates, referred.at_start(rows)
     both = [*rows, *candidates.tilts]
     goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
-    if task.scenario.start.positions:
+    if referred.scenario.start.positions:
         for chosen, values in ((both, goal), (rows, wanted)):
             near = near_posture(postures, chosen, values, guess)
             if near is not None and near.independence(rows) > REGULAR:
@@ -291,11 +185,11 @@ def _posture(
         found = best_posture(postures, both, goal, [guess, *postures.guesses(TRIES)])
         if found is not None:
             return found, True
-    return _found(task, postures, rows, wanted, guess), False
+    return _found(referred, postures, rows, wanted, guess), False
 
 
 def _found(
-    task: _Task,
+    referred: ReferredRows,
     postures: Postures,
     rows: Sequence[int],
     wanted: FloatArray,
@@ -314,7 +208,7 @@ def _found(
     polished = near_posture(postures, rows, wanted, nearest.q)
     if polished is not None:
         return polished
-    signals = [task.candidates.signals[row] for row in rows]
+    signals = [referred.candidates.signals[row] for row in rows]
     missed = [
         f"{signal.name} comes to {value:.4g} {signal.unit}, "
         f"{abs(goal - value):.2g} {signal.unit} from {goal:.4g} {signal.unit}".replace(" ,", ",")
@@ -335,14 +229,14 @@ def _found(
     )
 
 
-def _started(scenario: Scenario, task: _Task, posture: Posture) -> Scenario:
+def _started(scenario: Scenario, referred: ReferredRows, posture: Posture) -> Scenario:
     """The scenario with a start."""
-    return replace(scenario, start=replace(scenario.start, positions=_named(task, posture)))
+    return replace(scenario, start=replace(scenario.start, positions=_named(referred, posture)))
 
 
-def _named(task: _Task, posture: Posture) -> dict[str, float]:
+def _named(referred: ReferredRows, posture: Posture) -> dict[str, float]:
     """The positions of a posture by their names, rounded."""
-    names = [task.candidates.signals[row].name for row in task.candidates.joints]
+    names = [referred.candidates.signals[row].name for row in referred.candidates.joints]
     return dict(zip(names, _rounded(posture.q).tolist(), strict=True))
 
 
@@ -351,23 +245,16 @@ def _rounded(values: FloatArray) -> FloatArray:
     return np.round(values, _DIGITS) + 0.0
 
 
-def _start_note(task: _Task, posture: Posture) -> str:
-    positions = (f"{name}: {value:.4g}" for name, value in _named(task, posture).items())
+def _start_note(referred: ReferredRows, posture: Posture) -> str:
+    positions = (f"{name}: {value:.4g}" for name, value in _named(referred, posture).items())
     return f"start found: {{{', '.join(positions)}}}"
-
-
-def _value(reference: Reference | float, size: int, time: float) -> FloatArray:
-    """r at a time in s, shape (size,)."""
-    if not isinstance(reference, Reference):
-        return np.full(size, float(reference))
-    return np.asarray(reference.derivatives([0] * size)(time), dtype=float)
 
 
 def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
     """Parameter name -> value at the start, where it is not the default."""
     begin = scenario.integrator.start_time
     moving = {
-        name: np.concatenate([_value(one, getattr(one, "size", 1), begin) for one in references])
+        name: np.concatenate([value_at(one, getattr(one, "size", 1), begin) for one in references])
         for name, references in scenario.exogenous.items()
     }
     return {**{k: np.atleast_1d(v) for k, v in scenario.plant_parameters.items()}, **moving}

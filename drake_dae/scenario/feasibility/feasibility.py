@@ -17,7 +17,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.build import exogenous_references, wire_scenario
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.model import completed_model, scenario_structure
-from drake_dae.scenario.parts import IdealConstraints
+from drake_dae.scenario.parts.parts import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction

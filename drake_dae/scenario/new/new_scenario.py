@@ -16,13 +16,13 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.outputs import PointCoordinates
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.robots.surfaces.surfaces import Plane
-from drake_dae.scenario import parts as parts
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.model import complete_scenario, robot_links
 from drake_dae.scenario.new.places import find_places
 from drake_dae.scenario.new.robot import NewRobot, new_robot
 from drake_dae.scenario.new.task import SurfaceKind, Task, circle
 from drake_dae.scenario.new.text import scenario_text
+from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario
 
 _SHARES = (1.0, 0.5, 0.2)

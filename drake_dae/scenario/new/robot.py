@@ -25,11 +25,11 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.plant_constraints import couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.scenario.keys import at
-from drake_dae.scenario.parts import Base, Robot
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.packages import find_packages
 from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Base, Robot
 
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
 """What grasps or rolls: joints with such names are locked, if others are left."""

@@ -23,11 +23,11 @@ from drake_dae.arrays import unknown_name
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots.constraints.plant_constraints import Coupling, couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
-from drake_dae.scenario.keys import at
-from drake_dae.scenario.parts import Base, Robot
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.efforts import Efforts, limits_of
 from drake_dae.scenario.robot_file.payloads import add_payloads
 from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Base, Robot
 
 
 def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from pydrake.multibody.parsing import PackageMap
 
 from drake_dae.errors import ModelError
-from drake_dae.scenario.keys import at
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.shipped import FOLDER
 
 _URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")

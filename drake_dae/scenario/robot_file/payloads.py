@@ -10,8 +10,8 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import frame_named
-from drake_dae.scenario.forms.forms import Triple
-from drake_dae.scenario.keys import at
+from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.forms.values import Triple
 
 
 @dataclass(frozen=True)

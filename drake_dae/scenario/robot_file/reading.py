@@ -14,13 +14,13 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
-from drake_dae.scenario.keys import at
-from drake_dae.scenario.parts import Robot
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.descriptions import find_description
 from drake_dae.scenario.robot_file.efforts import Efforts, read_efforts
 from drake_dae.scenario.robot_file.meshes import Copies, add_models
 from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
 from drake_dae.scenario.robot_file.resources import check_resources, package_folder
+from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import FOLDER
 
 _IGNORED = re.compile(r"The (?:tag|attribute) '(\w+)' .*ignored")

@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.forms.forms import Choice, Form, Numbers, Reader, Triple
+from drake_dae.scenario.forms.forms import Choice, Form
+from drake_dae.scenario.forms.reader import Reader
 from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml, set_entry
+from drake_dae.scenario.forms.values import Numbers, Triple
 
 
 class Surface:

@@ -8,7 +8,7 @@ from runs import scenario
 from drake_dae import build_scenario
 from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.errors import AssumptionError, ScenarioError
-from drake_dae.scenario.keys import violated
+from drake_dae.scenario.forms.keys import violated
 
 PYTHON = re.compile(r"drop_constraints|share_forces|dynamic_extension|plant\.\w+\(|Finalize")
 

@@ -15,11 +15,11 @@ from vendors import joint, link, mobile_arm, panda, robot, write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.efforts import read_efforts
 from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.scenario import save_scenario
 
 # The collision meshes of the panda are left out.
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")

@@ -11,8 +11,8 @@ from vendors import COLLADA, binary_stl, write_panda, write_ur5
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
 from drake_dae.pictures.view import start_meshcat
-from drake_dae.scenario.parts import Robot
 from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Robot
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 

@@ -11,7 +11,8 @@ from runs import run_scenario, scenario
 from drake_dae import build_scenario, make_animation
 from drake_dae.errors import ScenarioError, WiringError
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.scenario import Scenario, save_scenario
+from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.scenario import Scenario
 
 # Without damping a compliant contact swings for ever. A ball without extension does not roll.
 CONTACT = (

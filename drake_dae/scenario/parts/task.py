@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from drake_dae.scenario.forms.forms import Choice
-from drake_dae.scenario.parts import Coefficients, Matrices, Poles
+from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
 

@@ -1,0 +1,124 @@
+"""Which outputs, given or still to be chosen, the references of a scenario mean."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.references import Reference
+from drake_dae.dae.references.by_name import meant
+from drake_dae.errors import ReferenceSignalError, ScenarioError
+from drake_dae.scenario.completion.candidates import Candidates
+from drake_dae.scenario.scenario import Scenario
+
+_TIMES = 25
+"""At so many times along the reference choices are compared."""
+
+
+class ReferredRows:
+    """Which rows have references, and their values.
+
+    Attributes:
+        scenario, candidates: The arguments.
+        given: How many rows the scenario gives.
+        missing: How many are missing.
+        rows: The rows that have references: those that are given, and then those that complete
+            them and are named by references.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        candidates: Candidates,
+        given: int,
+        missing: int,
+        forces: Sequence[str],
+        along: Sequence[int],
+    ) -> None:
+        """Finds the rows that references name.
+
+        Args:
+            scenario: The scenario.
+            candidates: Its rows.
+            given: How many of these it gives.
+            missing: How many are missing.
+            forces: The names of the force outputs.
+            along: The rows along the surfaces, near the start.
+
+        Raises:
+            ScenarioError: A name means none of them, or they are too many.
+        """
+        self.scenario, self.candidates = scenario, candidates
+        self.given, self.missing = given, missing
+        self._forces, self._along = forces, along
+        self._meanings = {name: self._named(name) for name in scenario.references}
+        named = dict.fromkeys(row for rows in self._meanings.values() for row in rows)
+        beside = [row for row in named if row is not None and row >= given]
+        if len(beside) > missing:
+            names = ", ".join(candidates.signals[row].name for row in beside)
+            text = f"{names} are {len(beside)} outputs, but only {missing} are missing"
+            raise ScenarioError(("references", text))
+        left = [candidates.signals[row].name for row in range(given) if row not in named]
+        if left:
+            raise ScenarioError(("references", f"left without one: {', '.join(left)}"))
+        self.rows = [*range(given), *beside]
+
+    def _named(self, name: str) -> list[int | None]:
+        """The rows that a key of the references means; None for a force."""
+        key, found = f"references.{name}", list[int | None]()
+        for part in map(str.strip, name.split(",")):
+            found += self._meant(part, key)
+        reference = self.scenario.references[name]
+        if isinstance(reference, Reference) and reference.size != len(found):
+            text = f"{reference.size} values for {len(found)} outputs"
+            raise ScenarioError((key, text))
+        return found
+
+    def _meant(self, name: str, key: str) -> Sequence[int | None]:
+        signals = [signal.name for signal in self.candidates.signals]
+        known = [*signals[: self.given], *self._forces]
+        degrees = [2] * self.given + [0] * len(self._forces)
+        try:
+            places = meant(name, known, degrees)
+        except ReferenceSignalError as error:
+            if not self.missing:
+                raise ScenarioError((key, str(error))) from None
+        else:
+            return [place if place < self.given else None for place in places]
+        # A name of no output yet: of rows that may complete them.
+        along = [signals[row] for row in self._along]
+        beside = [*along, *(one for one in signals[self.given :] if one not in along)]
+        own = [one for one in along if one.rpartition(".")[0] == name]
+        try:
+            chosen = own or [beside[k] for k in meant(name, beside, [2] * len(beside))]
+        except ReferenceSignalError:
+            text = unknown_name("output", name, [*known, *beside])
+            raise ScenarioError((key, text)) from None
+        return [signals.index(one) for one in chosen]
+
+    def wanted(self, time: float) -> FloatArray:
+        """The values of the referred rows at a time in s, shape (referred,)."""
+        values: dict[int | None, float] = {}
+        for name, rows in self._meanings.items():
+            found = value_at(self.scenario.references[name], len(rows), time)
+            values.update(zip(rows, found.tolist(), strict=True))
+        return np.array([values[row] for row in self.rows])
+
+    def times(self) -> FloatArray:
+        """Times along the references, in s."""
+        begin = self.scenario.integrator.start_time
+        return np.linspace(begin, begin + self.scenario.duration, _TIMES)
+
+    def at_start(self, rows: Sequence[int]) -> FloatArray:
+        """The values of the referred rows at the start, with start.errors."""
+        errors = self.scenario.start.errors
+        wanted = self.wanted(self.scenario.integrator.start_time)
+        signals = [self.candidates.signals[row] for row in rows]
+        return wanted + np.array([errors.get(signal.name, 0.0) for signal in signals])
+
+
+def value_at(reference: Reference | float, size: int, time: float) -> FloatArray:
+    """r at a time in s, shape (size,)."""
+    if not isinstance(reference, Reference):
+        return np.full(size, float(reference))
+    return np.asarray(reference.derivatives([0] * size)(time), dtype=float)

@@ -1,0 +1,98 @@
+"""Scenario files read, with changes at dotted keys, and written."""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from drake_dae.arguments import checked
+from drake_dae.dae import references
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.forms.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
+from drake_dae.scenario.scenario import Scenario, scenario_reader
+from drake_dae.systems.task import phases
+
+
+def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's plain data with other values at dotted keys.
+
+    Raises:
+        ScenarioError: There is no such place.
+    """
+    varied = deepcopy(dict(data))
+    for key, value in changes.items():
+        put_entry(varied, key, value, scenario_reader().free_names)
+    return varied
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
+    """Reads a scenario file.
+
+    Args:
+        path: The file.
+        settings: Changes "key=value" with dotted keys, for example "integrator.accuracy=1e-8" or
+            "constraints.0.surface.point=[0.7, 0, 0]".
+
+    Raises:
+        ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
+            given twice, or values cannot be used; all of these are told at once.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
+    except (OSError, ValueError) as error:  # A null byte in the path.
+        raise ScenarioError((str(path), str(error))) from None
+    data = load_yaml(text, str(path))
+    data = {} if data is None else data
+    if isinstance(data, dict):
+        # Drake's convention: keys with an underscore are a place for anchors.
+        data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
+    for setting in settings:
+        set_entry(data, setting, scenario_reader().free_names)
+    scenario = scenario_reader().read(data, path.absolute().parent)
+    # Absolute, so that the scenario as run means the same wherever it is written.
+    robot = scenario.robot
+    file = robot.file
+    try:
+        here = path.resolve().parent
+        if file and not file.startswith("package://"):
+            file = str((here / file).resolve())
+        packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
+    except (OSError, RuntimeError, ValueError) as error:
+        # The working directory is gone; a link that leads to itself; a null byte.
+        raise ScenarioError(("robot", f"no path: {error}")) from None
+
+    def located(one: Any) -> Any:
+        if isinstance(one, Mapping):
+            return {name: located(inner) for name, inner in one.items()}
+        if isinstance(one, list):
+            return [*map(located, one)]
+        if isinstance(one, phases.Phase):
+            inside = {part.name: located(getattr(one, part.name)) for part in fields(one)}
+            return replace(one, **inside)
+        return one.beside(here) if isinstance(one, references.Reference) else one
+
+    task = scenario.task
+    return replace(
+        scenario,
+        robot=replace(robot, file=file, packages=packages),
+        references=located(scenario.references),
+        exogenous=located(scenario.exogenous),
+        task=None if task is None else replace(task, phases=located([*task.phases])),
+    )
+
+
+def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
+    """Writes a scenario file that `load_scenario` reads back equal.
+
+    Args:
+        scenario: The scenario.
+        path: The file to write.
+        comment: A first line, with its "#"; empty for none.
+    """
+    head = f"{comment}\n" if comment else ""
+    Path(path).write_text(head + dump_yaml(scenario_reader().write(scenario)), encoding="utf-8")

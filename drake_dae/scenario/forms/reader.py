@@ -1,0 +1,57 @@
+"""Reads dataclasses from plain data, and writes them as such; all that is wrong told at once."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+import pydantic
+
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.forms.forms import Form
+from drake_dae.scenario.forms.problems import problem, with_parts
+
+T = TypeVar("T")
+
+
+class Reader(Generic[T]):
+    """Reads a dataclass from plain data, and writes it as such."""
+
+    def __init__(self, form: type[T]) -> None:
+        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(Annotated[form, Form()])  # type: ignore[arg-type]
+        self.schema: dict[str, Any] = self._adapter.json_schema()
+        #: Dotted keys of the dictionaries with any names; "*" is any entry of a list.
+        self.free_names = set(_free_names(self.schema, ""))
+
+    def read(self, data: Any, folder: Path | None = None) -> T:
+        """The dataclass that plain data describe.
+
+        Args:
+            data: The plain data.
+            folder: Where relative names of files start; None for the working directory.
+
+        Raises:
+            ScenarioError: Keys are unknown or missing, or values are wrong; all of them are told.
+        """
+        try:
+            return self._adapter.validate_python(data, context=folder)
+        except pydantic.ValidationError as error:
+            # Each member of a Union says the same.
+            problems = dict.fromkeys(
+                problem(self.schema, details, data) for details in error.errors()
+            )
+            raise ScenarioError(*problems) from None
+
+    def write(self, value: T) -> Any:
+        """The plain data of which `read` makes the same value."""
+        return self._adapter.dump_python(value, mode="json")
+
+
+def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:
+    schema = with_parts(schema)
+    if isinstance(schema.get("additionalProperties"), dict):
+        yield path
+    for one in schema.get("oneOf", ()):
+        yield from _free_names(one, path)
+    inside = {"*": schema["items"]} if isinstance(schema.get("items"), dict) else {}
+    for name, inner in {**schema.get("properties", {}), **inside}.items():
+        yield from _free_names(inner, f"{path}.{name}" if path else name)

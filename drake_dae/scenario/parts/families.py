@@ -1,0 +1,112 @@
+"""The families that a tag in a scenario chooses from. A new member is one line here."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+from casadi import SX
+from numpy.typing import ArrayLike
+
+from drake_dae.dae import references
+from drake_dae.diagrams import unilateral
+from drake_dae.robots import actuation, force_outputs, loads, outputs
+from drake_dae.robots import constraints as contact
+from drake_dae.robots.surfaces import maps, surface, surfaces
+from drake_dae.scenario.forms.forms import Choice, Form
+from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
+from drake_dae.scenario.parts import parts as parts
+from drake_dae.scenario.parts import written
+from drake_dae.scenario.parts.task import ScenarioTask
+from drake_dae.scenario.robot_file import payloads
+from drake_dae.systems.control import sampling
+from drake_dae.systems.plants.contact import contact_material, pushes
+from drake_dae.systems.sensing import encoders, tolerances
+from drake_dae.systems.task import phases
+
+# Vectors and arrays stand in a
+# file as `_WRITTEN` tells; numbers, text, truth values, Literals, dataclasses, tuples, and lists
+# and dictionaries of these stand for themselves.
+
+_WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, maps.Pair: Pair}
+
+Surface = Annotated[
+    surfaces.Plane
+    | surfaces.Sphere
+    | surfaces.Cylinder
+    | surfaces.Ellipsoid
+    | surfaces.Torus
+    | surfaces.ImplicitSurface
+    | maps.HeightMap
+    | maps.MeshSurface,
+    Choice({**_WRITTEN, Callable[..., SX] | str: str}),
+]
+Constraint = Annotated[
+    contact.PointOnSurface
+    | written.WeldedFrames
+    | contact.CoincidentPoints
+    | contact.FixedDistance
+    | contact.JointCoupler
+    | contact.RevoluteLoopJoint
+    | contact.PrismaticLoopJoint
+    | contact.AxisNormalToSurface
+    | contact.Blade
+    | contact.RollingWheel
+    | contact.RollingBall,
+    Choice({**_WRITTEN, surface.Surface: Surface}),
+]
+Output = Annotated[
+    outputs.PointCoordinates
+    | outputs.AxisCoordinates
+    | written.SurfaceCoordinates
+    | written.TiltFromNormal
+    | outputs.JointPositions,
+    Choice(_WRITTEN),
+]
+ForceOutput = Annotated[
+    str | force_outputs.Squeeze | force_outputs.ForceCombination, Choice(_WRITTEN)
+]
+Stage = Annotated[
+    actuation.FlexibleJoints | actuation.DcMotors | actuation.ElectrohydraulicServos,
+    Choice(_WRITTEN),
+]
+_PathLimits = Annotated[references.PathLimits, Form()]
+Reference = Annotated[
+    Annotated[references.ConstantReference, Form(tag="!Constant")]
+    | float
+    | Annotated[references.SinusoidReference, Form(tag="!Sinusoids")]
+    | Annotated[
+        references.PointToPointReference, Form(tag="!PointToPoint", defaults={"start_time": 0.0})
+    ]
+    | Annotated[references.LineReference, Form(tag="!Line")]
+    | Annotated[references.CircleReference, Form(tag="!Circle")]
+    | Annotated[references.SpiralReference, Form(tag="!Spiral")]
+    | Annotated[references.PolylineReference, Form(tag="!Polyline")]
+    | Annotated[references.WaypointsReference, Form(tag="!Waypoints")]
+    | Annotated[references.CsvReference, Form(tag="!Csv")]
+    | Annotated[references.TextReference, Form(tag="!Text")],
+    Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
+]
+Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
+Payload = Annotated[payloads.Payload, Form()]
+Push = Annotated[pushes.Push, Form(_WRITTEN)]
+Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
+Plant = Annotated[
+    parts.IdealConstraints
+    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")]
+    | unilateral.Unilateral,
+    Choice(),
+]
+Sampling = Annotated[sampling.Sampling, Form()]
+Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
+Tolerances = Annotated[tolerances.Tolerances, Form()]
+Observer = Annotated[parts.Observer, Form()]
+_PHASE_DATA = {
+    float | references.Reference: Reference,
+    Mapping[str, references.Reference | float]: dict[str, Reference],
+}
+Phase = Annotated[
+    phases.Approach | phases.Press | phases.Move | phases.Dwell | phases.Release | phases.Retreat,
+    Choice(_PHASE_DATA),
+]
+Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase]})]
+Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

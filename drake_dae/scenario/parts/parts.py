@@ -1,0 +1,171 @@
+"""Parts of a scenario that are plain data and no class of the library: force, gains, start."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.errors import GainError, ModelError
+from drake_dae.scenario.forms.values import Numbers
+from drake_dae.systems.control.observer_rates import Observing
+from drake_dae.systems.sensing.force_sensor import ForceSensor
+
+
+@dataclass(frozen=True)
+class ModelForce:
+    """The law uses the force of its model: (28)."""
+
+    is_measured: ClassVar = False
+    seed: ClassVar = 0
+    gain: ClassVar = 0.0
+
+    def sensor(self, size: int) -> ForceSensor | None:
+        """No sensor, since none is needed."""
+        return None
+
+
+@dataclass(frozen=True)
+class MeasuredForce:
+    """The law uses the force that a `systems.sensors.ForceSensor` measures: (59), (71), (81).
+
+    Attributes:
+        time_constant: The time constant of the sensor's lag, in s; 0 for none.
+        sample_period: The time between samples, in s; 0 for none.
+        bias: A constant error in N or N m, one number for all forces or one each.
+        noise_deviation: The standard deviation of the noise in N or N m, likewise.
+        seed: The seed of the noise.
+        gain: Gbar of (59), a number or a matrix row by row; with rigid joints alone.
+    """
+
+    time_constant: float = 0.0
+    sample_period: float = 0.0
+    bias: Numbers = 0.0
+    noise_deviation: Numbers = 0.0
+    seed: int = 0
+    gain: Numbers = 0.0
+    is_measured: ClassVar = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**32:
+            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
+
+    def sensor(self, size: int) -> ForceSensor | None:
+        """The sensor of m = `size` forces."""
+        return ForceSensor(
+            size, self.time_constant, self.sample_period, self.bias, self.noise_deviation
+        )
+
+
+@dataclass(frozen=True)
+class Observer(Observing):
+    """How a `systems.observer.DisturbanceObserver` observes what the law's model lacks.
+
+    Attributes:
+        friction: The names of constraints whose coefficient of friction is identified, from that
+            which they have here on: 0 where nothing is known.
+    """
+
+    friction: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class IdealConstraints:
+    """The plant is a `RobotPlant`: its constraints hold exactly."""
+
+
+@dataclass(frozen=True)
+class PerOutput:
+    """Numbers for all outputs, or for each.
+
+    Attributes:
+        all: For every output alike.
+        outputs: Output name -> its numbers; "*" is all others. Not beside `all`.
+    """
+
+    all: list[float] = field(default_factory=list)
+    outputs: dict[str, list[float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.all and self.outputs:
+            raise GainError("give either 'all' or 'outputs', not both")
+
+
+@dataclass(frozen=True)
+class Poles(PerOutput):
+    """Real poles of the errors, a number or mu_i of them; complex ones are Coefficients.
+
+    Attributes:
+        all: The poles of every output, in 1/s.
+        outputs: Output name -> its poles, in 1/s; "*" is all others. Not beside `all`.
+    """
+
+    def design(self) -> GainDesign:
+        """The design of the gains."""
+        return poles(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Coefficients(PerOutput):
+    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s.
+
+    Attributes:
+        all: The gains of every output, in 1/s^mu_i, ..., 1/s.
+        outputs: Output name -> its gains, in 1/s^mu_i, ..., 1/s; "*" is all
+            others. Not beside `all`.
+    """
+
+    def design(self) -> GainDesign:
+        """The design of the gains."""
+        return gain_coefficients(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """Gains that couple outputs of one degree: `dae.gains.gain_matrices`.
+
+    Attributes:
+        groups: For each degree mu, highest first, its Lambda_1, ..., Lambda_mu, each row by row,
+            in 1/s^mu, ..., 1/s.
+    """
+
+    groups: list[list[list[list[float]]]]
+
+    def __post_init__(self) -> None:
+        for matrix in (matrix for group in self.groups for matrix in group):
+            if len({len(row) for row in matrix}) != 1:
+                raise GainError(f"groups: the rows of {matrix} have different lengths")
+
+    def design(self) -> GainDesign:
+        """The design of the gains."""
+        return gain_matrices(*self.groups)
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start at rest, on the constraints, with given errors of the outputs.
+
+    Where a scenario has `exogenous` signals, the robot starts in motion with its references.
+
+    Attributes:
+        positions: Joint name -> position near which the robot starts, in rad or m; the robot's
+            default where not given.
+        errors: Output name -> z - r at the start, in the output's unit; 0 where not given. Forces
+            can start off their references where actuators have dynamics.
+    """
+
+    positions: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Write:
+    """What a run leaves in its folder, beside the scenario and the summary.
+
+    Attributes:
+        record: Whether it leaves record.npz, all signals at all times.
+        plots: Whether it leaves plots.
+        animation: Whether it leaves animation.html, which plays in a browser.
+    """
+
+    record: bool = True
+    plots: bool = True
+    animation: bool = True

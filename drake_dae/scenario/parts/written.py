@@ -1,0 +1,99 @@
+"""What a scenario writes in another way than the library holds it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_dae.arrays import unknown_name
+from drake_dae.errors import ModelError
+from drake_dae.robots import constraints as contact
+from drake_dae.robots import outputs
+from drake_dae.scenario.robot_file.robot import Pose
+
+T = TypeVar("T")
+
+
+class Written(ABC, Generic[T]):
+    """What a scenario writes in another way than the library holds it."""
+
+    @abstractmethod
+    def made(self, constraints: Sequence[contact.Constraint]) -> T:
+        """The object that the library holds.
+
+        Args:
+            constraints: The scenario's constraints, as far as they are made.
+
+        Raises:
+            ModelError: Something does not fit.
+        """
+
+
+def made(form: T | Written[T], constraints: Sequence[contact.Constraint]) -> T:
+    """The object that the library holds for a form; its own classes are their own forms."""
+    return form.made(constraints) if isinstance(form, Written) else form
+
+
+@dataclass(frozen=True)
+class WeldedFrames(Written[contact.Constraint]):
+    """Frame B keeps a pose in frame A: `robots.contact.WeldedFrames`, its pose by angles.
+
+    Attributes:
+        frame_a: Name of frame A; "world" holds B in place.
+        frame_b: Name of frame B, on another body.
+        pose: The pose of B in A; by default the frames coincide.
+        name: The name of the constraint, before those of its forces and its parameter.
+    """
+
+    frame_a: str
+    frame_b: str
+    pose: Pose = field(default_factory=Pose)
+    name: str = "weld"
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
+        pose = RigidTransform(rotation, self.pose.translation)
+        return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+
+
+@dataclass(frozen=True)
+class SurfaceCoordinates(Written[outputs.PositionOutput]):
+    """The coordinates along a constraint: `robots.outputs.SurfaceCoordinates`.
+
+    Attributes:
+        constraint: The name of a constraint with coordinates, as a PointOnSurface on a !Plane.
+    """
+
+    constraint: str
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        return outputs.SurfaceCoordinates(_named(self.constraint, constraints))
+
+
+@dataclass(frozen=True)
+class TiltFromNormal(Written[outputs.PositionOutput]):
+    """How far a tool's axis is off the normal where it touches: `robots.outputs.TiltFromNormal`.
+
+    Attributes:
+        constraint: The name of a constraint with a free side, as a PointOnSurface.
+        axis: The axis of its frame, "x", "y" or "z".
+        components: Which of the two other axes are rows, "xy" for example; both if empty.
+    """
+
+    constraint: str
+    axis: str
+    components: str = ""
+
+    def made(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        contact = _named(self.constraint, constraints)
+        return outputs.TiltFromNormal(contact, self.axis, self.components)
+
+
+def _named(name: str, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+    named = {constraint.name: constraint for constraint in constraints}
+    if name not in named:
+        raise ModelError(unknown_name("constraint", name, named))
+    return named[name]
