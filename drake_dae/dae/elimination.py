@@ -54,7 +54,7 @@ def eliminate(derivatives: Derivatives) -> Elimination:
         beta=beta,
         f_star=f_star,
         h_star=h_star,
-        l_star=system.l + ca.mtimes(system.m, alpha),
+        l_star=system.outputs(alpha),
         n_star=ca.sparsify(ca.mtimes(system.m, beta)),
         pivot=derivatives.pivot,
     )

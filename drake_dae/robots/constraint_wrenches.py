@@ -39,18 +39,16 @@ class ConstraintWrenches:
 
     Attributes:
         constraints: The constraints that act at a point.
+        frames: The frame that each of these acts on.
         with_moment: Whether each of these has a moment besides its force.
     """
 
     def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
         links, bound = model.links, ConstraintSet(model.constraints)
         kinematics, force = links.kinematics(), ca.SX.sym("force", bound.size)
-        acting = [
-            (constraint, part, application)
-            for constraint, part in bound.parts()
-            for application in constraint.applications(kinematics)[:1]
-        ]
+        acting = bound.acting(kinematics)
         self.constraints: Sequence[Constraint] = [constraint for constraint, _, _ in acting]
+        self.frames = [a.frame_b for _, _, a in acting]
         self.with_moment = [a.moment_axes.nnz() > 0 for _, _, a in acting]
         columns = {
             "points": [a.point for _, _, a in acting],
@@ -89,3 +87,16 @@ def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -
     """The values of a constraint's parameters, below each other, among all of a system."""
     own = [parameters[dae.parameter_slice(p.name)] for p in constraint.parameters]
     return np.concatenate([np.zeros(0), *own])
+
+
+def contact_normals(model: RobotModel) -> TracedFunction:
+    """(x, parameters) -> the normal of each constraint of one force, toward the robot, (3 m, 1).
+
+    It is the force on the robot of a unit of its constraint force where nothing slides, so that
+    friction is none: what a contact exerts along it is the constraint force.
+    """
+    links = model.links
+    kinematics = links.kinematics()
+    axes = [a.force_axes for _, _, a in ConstraintSet(model.constraints).acting(kinematics)]
+    found = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), links.v, 0 * links.v)
+    return model.dae.trace("normals", {"normals": ca.densify(found)})

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from actuated import slope
 from arms import fixed_step
+from assigned_errors import closed_form, coupled, new_input
 from pydrake.multibody.tree import JacobianWrtVariable
-from test_actuation_laws import closed_form, coupled, new_input
 from two_arms import APART, NOMINAL, REFERENCES, two_arms
 
 from drake_dae import (

@@ -8,11 +8,13 @@ import re
 import numpy as np
 import pytest
 from arms import arm, parse
+from grippers import gripper, parsed
 from members import RubbingPoint
+from numpy.testing import assert_allclose
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
-from test_couplers import gripper, parsed
+from pydrake.multibody.tree import JacobianWrtVariable
 from two_arms import two_arms
 
 from drake_dae import (
@@ -25,7 +27,10 @@ from drake_dae import (
     PointOnSurface,
     RobotModel,
     RobotPlant,
+    Sphere,
 )
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, contact_normals
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
 
 
 def accelerations(plant, q, v, u, wrenches, frames):
@@ -92,6 +97,12 @@ def rod_arm():
     rod = FixedDistance("link1", (0.2, 0.0, 0.1), "tool", (0.0, 0.0, 0.0), 1.1)
     outputs = [JointPositions(["joint1"])]
     return RobotModel.from_multibody(parse("two_link_arm"), [rod], outputs, [1.2, -0.9])
+
+
+def sphere_arm():
+    contact = PointOnSurface("tool", Sphere((1.5, 0, 0.2), 0.4), name="ball")
+    outputs = [JointPositions(["joint1"])]
+    return RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
 
 
 def flush_arm():
@@ -164,3 +175,29 @@ def test_behind_springs_wrenches_need_no_control():
     port = plant.GetOutputPort("constraint_wrenches")
     assert not plant.HasDirectFeedthrough(0, port.get_index())
     assert port.Eval(plant.CreateDefaultContext()).shape == (12,)
+
+
+@pytest.mark.parametrize("make", [rubbing_arm, sphere_arm], ids=["friction", "sphere"])
+def test_normal_is_the_direction_in_which_the_residual_grows(make):
+    """n = d phi / d(point), the tool's row of the constraint's Jacobian by MultibodyPlant: phi'
+    is n . (J_point v) for any v, where friction does not enter; 1e-12 is round-off."""
+    model = make()
+    plant, rng = model.links.plant, np.random.default_rng(3)
+    own = plant.CreateDefaultContext()
+    normals, wrenches = contact_normals(model), ConstraintWrenches(model)
+    kinematics = model.links.kinematics()
+    rate = kinematics.value(ConstraintSet(model.constraints).rate(kinematics))
+    rates = model.dae.trace("rate", {"value": rate})
+    for _ in range(5):
+        state = rng.normal(size=model.dae.num_states)
+        plant.SetPositionsAndVelocities(own, state)
+        (normal,) = normals(state, model.dae.parameter_values)
+        (point,) = wrenches(state, [1.0]).points
+        body = plant.GetFrameByName(wrenches.frames[0])
+        seen = body.CalcPoseInWorld(own).inverse() @ point
+        world = plant.world_frame()
+        jacobian = plant.CalcJacobianTranslationalVelocity(
+            own, JacobianWrtVariable.kV, body, seen, world, world
+        )
+        moving = jacobian @ plant.GetVelocities(own)
+        assert_allclose(normal @ moving, rates(state, model.dae.parameter_values)[0], atol=1e-12)

@@ -230,7 +230,7 @@ class _Plant:
             "balance": ca.jacobian(balance, x),
             "kept": ca.jacobian(kept, x),
             "k": ca.jacobian(system.k, x),
-            "z": ca.jacobian(system.l + ca.mtimes(system.m, v), x),
+            "z": ca.jacobian(system.outputs(v), x),
             "m": system.m,
         }
         slope, kept_slope, k_slope, z_slope, z_force = self._values(

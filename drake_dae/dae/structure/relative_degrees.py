@@ -118,7 +118,7 @@ def output_chains(
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     names, count = [s.name for s in system.output_signals], system.num_outputs
     controls = system.num_controls
-    moving = system.l + ca.mtimes(system.m, derivatives.constraint_input)
+    moving = system.outputs(derivatives.constraint_input)
     h_star_values, n_star_values = eliminated_at(samples, elimination)
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, controls)
     highest_derivatives = ca.SX(count, 1)

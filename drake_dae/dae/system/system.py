@@ -312,6 +312,10 @@ class DaeSystem:
             return constraint_input
         return ca.mtimes(self.sharing.split, constraint_input)
 
+    def outputs(self, constraint_input: ca.SX) -> ca.SX:
+        """z = l(x) + m(x) v (3) of v, shape (m, 1): the controlled outputs, shape (p, 1)."""
+        return self.l + ca.mtimes(self.m, constraint_input)
+
     @cached_property
     def parameter_symbol(self) -> ca.SX:
         """The symbols of all parameters, below each other; then w', w'', ... of those that move."""

@@ -67,7 +67,7 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
     chains: list[list[ca.SX]] = [[] for _ in degrees]
     highest = ca.SX(len(degrees), 1)
     rows = list(range(len(degrees)))
-    moving = system.l + ca.mtimes(system.m, derivatives.constraint_input)
+    moving = system.outputs(derivatives.constraint_input)
     for order in range(max(degrees, default=0) + 1):
         values, _ = derivatives.by_control(moving)
         for place, i in enumerate(rows):

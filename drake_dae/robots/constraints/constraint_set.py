@@ -9,7 +9,7 @@ from drake_dae.arrays import unknown_name
 from drake_dae.dae.system.contacts import Contact
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint, Joint
+from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.links.links import Links
 
@@ -87,6 +87,17 @@ class ConstraintSet:
         for constraint, part in self.parts():
             total += constraint.reaction(kinematics, constraint_force[part])
         return total
+
+    def acting(self, kinematics: Kinematics) -> list[tuple[Constraint, slice, Application]]:
+        """The constraints that act at a point, where their forces stand, and where they act first.
+
+        A constraint that acts at several points is shown, and felt, at the first of them.
+        """
+        return [
+            (constraint, part, application)
+            for constraint, part in self.parts()
+            for application in constraint.applications(kinematics)[:1]
+        ]
 
     def force_on(
         self, frame: str, name: str, kinematics: Kinematics, constraint_force: ca.SX

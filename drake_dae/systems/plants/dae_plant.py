@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 from weakref import ref
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
@@ -159,7 +158,7 @@ class DaePlant(ParameterizedSystem):
         self.set_name(system.name)
         elimination, derivatives = structure.elimination, structure.derivatives
         constraint_input = derivatives.expand(derivatives.constraint_input)
-        output = system.l + ca.mtimes(system.m, constraint_input)
+        output = system.outputs(constraint_input)
         force = system.forces(constraint_input)
         self._force_needs_control = elimination.beta.nnz() > 0
         self._output_needs_control = elimination.n_star.nnz() > 0
@@ -179,7 +178,7 @@ class DaePlant(ParameterizedSystem):
         }
 
         v = {"v": derivatives.constraint_input}
-        shown = {"force": system.forces(v["v"]), "output": system.l + ca.mtimes(system.m, v["v"])}
+        shown = {"force": system.forces(v["v"]), "output": system.outputs(v["v"])}
         self._force_of, self._output_of = (
             system.trace(name, {"value": value}, v, often=False) for name, value in shown.items()
         )

@@ -142,7 +142,7 @@ class TaskController(Diagram):
     def _trace_outputs(self) -> TracedFunction:
         system, chain = self.law.system, self.free_law.structure.output_chains[self.place]
         force = ca.SX.sym("force", system.num_constraints)
-        outputs = ca.vertcat(system.l + ca.mtimes(system.m, force), chain[0], chain[1])
+        outputs = ca.vertcat(system.outputs(force), chain[0], chain[1])
         return system.trace("task outputs", {"value": ca.densify(outputs)}, {"force": force})
 
     def rest_state(

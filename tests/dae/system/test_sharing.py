@@ -17,7 +17,7 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UnitInertia,
 )
-from test_redundancy import TABLE, plate
+from tables import TABLE, plate
 
 from drake_dae import (
     CoincidentPoints,

@@ -79,6 +79,17 @@ def test_constants_may_stand_for_expressions(control):
     np.testing.assert_array_equal(value, [[0.0], [1.0]])
 
 
+def test_outputs_are_l_and_m_v():
+    """(3), to the bit; with forces among the outputs, without, and where v shares an output."""
+    outputs = {"l": lambda x: [x[0] * x[1], ca.sin(x[3])], "m": lambda x: [[2 + x[0]], [0]]}
+    v = ca.SX.sym("v")
+    for system in (constrained(), constrained(**outputs), constrained(m=lambda x: [0, 0])):
+        function = ca.Function("z", [system.state, v], [ca.densify(system.outputs(v))])
+        for x in np.random.default_rng(1).normal(size=(5, 4)):
+            wanted = evaluated(system, "l", x) + evaluated(system, "m", x) * 3.5
+            np.testing.assert_array_equal(function(x, 3.5), wanted)
+
+
 def test_zeros_of_arrays_are_structural():
     x = ca.SX.sym("x", 2)
     system = DaeSystem(state=x, f=x, g=[], h=np.eye(2), k=[], l=[x[0], 0], m=[])

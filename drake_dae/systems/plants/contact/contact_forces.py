@@ -12,10 +12,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.constraint_wrenches import contact_normals
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.trace.functions import TracedFunction
 
 
 class ContactForces(LeafSystem):
@@ -65,10 +64,10 @@ class ContactForces(LeafSystem):
             for axis in "xyz"
         )
         self._manifold, self._parameters = structure.manifold, parameters
-        self._normals = normals(model)
+        self._normals = contact_normals(model)
         force = ca.SX.sym("force", dae.num_constraints)
-        output = dae.l + ca.mtimes(dae.m, force)
-        self._output = dae.trace("controlled output", {"value": output}, {"force": force})
+        output = {"value": dae.outputs(force)}
+        self._output = dae.trace("controlled output", output, {"force": force})
         self._state = self.DeclareVectorInputPort("state", dae.num_states)
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # What the other ports take from it is found once.
@@ -126,17 +125,3 @@ class ContactForces(LeafSystem):
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         state, force = self._state.Eval(context), self._force(context)
         output.SetFromVector(self._output(state, force, self._parameters)[0])
-
-
-def normals(model: RobotModel) -> TracedFunction:
-    """(x, parameters) -> the normal of each constraint of one force, toward the robot, (3 m, 1)."""
-    links, bound = model.links, ConstraintSet(model.constraints)
-    kinematics = links.kinematics()
-    axes = [
-        application.force_axes
-        for constraint in bound.constraints
-        for application in constraint.applications(kinematics)[:1]
-    ]
-    # At rest nothing rubs.
-    found = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), links.v, 0 * links.v)
-    return model.dae.trace("normals", {"normals": ca.densify(found)})

@@ -223,12 +223,8 @@ class ContactPlant(Diagram):
         # A unit of force shows the normal, where nothing rubs.
         state[model.links.q.numel() :] = 0.0
         found = loads(state, np.ones(self.dae.num_constraints))
-        kinematics = model.links.kinematics()
         balls = []
-        for constraint, point, normal in zip(
-            loads.constraints, found.points, found.forces, strict=True
-        ):
-            name = constraint.applications(kinematics)[0].frame_b
+        for name, point, normal in zip(loads.frames, found.points, found.forces, strict=True):
             pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
             center = pose.inverse() @ (point + radius * normal)
             balls.append((GetScopedFrameByName(plant, name), center))

@@ -104,7 +104,7 @@ class Modes:
         own = derivatives.expand(derivatives.constraint_input)
         force = ca.SX(dae.num_constraints, 1)
         force[rows] = own
-        output = system.l + ca.mtimes(system.m, own)
+        output = system.outputs(own)
         by_control = [ca.depends_on(value, derivatives.control) for value in (force, output)]
         rate = derivatives.expand(derivatives.rate)
         return Mode(
