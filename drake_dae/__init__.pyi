@@ -82,11 +82,11 @@ from .robots.outputs import JointPositions as JointPositions
 from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
 from .robots.outputs import TiltFromNormal as TiltFromNormal
+from .robots.surfaces.implicit import ImplicitSurface as ImplicitSurface
 from .robots.surfaces.maps import HeightMap as HeightMap
 from .robots.surfaces.maps import MeshSurface as MeshSurface
 from .robots.surfaces.surfaces import Cylinder as Cylinder
 from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
-from .robots.surfaces.surfaces import ImplicitSurface as ImplicitSurface
 from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus

@@ -1,10 +1,8 @@
 """Arguments of public names, checked by their annotations: the same words everywhere."""
 
 import inspect
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import cache, wraps
+from functools import wraps
 from math import isfinite
 from numbers import Complex, Integral, Real
 from types import NoneType, UnionType
@@ -25,58 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_dae.arrays import brief, numbers
-from drake_dae.errors import DrakeDaeError, ModelError
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-def result_of(
-    what: str,
-    function: Callable[..., Any],
-    *arguments: Any,
-    error: Callable[[str], Exception] = ModelError,
-) -> Any:
-    """What a function that was given returns; if it fails, that is an error of the argument.
-
-    Args:
-        what: How a message calls the function.
-        function: The function, with its arguments.
-        error: Makes what is raised of a text. Errors of the library pass.
-    """
-    try:
-        return function(*arguments)
-    except DrakeDaeError:
-        raise
-    except Exception as failure:
-        text = f"{what} failed: {type(failure).__name__}: {brief(str(failure))}"
-        raise error(text) from failure
-
-
-@contextmanager
-def numpy_told(what: str) -> Iterator[None]:
-    """Tells in one line, once, that a function calls NumPy on symbols: CasADi takes twenty lines.
-
-    Args:
-        what: How the warning calls the function.
-    """
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        yield
-    for one in found:
-        text = str(one.message)
-        if one.category is FutureWarning and "casadi" in text and "numpy" in text:
-            _tell(what)
-        else:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-
-
-@cache
-def _tell(what: str) -> None:
-    warnings.warn(
-        f"{what} calls a function of NumPy on CasADi symbols; write casadi.sin for numpy.sin, and "
-        "likewise for others: CasADi is about to change what NumPy's give",
-        stacklevel=2,
-    )
 
 
 class _Rule(NamedTuple):

@@ -14,16 +14,16 @@ they and their derivatives move, too. Each order brings new unknowns
 so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and A is J M^-1 J^T.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
+from drake_dae.trace.blocks import block_stages, saddle_point_solver
 from drake_dae.trace.factorization import (
     Factorization,
-    PositiveDefiniteFactorization,
     nonzeros,
 )
 
@@ -81,7 +81,7 @@ class Derivatives:
         self._matrix = ca.blockcat(
             mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
         )
-        self._unknowns, self.constraint_matrix, self.pivot = _solver(
+        self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
             mass[self._rows, self._rows], g_rows, gradient
         )
         if system.rubbing:
@@ -198,7 +198,7 @@ class Derivatives:
             return None
         blocks = []
         waiting = list(range(unknowns.numel()))
-        for stage in _stages(matrix.sparsity()):
+        for stage in block_stages(matrix.sparsity()):
             ahead = unknowns[waiting]
             # What is solved for later may stand here with a slope that cancels.
             every = equations[[row for rows, _ in stage for row in rows]]
@@ -313,26 +313,6 @@ class Derivatives:
         )
 
 
-def _stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:
-    """Rows and columns of the blocks of a square matrix, in stages.
-
-    A block needs what blocks of earlier stages solve for, and nothing else.
-    """
-    count, rows, columns, row_starts, column_starts, _, _ = pattern.btf()
-    used = nonzeros(pattern)
-    stages: list[list[tuple[list[int], list[int]]]] = []
-    stage_of = np.full(pattern.size2(), -1)
-    for k in range(count):
-        own_rows = rows[row_starts[k] : row_starts[k + 1]]
-        own = columns[column_starts[k] : column_starts[k + 1]]
-        stage = int(stage_of[used[own_rows].any(axis=0)].max()) + 1
-        stage_of[own] = stage
-        if stage == len(stages):
-            stages.append([])
-        stages[stage].append((own_rows, own))
-    return stages
-
-
 def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
     """Whether two expressions are the same function, by their numbers around the nominal state.
 
@@ -356,31 +336,3 @@ def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> 
         if not np.all(np.abs(one - other) <= 1e-9 * np.abs(other) + 1e-11 * size):
             return False
     return finite > 0
-
-
-def _solver(
-    mass: ca.SX, g: ca.SX, gradient: ca.SX
-) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
-    """A solver of [[E, -g], [dc/dx, 0]] (w, v) = -(balance, rate), from E, g and (dc/dx)^T.
-
-    Returns:
-        The solver, A(x), and a scalar that is 0 exactly where A is singular.
-    """
-    inertia = PositiveDefiniteFactorization(mass)
-    half = inertia.forward(g)
-    coupling: Factorization | PositiveDefiniteFactorization
-    if gradient is g:  # A = g^T E^-1 g, as J M^-1 J^T
-        other = ca.sparsify(inertia.scaled(half))
-        matrix = ca.sparsify(ca.tril2symm(ca.tril(ca.mtimes(other.T, half))))
-        coupling = PositiveDefiniteFactorization(matrix)
-    else:
-        other = ca.sparsify(inertia.scaled(inertia.forward(gradient)))
-        matrix = ca.sparsify(ca.mtimes(other.T, half))
-        coupling = Factorization(matrix)
-
-    def solve(balance: ca.SX, rate: ca.SX) -> ca.SX:
-        free = inertia.forward(-balance)
-        v = coupling.solve(-rate - ca.mtimes(other.T, free))
-        return ca.vertcat(inertia.backward(free + ca.mtimes(half, v)), v)
-
-    return solve, matrix, coupling.pivot

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from drake_dae.arguments import checked, numpy_told, result_of
+from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
 from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Signal
@@ -15,6 +15,7 @@ from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import position_index
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.trace.given import numpy_told, result_of
 
 
 class PositionOutput(ABC):

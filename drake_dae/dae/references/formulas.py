@@ -9,9 +9,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arguments import checked, result_of
+from drake_dae.arguments import checked
 from drake_dae.dae.references.reference import FormulaReference, Reference
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.trace.given import result_of
 
 
 @checked(ReferenceSignalError)

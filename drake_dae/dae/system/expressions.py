@@ -11,9 +11,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.arguments import numpy_told
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.trace.given import numpy_told
 from drake_dae.trace.smoothness import find_flaw
 
 

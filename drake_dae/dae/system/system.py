@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from math import isfinite
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -12,15 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, numbers, unknown_name, vector
+from drake_dae.arrays import FloatArray, unknown_name, vector
+from drake_dae.dae.system.called import called_functions
+from drake_dae.dae.system.checks import checked_fields
 from drake_dae.dae.system.contacts import Contact, Contacts
 from drake_dae.dae.system.exogenous import Exogenous
-from drake_dae.dae.system.expressions import as_functions, as_signals, call, check_unique
+from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
 from drake_dae.dae.system.scale import natural_scale
 from drake_dae.dae.system.sharing import Sharing
-from drake_dae.dae.system.signals import Parameter, Signal, is_symbol, moving
+from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
-from drake_dae.trace.compiled import Compiled, check_choice
+from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -117,76 +118,9 @@ class DaeSystem:
     contacts: tuple[Contact, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str):
-            raise ModelError(f"the name of a system must be text, got {self.name!r}")
-        if not (is_symbol(self.state) and self.state.numel()):
-            raise ModelError(
-                f"{self.name}: 'state' must be a CasADi SX column of symbols, "
-                f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
-            )
-        check_choice(self.name, self.compiled)
-        self._put("state", ca.vec(self.state))
-        given = self.parameters if isinstance(self.parameters, (list, tuple)) else [None]
-        if not all(isinstance(parameter, Parameter) for parameter in given):
-            raise ModelError(
-                f"{self.name}: parameters must be a list of Parameters, got "
-                f"{brief(self.parameters)}"
-            )
-        self._put("parameters", tuple(given))
-        check_unique(self.name, "parameter", [p.name for p in self.parameters])
-        for contact in self.contacts:
-            if contact.friction is not None:
-                self.parameter_slice(contact.friction)
-        if self.mass_matrix is None:
-            self._put("mass_matrix", ca.SX.eye(self.state.numel()))
-        functions = {key: getattr(self, key) for key in ("f", "g", "h", "k", "l", "m")}
-        functions["mass_matrix"] = self.mass_matrix
-        chosen = {key: getattr(self, key) for key in ("control_metric", "free_control")}
-        functions |= {key: value for key, value in chosen.items() if value is not None}
-        checked = as_functions(self.name, functions, self.state, self.parameter_symbol)
-        for key, expression in checked.items():
-            self._put(key, expression)
-        for key, count, letter in (
-            ("state_signals", self.num_states, "x"),
-            ("constraint_input_signals", self.num_constraints, "v"),
-            ("constraint_output_signals", self.num_constraints, "y"),
-            ("control_signals", self.num_controls, "u"),
-            ("output_signals", self.num_outputs, "z"),
-        ):
-            labels = getattr(self, key) or [f"{letter}{i}" for i in range(count)]
-            signals = as_signals(f"{self.name}: {key}", labels)
-            if len(signals) != count:
-                raise ModelError(f"{self.name}: {key} has {len(signals)} entries, expected {count}")
-            check_unique(self.name, key, [signal.name for signal in signals])
-            self._put(key, signals)
-        start = np.zeros(self.num_states) if self.nominal_state is None else self.nominal_state
-        nominal = vector(f"{self.name}: nominal_state", start, self.num_states)
-        nominal.setflags(write=False)
-        self._put("nominal_state", nominal)
-        if self.state_scale is not None:
-            scale = vector(f"{self.name}: state_scale", self.state_scale, self.num_states)
-            if not np.all(scale > 0.0):
-                raise ModelError(f"{self.name}: state_scale must be positive, got {brief(scale)}")
-            scale.setflags(write=False)
-            self._put("state_scale", scale)
-        self._check_choice()
-
-    def _check_choice(self) -> None:
-        """Refuses a choice of the control where there is none, or no metric to choose by."""
-        if self.control_metric is not None and self.free_control is None:
-            self._put("free_control", ca.SX(self.num_controls, 1))
-        if self.control_metric is None and self.free_control is not None:
-            raise ModelError(f"{self.name}: free_control needs a control_metric that it is near in")
-        if self.control_metric is not None and self.num_controls <= self.num_outputs:
-            raise ModelError(
-                f"{self.name}: control_metric chooses among controls, but with "
-                f"{self.num_controls} controls and {self.num_outputs} controlled outputs there is "
-                "nothing to choose; leave it out"
-            )
-
-    def _put(self, key: str, value: object) -> None:
-        """Sets a field while the frozen system is made."""
-        object.__setattr__(self, key, value)
+        given = {item.name: getattr(self, item.name) for item in fields(self)}
+        for key, value in checked_fields(given).items():
+            object.__setattr__(self, key, value)
 
     def __repr__(self) -> str:
         counts = (self.num_states, self.num_constraints, self.num_controls)
@@ -226,34 +160,11 @@ class DaeSystem:
         Raises:
             ModelError: A function fails, or the functions make no system; see the class.
         """
-        owner = labels.get("name", "system")
         own = {"state", "parameters", "state_signals", *"fghklm"}
         known = [item.name for item in fields(cls) if item.name not in own]
-        for label in labels:
-            if label not in known:
-                raise ModelError(f"{owner}: {unknown_name('field', label, known)}")
-        bad = [name for name in parameters or {} if not name.isidentifier()]
-        if bad:
-            raise ModelError(
-                f"parameter names must be Python identifiers, to be read as p.name: {bad}"
-            )
-        names = [f"x{i}" for i in range(state)] if isinstance(state, int) else state
-        named = as_signals(f"{owner}: the states", names)
-        if not named:
-            raise ModelError(f"{owner}: a system needs at least one state")
-        x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
-        defined = tuple(
-            Parameter(name, numbers(f"parameter '{name}'", value))
-            for name, value in (parameters or {}).items()
-        )
-        arguments: list[Any] = [x]
-        if defined:
-            arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
-        values = {key: call(owner, key, given, arguments) for key, given in functions.items()}
-        if values["h"].shape[0] == 1 and x.numel() != 1:
-            values["h"] = values["h"].T
-        system = cls(state=x, **values, parameters=defined, state_signals=named, **labels)
+        called = called_functions(state, functions, parameters or {}, labels, known)
+        system = cls(**called, **labels)
         return system.with_exogenous(exogenous) if exogenous else system
 
     @cached_property
@@ -319,8 +230,7 @@ class DaeSystem:
     @cached_property
     def parameter_symbol(self) -> ca.SX:
         """The symbols of all parameters, below each other; then w', w'', ... of those that move."""
-        rates = [rate for p in self.exogenous.moving for rate in p.derivatives]
-        return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters], *rates)
+        return parameter_symbol(self.parameters)
 
     @property
     def parameter_values(self) -> FloatArray:
@@ -444,10 +354,4 @@ class DaeSystem:
         Raises:
             ModelError: No parameter has that name.
         """
-        start = 0
-        for parameter in self.parameters:
-            if parameter.name == name:
-                return slice(start, start + parameter.value.size)
-            start += parameter.value.size
-        known = [parameter.name for parameter in self.parameters]
-        raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
+        return parameter_slice(self.name, self.parameters, name)

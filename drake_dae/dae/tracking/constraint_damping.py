@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from drake_dae.arguments import checked, result_of
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import eliminate
@@ -14,6 +14,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.errors import GainError, ModelError
+from drake_dae.trace.given import result_of
 
 STEPS = 200
 """Into how many steps an interval is divided in which the best damping is sought, twice."""

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arguments import checked, result_of
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.layout import Layout
@@ -20,6 +20,7 @@ from drake_dae.dae.tracking.integral import IntegralAction
 from drake_dae.dae.tracking.measured_force import MeasuredForce
 from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.given import result_of
 
 
 @checked(ModelError)

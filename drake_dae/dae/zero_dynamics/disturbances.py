@@ -14,12 +14,12 @@ import numpy as np
 import scipy  # Which loads its heavy parts when they are used.
 import scipy.linalg
 
-from drake_dae.arguments import result_of
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.zero_dynamics.periods import find_period
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
+from drake_dae.trace.given import result_of
 
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""

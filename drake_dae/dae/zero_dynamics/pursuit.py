@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import scipy  # Which loads its heavy parts when they are used.
 
-from drake_dae.arguments import result_of
 from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause, Ending, PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
+from drake_dae.trace.given import result_of
 
 TOLERANCE = 1e-6
 """The error of an integration step by the method's estimate, which is two orders too high."""

@@ -2,7 +2,7 @@
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import ClassVar, Self
 
 import casadi as ca
@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
@@ -233,3 +234,13 @@ def unit_vector(name: str, value: ArrayLike) -> Vector:
         raise ModelError(f"{name} must not be zero")
     # A unit vector stays as it is, so that what was saved reads back equal.
     return triple(name, array if abs(length - 1.0) < 1e-15 else array / length)
+
+
+def normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
+    """F / |grad F| at a point: the distance from F = 0 to first order."""
+    p = ca.SX.sym("p", 3)
+    value = as_expression("an ImplicitSurface", "its function", function(p))
+    if value.shape != (1, 1):
+        raise ModelError(f"a surface function returns one number, this one has {value.shape}")
+    quotient = value / ca.norm_2(ca.gradient(value, p))
+    return ca.substitute(quotient, p, offset)

@@ -1,10 +1,7 @@
-"""The surfaces: planes, spheres, cylinders, ellipsoids, tori, and any F(p) = 0."""
+"""The surfaces with a closed form: planes, spheres, cylinders, ellipsoids, tori."""
 
-from collections.abc import Callable, Mapping
-from copy import copy
-from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -12,9 +9,8 @@ from numpy.typing import ArrayLike
 from pydrake import geometry
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_dae.arguments import checked, numpy_told, result_of
+from drake_dae.arguments import checked
 from drake_dae.arrays import positive
-from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
@@ -22,22 +18,11 @@ from drake_dae.robots.surfaces.surface import (
     Surface,
     Vector,
     axes_along,
+    normalized,
     tangents,
     triple,
     unit_vector,
 )
-from drake_dae.trace.formula import check_names, parse_formula
-
-_TAKEN = (
-    "position",
-    "rpy",
-    "force",
-    "distance",
-    "friction",
-    "stiction_tolerance",
-    "viscous_friction",
-)
-"""What constraints call parameters and signals of their own."""
 
 
 @checked(ModelError)
@@ -207,7 +192,7 @@ class Ellipsoid(Surface):
 
     def distance(self, offset: ca.SX) -> ca.SX:
         return _side(
-            _normalized(lambda p: ca.sumsqr(p / ca.DM(self.semi_axes)) - 1.0, offset), self.inside
+            normalized(lambda p: ca.sumsqr(p / ca.DM(self.semi_axes)) - 1.0, offset), self.inside
         )
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
@@ -271,79 +256,6 @@ class Torus(Surface):
         points = np.stack([radial * np.cos(ring), radial * np.sin(ring), height], axis=-1)
         pose = RigidTransform(RotationMatrix(axes_along(self.axis)), np.zeros(3))
         return Picture(mesh_of_grid(points), pose)
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class ImplicitSurface(Surface):
-    """Any smooth surface F(p) = 0: phi = F / |grad F|, the distance to first order.
-
-    The gradient has length one on the surface itself.
-
-    Attributes:
-        function: F relative to `point` in the world's axes, positive on the free side, of any
-            scale, with a gradient that does not vanish on the surface. A formula of x, y, z in m,
-            pi and the parameters, as "z - a*sin(x)**2" (see `parse_formula`); or a function of a
-            CasADi column p of shape (3, 1), and of a namespace of the parameters if there are any.
-        point: Where the origin of p stands in the world, m, shape (3,).
-        parameters: Name -> number in F, in the unit that F takes it in. A constraint has them as
-            its parameters "<constraint>.<name>".
-
-    Raises:
-        ModelError: The formula cannot be read; the message tells where.
-    """
-
-    function: Callable[..., ca.SX] | str
-    point: Vector = (0.0, 0.0, 0.0)
-    parameters: Mapping[str, float] = field(default_factory=dict, hash=False)
-    _shape: ca.SX = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "point", triple("point", self.point))
-        object.__setattr__(self, "parameters", dict(self.parameters))
-        object.__setattr__(self, "_shape", ca.SX(ca.DM(list(self.parameters.values()))))
-        check_names(self.parameters, (*"xyz", *_TAKEN))
-        if isinstance(self.function, str):
-            value = self._function(ca.SX.sym("p", 3))
-            if value.is_constant():
-                raise ModelError(f"formula '{self.function}' has none of x, y and z: no surface")
-
-    @property
-    def position(self) -> Vector:
-        return self.point
-
-    @property
-    def shape(self) -> Mapping[str, float]:
-        return self.parameters
-
-    def shaped(self, values: ca.SX) -> Self:
-        changed = copy(self)
-        object.__setattr__(changed, "_shape", values)
-        return changed
-
-    def distance(self, offset: ca.SX) -> ca.SX:
-        return _normalized(self._function, offset)
-
-    def _function(self, p: ca.SX) -> ca.SX:
-        """F at a point."""
-        names = dict(zip(self.parameters, ca.vertsplit(self._shape), strict=True))
-        if isinstance(self.function, str):
-            return parse_formula(
-                self.function, {**dict(zip("xyz", ca.vertsplit(p), strict=True)), **names}
-            )
-        more = [SimpleNamespace(**names)] if names else []
-        with numpy_told("the function of an ImplicitSurface"):
-            return result_of("function", self.function, p, *more)
-
-
-def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
-    """F / |grad F| at a point."""
-    p = ca.SX.sym("p", 3)
-    value = as_expression("an ImplicitSurface", "its function", function(p))
-    if value.shape != (1, 1):
-        raise ModelError(f"a surface function returns one number, this one has {value.shape}")
-    quotient = value / ca.norm_2(ca.gradient(value, p))
-    return ca.substitute(quotient, p, offset)
 
 
 def _components(

@@ -11,7 +11,7 @@ from drake_dae.dae import references
 from drake_dae.diagrams import unilateral
 from drake_dae.robots import actuation, force_outputs, loads, outputs
 from drake_dae.robots import constraints as contact
-from drake_dae.robots.surfaces import maps, surface, surfaces
+from drake_dae.robots.surfaces import implicit, maps, surface, surfaces
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
 from drake_dae.scenario.parts import parts as parts
@@ -35,7 +35,7 @@ Surface = Annotated[
     | surfaces.Cylinder
     | surfaces.Ellipsoid
     | surfaces.Torus
-    | surfaces.ImplicitSurface
+    | implicit.ImplicitSurface
     | maps.HeightMap
     | maps.MeshSurface,
     Choice({**_WRITTEN, Callable[..., SX] | str: str}),

@@ -12,10 +12,11 @@ from typing import Self
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_dae.arguments import checked, result_of
+from drake_dae.arguments import checked
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
+from drake_dae.trace.given import result_of
 
 PERIOD = 1.0
 """Between two appends, in s."""

@@ -16,10 +16,10 @@ from drake_dae import (
     PointOnSurface,
     Sphere,
 )
-from drake_dae.arguments import numpy_told
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.given import numpy_told
 
 X, Y = np.linspace(-0.2, 0.2, 33), np.linspace(-0.15, 0.15, 25)
 A, B = 0.02, 15.0

@@ -14,16 +14,10 @@ from pydrake import geometry
 
 from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.implicit import ImplicitSurface
 from drake_dae.robots.surfaces.maps import HeightMap, MeshSurface
 from drake_dae.robots.surfaces.surface import Surface, tangents
-from drake_dae.robots.surfaces.surfaces import (
-    Cylinder,
-    Ellipsoid,
-    ImplicitSurface,
-    Plane,
-    Sphere,
-    Torus,
-)
+from drake_dae.robots.surfaces.surfaces import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from drake_dae.trace.functions import TracedFunction
 
 FOLDER = Path(tempfile.mkdtemp(prefix="drake_dae_surfaces_"))

@@ -1,0 +1,56 @@
+"""The functions of (1)-(3) as a user writes them in Python, called once with symbols."""
+
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import numbers, unknown_name
+from drake_dae.dae.system.expressions import as_signals, call
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.errors import ModelError
+
+
+def called_functions(
+    state: Sequence[Signal | str] | int,
+    functions: Mapping[str, Any],
+    parameters: Mapping[str, ArrayLike],
+    labels: Mapping[str, Any],
+    known: Sequence[str],
+) -> dict[str, Any]:
+    """The fields of a `DaeSystem` that functions of the state make; see `from_functions`.
+
+    Args:
+        state: Names (or Signals) of the states, or their number n.
+        functions: "f", "g", ..., "m" -> the function; None where there is none.
+        parameters: Name -> default.
+        labels: The other fields.
+        known: The names that those can have.
+
+    Raises:
+        ModelError: A name is wrong, or a function fails.
+    """
+    owner = labels.get("name", "system")
+    for label in labels:
+        if label not in known:
+            raise ModelError(f"{owner}: {unknown_name('field', label, known)}")
+    bad = [name for name in parameters if not name.isidentifier()]
+    if bad:
+        raise ModelError(f"parameter names must be Python identifiers, to be read as p.name: {bad}")
+    names = [f"x{i}" for i in range(state)] if isinstance(state, int) else state
+    named = as_signals(f"{owner}: the states", names)
+    if not named:
+        raise ModelError(f"{owner}: a system needs at least one state")
+    x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
+    defined = tuple(
+        Parameter(name, numbers(f"parameter '{name}'", value)) for name, value in parameters.items()
+    )
+    arguments: list[Any] = [x]
+    if defined:
+        arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
+    values = {key: call(owner, key, given, arguments) for key, given in functions.items()}
+    if values["h"].shape[0] == 1 and x.numel() != 1:
+        values["h"] = values["h"].T
+    return {"state": x, **values, "parameters": defined, "state_signals": named}

@@ -1,0 +1,114 @@
+"""The fields of a `DaeSystem`, checked when it is made: shapes, symbols, names, numbers."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray, brief, vector
+from drake_dae.dae.system.expressions import as_functions, as_signals, check_unique
+from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
+from drake_dae.dae.system.signals import Parameter, Signal, is_symbol
+from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import check_choice
+
+
+def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a system as it holds them, of those that were given.
+
+    Args:
+        given: Every field by its name; see `DaeSystem`.
+
+    Raises:
+        ModelError: They make no system; see `DaeSystem`.
+    """
+    name = given["name"]
+    if not isinstance(name, str):
+        raise ModelError(f"the name of a system must be text, got {name!r}")
+    state = given["state"]
+    if not (is_symbol(state) and state.numel()):
+        raise ModelError(
+            f"{name}: 'state' must be a CasADi SX column of symbols, "
+            f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
+        )
+    check_choice(name, given["compiled"])
+    state = ca.vec(state)
+    parameters = _parameters(name, given["parameters"])
+    for contact in given["contacts"]:
+        if contact.friction is not None:
+            parameter_slice(name, parameters, contact.friction)
+    expressions = _expressions(given, state, parameters)
+    found = {"state": state, "parameters": parameters, **expressions}
+    n, m = state.numel(), expressions["k"].numel()
+    p, q = expressions["h"].shape[1], expressions["l"].numel()
+    for key, count, letter in (
+        ("state_signals", n, "x"),
+        ("constraint_input_signals", m, "v"),
+        ("constraint_output_signals", m, "y"),
+        ("control_signals", p, "u"),
+        ("output_signals", q, "z"),
+    ):
+        found[key] = _signals(name, key, given[key], count, letter)
+    found |= _numbers(name, given, n)
+    found |= _choice(name, given, p, q)
+    return found
+
+
+def _parameters(name: str, given: Any) -> tuple[Parameter, ...]:
+    parameters: Any = given if isinstance(given, (list, tuple)) else [None]
+    if not all(isinstance(parameter, Parameter) for parameter in parameters):
+        raise ModelError(f"{name}: parameters must be a list of Parameters, got {brief(given)}")
+    check_unique(name, "parameter", [p.name for p in parameters])
+    return tuple(parameters)
+
+
+def _expressions(
+    given: Mapping[str, Any], state: ca.SX, parameters: Sequence[Parameter]
+) -> dict[str, ca.SX]:
+    """The functions of (1)-(3), E, and how the control is chosen, as expressions that fit."""
+    functions = {key: given[key] for key in ("f", "g", "h", "k", "l", "m")}
+    mass = given["mass_matrix"]
+    functions["mass_matrix"] = ca.SX.eye(state.numel()) if mass is None else mass
+    chosen = {key: given[key] for key in ("control_metric", "free_control")}
+    functions |= {key: value for key, value in chosen.items() if value is not None}
+    return as_functions(given["name"], functions, state, parameter_symbol(parameters))
+
+
+def _signals(
+    name: str, key: str, given: Sequence[Any], count: int, letter: str
+) -> tuple[Signal, ...]:
+    """Names and units of a vector, made up where not given."""
+    signals = as_signals(f"{name}: {key}", given or [f"{letter}{i}" for i in range(count)])
+    if len(signals) != count:
+        raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
+    check_unique(name, key, [signal.name for signal in signals])
+    return signals
+
+
+def _numbers(name: str, given: Mapping[str, Any], size: int) -> dict[str, FloatArray]:
+    """The nominal state, and how large states are where that is given."""
+    start = np.zeros(size) if given["nominal_state"] is None else given["nominal_state"]
+    found = {"nominal_state": vector(f"{name}: nominal_state", start, size)}
+    if given["state_scale"] is not None:
+        scale = vector(f"{name}: state_scale", given["state_scale"], size)
+        if not np.all(scale > 0.0):
+            raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
+        found["state_scale"] = scale
+    for array in found.values():
+        array.setflags(write=False)
+    return found
+
+
+def _choice(name: str, given: Mapping[str, Any], controls: int, outputs: int) -> dict[str, ca.SX]:
+    """u_0 where it is left out; a choice where there is none, or no metric, is refused."""
+    has_metric, has_free = (given[key] is not None for key in ("control_metric", "free_control"))
+    if has_free and not has_metric:
+        raise ModelError(f"{name}: free_control needs a control_metric that it is near in")
+    if has_metric and controls <= outputs:
+        raise ModelError(
+            f"{name}: control_metric chooses among controls, but with "
+            f"{controls} controls and {outputs} controlled outputs there is "
+            "nothing to choose; leave it out"
+        )
+    return {"free_control": ca.SX(controls, 1)} if has_metric and not has_free else {}

@@ -1,0 +1,59 @@
+"""Functions that somebody gave: what goes wrong in them is told of the one who gave them."""
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+from drake_dae.arrays import brief
+from drake_dae.errors import DrakeDaeError, ModelError
+
+
+def result_of(
+    what: str,
+    function: Callable[..., Any],
+    *arguments: Any,
+    error: Callable[[str], Exception] = ModelError,
+) -> Any:
+    """What a function that was given returns; if it fails, that is an error of the argument.
+
+    Args:
+        what: How a message calls the function.
+        function: The function, with its arguments.
+        error: Makes what is raised of a text. Errors of the library pass.
+    """
+    try:
+        return function(*arguments)
+    except DrakeDaeError:
+        raise
+    except Exception as failure:
+        text = f"{what} failed: {type(failure).__name__}: {brief(str(failure))}"
+        raise error(text) from failure
+
+
+@contextmanager
+def numpy_told(what: str) -> Iterator[None]:
+    """Tells in one line, once, that a function calls NumPy on symbols: CasADi takes twenty lines.
+
+    Args:
+        what: How the warning calls the function.
+    """
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        yield
+    for one in found:
+        text = str(one.message)
+        if one.category is FutureWarning and "casadi" in text and "numpy" in text:
+            _tell(what)
+        else:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+
+
+@cache
+def _tell(what: str) -> None:
+    warnings.warn(
+        f"{what} calls a function of NumPy on CasADi symbols; write casadi.sin for numpy.sin, and "
+        "likewise for others: CasADi is about to change what NumPy's give",
+        stacklevel=2,
+    )
