@@ -37,7 +37,7 @@ import drake_dae as dd
 from drake_dae.analysis.findings import Assumption
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError

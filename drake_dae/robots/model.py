@@ -13,15 +13,15 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.structure.shared_forces import share_forces
-from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.actuation.chain import ActuationChain, chain
+from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import check_outputs, control_choice
+from drake_dae.robots.equations import Outputs, robot_equations
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
@@ -131,8 +131,8 @@ class RobotModel:
                 "theirs through stages: the control would reach the outputs at different orders. "
                 "Cut the loop at a joint without motor"
             )
-        self._controls = (*driven.control_signals, *bound.motors)
-        choice = control_choice(name, control_weights, self._controls)
+        controls = (*driven.control_signals, *bound.motors)
+        choice = control_choice(name, control_weights, controls)
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
         is_joint_force = driven.control_signals == tuple(links.actuator_signals)
@@ -143,7 +143,18 @@ class RobotModel:
         self.control_limits = np.concatenate([efforts, motors])
         self.loop_joints = LoopState.of(bound, links)
         nominal = self._nominal(nominal_positions)
-        equations = self._equations(bound, h_1, S, driven, nominal, choice)
+        steered = (*signals, *(s for f in self.forces for s in f.signals(bound)))
+        equations = robot_equations(
+            name,
+            links,
+            bound,
+            driven,
+            self.loop_joints,
+            self.loads,
+            Outputs(h_1, S, steered),
+            choice,
+            nominal,
+        )
         self.dae = replace(equations, compiled=compiled).with_exogenous(exogenous)
         self._check_exogenous()
         if compliances is not None:
@@ -305,92 +316,6 @@ class RobotModel:
     def _nominal(self, given: ArrayLike | None) -> FloatArray:
         nominal = self.links.default_positions if given is None else given
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
-
-    def _equations(
-        self,
-        bound: ConstraintSet,
-        h_1: ca.SX,
-        S: ca.SX,
-        driven: ActuationChain,
-        nominal: FloatArray,
-        choice: tuple[Parameter, ...],
-    ) -> DaeSystem:
-        """(43)-(45), with M on the left; below the rows of the links stand those of the stages."""
-        links = self.links
-        nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
-        m, nu = bound.size, len(self._controls)
-        B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
-        velocity = ca.mtimes(links.velocity_map, links.v)
-        torque = ca.mtimes(B, driven.joint_force) + self._known_force() + bound.drag(links)
-        torque += self.loop_joints.force
-        motors = self.loop_joints.motors
-        rotors = self._moved_rotors(driven)
-
-        def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
-            acceleration = rate[nq : nq + nv]
-            inertial, constraint_rate = bound.implicit(links, acceleration, constraint_force)
-            slip = ca.sparsify(rate[:nq] - velocity)
-            if slip.nnz():  # q' is an unknown of its own where N is not the identity.
-                kinematics = links.kinematics()
-                motion = kinematics.value(bound.rate(kinematics))
-                constraint_rate += ca.jtimes(motion, links.q, slip)
-            balance = inertial - ca.mtimes(rotors, acceleration) - torque
-            stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
-            return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
-
-        position_signals = tuple(s for p in self.positions for s in p.signals(links))
-        force_outputs = tuple(s for f in self.forces for s in f.signals(bound))
-        return DaeSystem(
-            state=ca.vertcat(links.q, links.v, driven.state),
-            mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
-            f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
-            g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
-            h=ca.vertcat(
-                ca.SX(nq, nu),
-                ca.horzcat(ca.mtimes(B, driven.direct), motors),
-                ca.horzcat(driven.drive, ca.SX(k, motors.shape[1])),
-            ),
-            k=bound.constraint_output(links.kinematics()),  # (44)
-            l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
-            m=ca.vertcat(ca.SX(h_1.numel(), m), S),
-            parameters=(
-                *links.parameters,
-                *driven.parameters,
-                *bound.parameters,
-                *(parameter for load in self.loads for parameter in load.parameters),
-                *choice,
-            ),
-            state_signals=(
-                *links.position_signals,
-                *links.velocity_signals,
-                *driven.state_signals,
-            ),
-            constraint_input_signals=bound.force_signals,
-            constraint_output_signals=bound.residual_signals,
-            control_signals=self._controls,
-            output_signals=(*position_signals, *force_outputs),
-            nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
-            state_scale=np.ones(nq + nv + k),  # Of SI units and angles.
-            name=self.name,
-            implicit=implicit,
-            control_metric=ca.diag(choice[0].symbol) if choice else None,
-            free_control=choice[1].symbol if choice else None,
-            contacts=bound.contacts,
-        )
-
-    def _known_force(self) -> ca.SX:
-        """The generalized force of the loads, shape (nv, 1)."""
-        total, kinematics = ca.SX(self.links.v.numel(), 1), self.links.kinematics()
-        for load in self.loads:
-            total += self.links.generalized_force(kinematics, load.reaction(kinematics))
-        return total
-
-    def _moved_rotors(self, driven: ActuationChain) -> ca.SX:
-        """What of M turns with a stage, and not with the links, shape (nv, nv)."""
-        B = self.links.actuation_matrix
-        if not driven.carries_rotors:
-            return ca.SX(B.shape[0], B.shape[0])
-        return ca.SX(ca.sparsify(ca.DM(B * self.links.reflected_inertia @ B.T)))
 
     def _nominal_rest(self, nominal: FloatArray) -> FloatArray:
         """The state at rest on the constraints: shafts off them would strain the springs."""

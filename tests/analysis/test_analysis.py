@@ -19,7 +19,7 @@ from problems import (
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.findings import Finding
 from drake_dae.analysis.report import Analysis
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem

@@ -26,7 +26,7 @@ from drake_dae.dae.extension.extension import (
     nominal_controls,
     refuse_metric,
 )
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import SINGULAR
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import eliminated_at

@@ -12,7 +12,7 @@ import numpy as np
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation

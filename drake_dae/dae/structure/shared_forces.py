@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, unknown_name
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.redundancy import (
     check_same_motion,

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.contacts import jam
 from drake_dae.dae.system.signals import Signal

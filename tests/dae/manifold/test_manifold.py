@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from problems import PROBLEMS, Problem, double_integrator, pendulum
 
-from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError

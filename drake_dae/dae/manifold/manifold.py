@@ -1,0 +1,176 @@
+"""The manifold N* of consistent states, and the projection onto it.                 (4)"""
+
+from collections.abc import Callable, Sequence
+from math import isfinite
+
+import casadi as ca
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.manifold.first_steps import FOUND, STAYS, trace_first_steps
+from drake_dae.dae.manifold.residual import Residual
+from drake_dae.dae.manifold.search import CONSISTENT, Search
+from drake_dae.dae.manifold.settling import Settling
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import ModelError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import norm
+
+FLOOR = 1e-12
+"""A distance from N* that is round-off of states that are zero."""
+
+
+class Manifold:
+    """N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m}, equation (4).
+
+    Args:
+        system: The system (1)-(3).
+        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
+
+    Attributes:
+        residual_expression: What is zero on N*, shape (sum r_i, 1), constraint-major.
+        residual_signals: Its names and units.
+        residual_function: The same as a function of state and parameters.
+    """
+
+    def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
+        self.system = system
+        self._residual = Residual(system, chains)
+        self.residual_expression = self._residual.expression
+        self.residual_signals = self._residual.signals
+        self.residual_function = self._residual.function
+        self._first_steps = trace_first_steps(self._residual)
+        self._search = Search(self._residual, self._first_steps)
+        self._settling = Settling(self._residual)
+
+    @property
+    def dimension(self) -> int:
+        """The dimension of N*, n - (r_1 + ... + r_m), Theorem 1.1."""
+        return self.system.num_states - len(self.residual_signals)
+
+    def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """The constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+        """
+        return self.residual_function(state, self.system.parameter_vector(parameters))[0]
+
+    def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """C = d(residual)/dx, shape (sum r_i, n); the arguments are those of `residual`."""
+        return self._residual.gradients(state, parameters)
+
+    @property
+    def newton_step(self) -> TracedFunction:
+        """The Newton step of least norm from a state, over its scale, by the gradients at another.
+
+        A function of state, the other state and parameters.
+        """
+        return self._residual.newton_step
+
+    def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
+        """Whether a state is on N* up to round-off: Newton's step to it is short, in any unit.
+
+        The arguments are those of `residual`.
+        """
+        x, p = self._state(state), self.system.parameter_vector(parameters)
+        reach = float(self._first_steps.evaluate(x, p)[0][1])
+        if isfinite(reach) and reach > 0.0:
+            return reach <= CONSISTENT * norm(x / self._residual.scale) + FLOOR
+        # Gradients that depend on each other; or nothing is left, or what no state changes.
+        return self._residual.size(x, p) <= CONSISTENT
+
+    def project(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
+        """The consistent state next to a given one, to round-off, by Newton's method.
+
+        Args:
+            state: A state near N*, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+            crosses: Whether a system crosses a singular configuration at a state next to one: what
+                it loses there is then left out of the projection; None if it crosses none.
+
+        Returns:
+            The consistent state, shape (n,).
+
+        Raises:
+            InconsistentStateError: Newton's method does not reach N* from there.
+            ModelError: The state has a wrong shape.
+        """
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        return self.projected(start, p, crosses)
+
+    def projected(
+        self,
+        start: FloatArray,
+        p: FloatArray,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
+        """`project` without checks of its arguments; the state itself if it is consistent."""
+        found = self.first_steps(start, p)
+        if found is None:
+            return self.searched(start, p, crosses)
+        return found if found is start else found.copy()
+
+    def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
+        """`project` by its first few steps, without checks of its arguments: for a simulation.
+
+        Args:
+            start: The state, shape (n,).
+            p: Values of all parameters, shape (k,).
+
+        Returns:
+            The consistent state, overwritten by the next call; `start` itself if that is one; None
+            where `searched` finds more.
+        """
+        function = self._first_steps
+        state, parameters = function.arguments
+        state[...] = start
+        parameters[...] = p
+        is_valid = function.run()
+        sizes, found, _ = function.outputs
+        outcome = sizes.item(0)
+        if is_valid and outcome == FOUND:
+            return found
+        return start if outcome == STAYS and function.is_finite else None
+
+    def searched(
+        self,
+        start: FloatArray,
+        p: FloatArray,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
+        """`project` where `first_steps` has found nothing.
+
+        Args:
+            start: The state, shape (n,).
+            p: Values of all parameters, shape (k,).
+            crosses: As for `project`.
+        """
+        return self._search.searched(start, p, crosses)
+
+    def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """The consistent state next to a given one, level by level: for a start that someone gave.
+
+        The constraints are met first, by the states that they depend on; then their derivatives, by
+        the states that are new in them, and so on: positions first, then velocities, so that no
+        velocity moves a position. Where that leads nowhere it is `project`, whose arguments, result
+        and exceptions it has.
+        """
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        found = self._settling.settled(start, p)
+        return self.project(start if found is None else found, p)
+
+    def _state(self, state: ArrayLike) -> FloatArray:
+        """A state as a new array; its numbers need not be finite."""
+        x = numbers(f"{self.system.name}: a state", state).reshape(-1)
+        if x.size != self.system.num_states:
+            raise ModelError(
+                f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
+            )
+        return x

@@ -1,0 +1,90 @@
+"""What is zero on N*: the constraints and their derivatives, with Newton's step to zero.   (4)"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import norm
+from drake_dae.trace.round_off import positive
+
+
+class Residual:
+    """L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, constraint-major, and its gradients.
+
+    Args:
+        system: The system (1)-(3).
+        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
+
+    Attributes:
+        expression: The residual, shape (sum r_i, 1).
+        gradient: Its derivative by the state, shape (sum r_i, n).
+        layout: Where the derivatives of each constraint stand.
+        signals: Names and units of the residual.
+        function: The residual as a function of state and parameters.
+        scale: How large the states are in use, shape (n,).
+        lengths: How long gradients are at the nominal state over the scale of the states, 0 where
+            one has no length there or is not finite, shape (sum r_i,).
+    """
+
+    def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
+        self.system = system
+        self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])
+        self.layout = Layout(tuple(len(chain) for chain in chains))
+        self.signals = self.layout.chain_signals(system.constraint_output_signals)
+        self.gradient = ca.jacobian(self.expression, system.state)
+        self.function = system.trace("manifold", {"residual": self.expression})
+        outputs = {"gradient": self.gradient}
+        self._gradient = system.trace("manifold gradient", outputs, often=False)
+        self.scale = system.scale
+        gradients = self.gradients(system.nominal_state) * self.scale
+        if not np.all(np.isfinite(gradients)):
+            gradients = np.zeros_like(gradients)
+        self.lengths: FloatArray = np.linalg.norm(gradients, axis=1)
+
+    def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """The gradients at a state, shape (sum r_i, n); with the default parameters if None."""
+        values = self._gradient(state, self.system.parameter_vector(parameters))[0]
+        return values.reshape(-1, self.system.num_states)
+
+    @cached_property
+    def newton_step(self) -> TracedFunction:
+        """The Newton step of least norm from a state, over its scale, by the gradients at another.
+
+        A function of state, the other state and parameters.
+        """
+        other, state = ca.SX.sym("other", self.system.num_states), self.system.state
+        gradient = ca.substitute(ca.jacobian(self.expression, state), state, other)
+        scale = ca.SX(self.scale)
+        step = shortest_step(gradient, scale)[0](self.expression)
+        inputs = {"other": other}
+        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
+
+    @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
+    def size(self, state: FloatArray, parameters: FloatArray) -> float:
+        """The residual relative to how it changes over the scale of the states, if it does."""
+        residual = self.function.evaluate(state, parameters)[0]
+        if not residual.any():
+            return 0.0
+        length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
+        return norm(residual / positive(length))
+
+
+def shortest_step(
+    gradient: ca.SX, scale: ca.SX
+) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
+    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
+
+    From (C S)' = Q R it is -Q R^-T residual; the diagonal of R comes with it.
+    """
+    if not gradient.shape[0]:
+        return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
+    q, r = ca.qr(ca.mtimes(gradient, ca.diag(scale)).T)
+    pivots = [r[i, i] for i in range(r.shape[0])]
+    return (lambda residual: -ca.mtimes(q, ca.solve(r.T, residual))), pivots

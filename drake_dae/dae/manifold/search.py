@@ -1,0 +1,174 @@
+"""The consistent state next to one from which the first Newton steps do not lead to N*."""
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.manifold.first_steps import FOUND
+from drake_dae.dae.manifold.residual import Residual
+from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.factorization import smallest_sine
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import (
+    ROUND_OFF,
+    Linearization,
+    are_dependent,
+    newton,
+    norm,
+    shortest_steps,
+)
+from drake_dae.trace.round_off import positive
+
+CONSISTENT = 1e-8
+"""A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
+size; or, where gradients depend on each other, if its residual is at most this."""
+
+NEARLY = 3e-3
+"""Gradients of constraints that are this near to dependent, as the sine of an angle, are left out
+of a projection from a state that is all but on N*."""
+
+SMALL = 1e-3
+"""A state is all but on N* if its residual, in lengths of gradients, is at most this, relative to
+its size."""
+
+ITERATIONS = 10
+"""After so many steps such a projection is given up; quadratic convergence takes three."""
+
+
+class Search:
+    """Newton's method, least squares downhill, and across singular configurations.
+
+    Args:
+        residual: What is zero on N*.
+        first_steps: The first Newton steps; see `trace_first_steps`.
+    """
+
+    def __init__(self, residual: Residual, first_steps: TracedFunction) -> None:
+        self._residual, self._first_steps = residual, first_steps
+        heads = residual.layout.heads.tolist()
+        if heads:
+            first = ca.mtimes(residual.gradient[heads, :], ca.diag(ca.SX(residual.scale)))
+            sines = {"sine": smallest_sine(first, residual.lengths[heads])}
+            self._sine = residual.system.trace("independence", sines, often=False)
+
+    def searched(
+        self,
+        start: FloatArray,
+        p: FloatArray,
+        crosses: Callable[[FloatArray], bool] | None = None,
+    ) -> FloatArray:
+        """`project` where `first_steps` has found nothing.
+
+        Args:
+            start: The state, shape (n,).
+            p: Values of all parameters, shape (k,).
+            crosses: As for `project`.
+        """
+        function = self._first_steps
+        sizes, found, _ = function.evaluate(start, p)
+        is_finite = function.is_finite
+        if (
+            is_finite
+            and sizes.item(1) == 0.0
+            and not self._residual.function.evaluate(start, p)[0].any()
+        ):
+            return start
+        known = found.copy() if is_finite and sizes.item(0) == FOUND else None
+        if crosses is not None and not function.is_valid and self._is_near(start, p, crosses):
+            known = self._nearly(start, p)
+        return self._searched(start, p) if known is None else known
+
+    def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """The consistent state next to one, where the first few steps do not lead to it."""
+        scale = self._residual.scale
+        z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
+        if not converged:
+            # Gradients that depend on each other, or steps that mislead: least squares, downhill.
+            z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
+        found = scale * z
+        if converged and not np.array_equal(found, start):
+            return found
+        # Else it is round-off, in units in which that is much, or no state changes what is left.
+        if self._residual.size(found, p) <= CONSISTENT:
+            return found
+        residual = self._residual.function.evaluate(found, p)[0].copy()
+        if converged and self._first_steps.evaluate(found, p)[1].any():
+            return found
+        raise InconsistentStateError(self._why(found, p, residual), residual)
+
+    def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
+        """Newton steps of least norm by the gradients at a state, in states over their scale."""
+        scale = self._residual.scale
+        return Linearization(
+            lambda z: self._residual.newton_step.evaluate(scale * z, state, parameters)[0].copy(),
+            is_regular=True,
+        )
+
+    def _is_near(
+        self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
+    ) -> bool:
+        """Whether a system crosses a singular configuration next to a state."""
+        return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
+
+    def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
+        """The state next to one that is all but on N*, where gradients nearly depend on each other.
+
+        Across a singular configuration a regular step would magnify round-off. What gradients that
+        are left out there say of N* is left, which is little so near to it; None if it is more.
+        """
+        x = start / self._residual.scale
+        size = max(norm(x), norm(self._residual.system.nominal_state / self._residual.scale))
+        for _ in range(ITERATIONS):
+            state = x * self._residual.scale
+            gradients = self._residual.gradients(state, parameters) * self._residual.scale
+            left = self._residual.function(state, parameters)[0]
+            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(left))):
+                return None
+            length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._residual.lengths))
+            if norm(left / length) > SMALL * size:
+                return None
+            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (left / length)
+            x = x - step
+            if norm(step) <= ROUND_OFF * size:
+                return x * self._residual.scale
+        return None
+
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
+        """Steps of least squares that make the residual smaller, its rows scaled to length one."""
+        scale = self._residual.scale
+        gradients = self._residual.gradients(state, parameters) * scale
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self._residual.function(scale * z, parameters)[0]
+
+        def measure(z: FloatArray) -> float:
+            return float(np.linalg.norm(residual(z) / length))
+
+        steps = shortest_steps(gradients, residual)
+        return None if steps is None else steps._replace(measure=measure)
+
+    def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
+        """Why a Newton iteration that ended at a state failed, in words."""
+        name = self._residual.system.name
+        values = zip(self._residual.signals, residual, strict=True)
+        bad = [signal.name for signal, value in values if not np.isfinite(value)]
+        if bad:
+            return (
+                f"{name}: {', '.join(bad)} is not finite at the given state; start inside the "
+                "domain of the constraints"
+            )
+        worst = int(np.argmax(np.abs(residual)))
+        left = (
+            f"{name}: no consistent state found near the given one; "
+            f"{self._residual.signals[worst].name} = {residual[worst]:.3g} is left where Newton's "
+            "method ends. "
+        )
+        if are_dependent(self._residual.gradients(state, parameters) * self._residual.scale):
+            return left + (
+                "The gradients of the constraints depend on each other there: the constraints "
+                "contradict each other, or start away from this state"
+            )
+        return left + "Start nearer to the constraint, away from its singular states"

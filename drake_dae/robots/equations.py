@@ -1,0 +1,128 @@
+"""The equations of a robot in contact as a DaeSystem.       (43)-(45), (64)-(68), (74)-(78)"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.robots.actuation.chain import ActuationChain
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.loads import KnownForce
+from drake_dae.robots.loop_state import LoopState
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """The controlled outputs z = (h_1(q), S(q) lambda) of a robot.
+
+    Attributes:
+        positions: h_1, shape (p - k, 1).
+        forces: S, shape (k, m).
+        signals: Names and units of z.
+    """
+
+    positions: ca.SX
+    forces: ca.SX
+    signals: tuple[Signal, ...]
+
+
+def robot_equations(
+    name: str,
+    links: Links,
+    bound: ConstraintSet,
+    driven: ActuationChain,
+    loop_joints: LoopState,
+    loads: Sequence[KnownForce],
+    outputs: Outputs,
+    choice: tuple[Parameter, ...],
+    nominal: FloatArray,
+) -> DaeSystem:
+    """(43)-(45), with M on the left; below the rows of the links stand those of the stages.
+
+    Args:
+        name: The robot's name in messages.
+        links, bound, driven, loop_joints, loads, outputs: What the robot is made of.
+        choice: The parameters by which the control is chosen, if it is; see `control_choice`.
+        nominal: A configuration of the robot at work, shape (nq,).
+    """
+    nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
+    controls = (*driven.control_signals, *bound.motors)
+    m, nu = bound.size, len(controls)
+    h_1, S = outputs.positions, outputs.forces
+    B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+    velocity = ca.mtimes(links.velocity_map, links.v)
+    torque = ca.mtimes(B, driven.joint_force) + _known_force(links, loads) + bound.drag(links)
+    torque += loop_joints.force
+    motors = loop_joints.motors
+    rotors = _moved_rotors(links, driven)
+
+    def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        acceleration = rate[nq : nq + nv]
+        inertial, constraint_rate = bound.implicit(links, acceleration, constraint_force)
+        slip = ca.sparsify(rate[:nq] - velocity)
+        if slip.nnz():  # q' is an unknown of its own where N is not the identity.
+            kinematics = links.kinematics()
+            motion = kinematics.value(bound.rate(kinematics))
+            constraint_rate += ca.jtimes(motion, links.q, slip)
+        balance = inertial - ca.mtimes(rotors, acceleration) - torque
+        stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
+        return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
+
+    return DaeSystem(
+        state=ca.vertcat(links.q, links.v, driven.state),
+        mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
+        f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
+        g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
+        h=ca.vertcat(
+            ca.SX(nq, nu),
+            ca.horzcat(ca.mtimes(B, driven.direct), motors),
+            ca.horzcat(driven.drive, ca.SX(k, motors.shape[1])),
+        ),
+        k=bound.constraint_output(links.kinematics()),  # (44)
+        l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
+        m=ca.vertcat(ca.SX(h_1.numel(), m), S),
+        parameters=(
+            *links.parameters,
+            *driven.parameters,
+            *bound.parameters,
+            *(parameter for load in loads for parameter in load.parameters),
+            *choice,
+        ),
+        state_signals=(
+            *links.position_signals,
+            *links.velocity_signals,
+            *driven.state_signals,
+        ),
+        constraint_input_signals=bound.force_signals,
+        constraint_output_signals=bound.residual_signals,
+        control_signals=controls,
+        output_signals=outputs.signals,
+        nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
+        state_scale=np.ones(nq + nv + k),  # Of SI units and angles.
+        name=name,
+        implicit=implicit,
+        control_metric=ca.diag(choice[0].symbol) if choice else None,
+        free_control=choice[1].symbol if choice else None,
+        contacts=bound.contacts,
+    )
+
+
+def _known_force(links: Links, loads: Sequence[KnownForce]) -> ca.SX:
+    """The generalized force of the loads, shape (nv, 1)."""
+    total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
+    for load in loads:
+        total += links.generalized_force(kinematics, load.reaction(kinematics))
+    return total
+
+
+def _moved_rotors(links: Links, driven: ActuationChain) -> ca.SX:
+    """What of M turns with a stage, and not with the links, shape (nv, nv)."""
+    B = links.actuation_matrix
+    if not driven.carries_rotors:
+        return ca.SX(B.shape[0], B.shape[0])
+    return ca.SX(ca.sparsify(ca.DM(B * links.reflected_inertia @ B.T)))
