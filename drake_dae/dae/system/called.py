@@ -18,21 +18,23 @@ def called_functions(
     functions: Mapping[str, Any],
     parameters: Mapping[str, ArrayLike],
     labels: Mapping[str, Any],
-    known: Sequence[str],
+    fields: Sequence[str],
 ) -> dict[str, Any]:
-    """The fields of a `DaeSystem` that functions of the state make; see `from_functions`.
+    """The fields of a `DaeSystem` whose functions are given in Python; see `from_functions`.
 
     Args:
         state: Names (or Signals) of the states, or their number n.
         functions: "f", "g", ..., "m" -> the function; None where there is none.
         parameters: Name -> default.
         labels: The other fields.
-        known: The names that those can have.
+        fields: The names of all fields.
 
     Raises:
         ModelError: A name is wrong, or a function fails.
     """
     owner = labels.get("name", "system")
+    own = {"state", "parameters", "state_signals", *"fghklm"}
+    known = [item for item in fields if item not in own]
     for label in labels:
         if label not in known:
             raise ModelError(f"{owner}: {unknown_name('field', label, known)}")
@@ -53,4 +55,4 @@ def called_functions(
     values = {key: call(owner, key, given, arguments) for key, given in functions.items()}
     if values["h"].shape[0] == 1 and x.numel() != 1:
         values["h"] = values["h"].T
-    return {"state": x, **values, "parameters": defined, "state_signals": named}
+    return {"state": x, **values, "parameters": defined, "state_signals": named, **labels}

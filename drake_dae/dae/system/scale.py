@@ -217,3 +217,14 @@ def _linear_part(
     function = ca.Function("linear", [state, parameters[0]], [ca.densify(e) for e in outputs])
     part, size = (v.full().ravel() for v in function(nominal, parameters[1]))
     return np.where(np.abs(values - part) <= ROUND_OFF * size, values, part)
+
+
+def spread_about(state: FloatArray, scale: FloatArray) -> FloatArray:
+    """How far states are drawn from one where nobody says, shape (n,): 0.1 of their scale.
+
+    It is a hundredth of a value that is above 10 of them, and a tenth of one that is below 1e-3 and
+    not round-off.
+    """
+    size = np.abs(state) / scale
+    small = (size < 1e-3) & (size > 1e-12 * size.max())
+    return scale * np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))

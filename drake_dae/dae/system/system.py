@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name, vector
+from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.system.called import called_functions
 from drake_dae.dae.system.checks import checked_fields
 from drake_dae.dae.system.contacts import Contact, Contacts
 from drake_dae.dae.system.exogenous import Exogenous
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
-from drake_dae.dae.system.scale import natural_scale
+from drake_dae.dae.system.scale import natural_scale, spread_about
 from drake_dae.dae.system.sharing import Sharing
 from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
@@ -160,11 +160,9 @@ class DaeSystem:
         Raises:
             ModelError: A function fails, or the functions make no system; see the class.
         """
-        own = {"state", "parameters", "state_signals", *"fghklm"}
-        known = [item.name for item in fields(cls) if item.name not in own]
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
-        called = called_functions(state, functions, parameters or {}, labels, known)
-        system = cls(**called, **labels)
+        names = [item.name for item in fields(cls)]
+        system = cls(**called_functions(state, functions, parameters or {}, labels, names))
         return system.with_exogenous(exogenous) if exogenous else system
 
     @cached_property
@@ -259,10 +257,8 @@ class DaeSystem:
         Raises:
             ModelError: No parameter has that name.
         """
-        known = [p.name for p in self.parameters]
         for name in names:
-            if name not in known:
-                raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
+            self.parameter_slice(name)
         return replace(self, parameters=moving(self.parameters, names))
 
     @cached_property
@@ -285,17 +281,12 @@ class DaeSystem:
         return self.usual_spread(self.nominal_state)
 
     def usual_spread(self, state: ArrayLike) -> FloatArray:
-        """How far states are drawn from one where nobody says, shape (n,): 0.1 of their scale.
-
-        It is a hundredth of a value that is above 10 of them, and a tenth of one that is below
-        1e-3 and not round-off.
+        """How far states are drawn from one where nobody says, shape (n,); see `spread_about`.
 
         Raises:
             ModelError: The state has a wrong shape, or a number is not finite.
         """
-        size = np.abs(self.state_vector(state)) / self.scale
-        small = (size < 1e-3) & (size > 1e-12 * size.max())
-        return self.scale * np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
+        return spread_about(self.state_vector(state), self.scale)
 
     def trace(
         self,
