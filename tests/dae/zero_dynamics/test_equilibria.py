@@ -1,0 +1,394 @@
+"""Equilibria of zero dynamics: where they are, which are none, and what is said of those."""
+
+import re
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+from actuated import OFFSET, actuated, at_rest, start_position
+from problems import (
+    PROBLEMS,
+)
+from zero_systems import (
+    GRAVITY,
+    HOLES,
+    MINIMUM_PHASE,
+    NON_MINIMUM_PHASE,
+    TANK_AREAS,
+    TANK_GRAVITY,
+    Array,
+    assert_same_numbers,
+    cart_pendulum,
+    free_arm,
+    internal,
+    quadruple_tank,
+    zero_dynamics,
+)
+
+from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
+from drake_dae.dae.structure.structure import examine_structure, find_structure
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.gains import poles
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+    NonMinimumPhaseWarning,
+)
+
+
+def tanks_at_rest(pumps, valves, levels) -> tuple[Array, Array]:
+    """Levels and voltages: outflow = inflow of tanks 1 and 2, hence u; then tanks 3 and 4."""
+    k, g = np.array(pumps), np.array(valves)
+    inflow = np.array([[g[0] * k[0], (1 - g[1]) * k[1]], [(1 - g[0]) * k[0], g[1] * k[1]]])
+    out = HOLES[:2] * np.sqrt(2 * TANK_GRAVITY * np.array(levels))
+    u = np.linalg.solve(inflow, out)
+    upper = np.array([(1 - g[1]) * k[1] * u[1], (1 - g[0]) * k[0] * u[0]])
+    return np.concatenate([levels, (upper / HOLES[2:]) ** 2 / (2 * TANK_GRAVITY)]), u
+
+
+@pytest.mark.parametrize("plant", [MINIMUM_PHASE, NON_MINIMUM_PHASE])
+def test_equilibrium_of_the_four_tanks(plant):
+    dynamics = zero_dynamics(quadruple_tank(**plant))
+    expected, voltages = tanks_at_rest(**plant)
+    found = dynamics.equilibrium(plant["levels"])
+    # A dozen operations.
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    motion = dynamics.motion(lambda t: [plant["levels"][0], 0, plant["levels"][1], 0], [0.0], found)
+    np.testing.assert_allclose(motion.controls[0], voltages, rtol=1e-10)
+    # The published upper levels are measured ones.
+    published = (1.8, 1.4) if plant is MINIMUM_PHASE else (4.8, 4.9)
+    np.testing.assert_allclose(found[2:], published, atol=0.25)
+
+
+@pytest.mark.parametrize("plant", [MINIMUM_PHASE, NON_MINIMUM_PHASE])
+def test_zeros_of_the_four_tanks(plant):
+    """(1 + s T3)(1 + s T4) = (1 - g1)(1 - g2)/(g1 g2), T_i = A_i/a_i sqrt(2 h_i/g)."""
+    dynamics = zero_dynamics(quadruple_tank(**plant))
+    levels, _ = tanks_at_rest(**plant)
+    t3, t4 = (TANK_AREAS / HOLES * np.sqrt(2 * levels / TANK_GRAVITY))[2:]
+    g1, g2 = plant["valves"]
+    expected = np.roots([t3 * t4, t3 + t4, 1 - (1 - g1) * (1 - g2) / (g1 * g2)])
+    found = dynamics.eigenvalues(dynamics.equilibrium(plant["levels"]))
+    # An equilibrium to 1e-12.
+    np.testing.assert_allclose(found, np.sort(expected)[::-1], rtol=1e-9)
+    stability = dynamics.stability()
+    np.testing.assert_allclose(stability.eigenvalues, found, rtol=1e-9)
+    np.testing.assert_allclose(stability.state, levels, rtol=1e-9)
+    if plant is MINIMUM_PHASE:
+        assert (stability.verdict, g1 + g2 > 1) == (Verdict.STABLE, True)
+        published = (-0.018, -0.060)
+    else:
+        assert (stability.verdict, g1 + g2 < 1) == (Verdict.UNSTABLE, True)
+        assert stability.reason.startswith("non-minimum phase")
+        published = (0.013, -0.057)
+    # As published, for the measured levels.
+    np.testing.assert_allclose(found, published, atol=2e-3)
+
+
+def test_equilibrium_of_a_robot_against_multibody_plant():
+    name, kind = "two_link", "damped"
+    robot = actuated(name, kind)
+    expected, _ = at_rest(name, kind, start_position(name), 25.0)
+    found = ZeroDynamics(robot.structure.system, structure=robot.structure).equilibrium(
+        [*OFFSET[name], 25.0]
+    )
+    # The plant and the library differ by round-off of forces of 100 N over stiffnesses of 5e3.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+
+
+def test_eigenvalues_belong_to_equilibria():
+    dynamics = zero_dynamics(cart_pendulum())
+    with pytest.raises(
+        ModelError, match=r"is no regular equilibrium: .*' = .*'equilibrium' finds one"
+    ):
+        dynamics.eigenvalues([0.0, 0.7 * np.sin(0.3), 0.7 * np.cos(0.3), 0, 0, 0])
+    for off in ([0, 0, 0.8, 0, 0, 0], [0, 0, 0.7, 1.0, 1.0, 0]):
+        with pytest.raises(ModelError, match="it is off N\\*, or its outputs change"):
+            dynamics.eigenvalues(off)
+    upright = [0.0, 0.0, 0.7, 0, 0, 0]
+    assert dynamics.eigenvalues(upright)[0] == pytest.approx(np.sqrt(GRAVITY / 0.7), rel=1e-10)
+
+
+def test_singular_states_are_named():
+    """The arm stretched out, where its Jacobian is singular."""
+    dynamics = zero_dynamics(free_arm())
+    with pytest.raises(
+        InconsistentStateError, match=r"lead to x = .* A\(x\) or B\(x\) is singular"
+    ):
+        dynamics.state([1.8, 0, 0, 0, 0, 0], np.zeros(4))
+    with pytest.raises(ModelError, match=r"no regular equilibrium: A\(x\) or B\(x\) is singular"):
+        dynamics.eigenvalues(np.zeros(4))
+    # z' = (s + 1) u, s' = -1 - s: at rest with s = -1 nothing moves z.
+    system = DaeSystem.from_functions(
+        2, f=lambda x: [0, -1 - x[1]], h=lambda x: [1 + x[1], 0], l=lambda x: x[0]
+    )
+    stability = zero_dynamics(system).stability()
+    assert stability.verdict is Verdict.UNDECIDED
+    assert "A(x) or B(x) is singular" in stability.reason
+
+
+def test_no_equilibrium_is_reported():
+    """s' = 1 + s^2 has none, nor has a blade pinned to a speed; with speed 0 it has many."""
+    dynamics = zero_dynamics(internal(lambda s, z: 1 + s**2))
+    with pytest.raises(
+        InconsistentStateError, match=r"z = 0 have no regular state at rest .* s' = "
+    ) as e:
+        dynamics.equilibrium([0.0])
+    assert e.value.residual[1] >= 1.0
+    # The motion from there, s = tan t, tells it.
+    growing = dynamics.stability()
+    assert growing.verdict is Verdict.UNSTABLE
+    assert (growing.state, growing.eigenvalues.shape) == (None, (0,))
+    assert "no regular state at rest" in growing.reason
+    assert "the motion from there grows without bound" in growing.reason
+
+    blade = zero_dynamics(PROBLEMS["knife_edge"]().system)
+    with pytest.raises(InconsistentStateError, match=r"V = 0\.8 have no regular state at rest"):
+        blade.equilibrium([0.3, 0.8])
+    assert blade.stability().verdict is Verdict.UNDECIDED
+    guess = np.array([2.0, -1.0, 0.1, 0.2, -0.1, 0.3])
+    rest = blade.equilibrium([0.3, 0.0], guess)
+    # Of the continuum (x, y) the one at the guess.
+    np.testing.assert_allclose(rest, [2.0, -1.0, 0.3, 0.0, 0.0, 0.0], rtol=0, atol=1e-12)
+    still = blade.stability(rest)
+    assert still.verdict is Verdict.UNDECIDED
+    np.testing.assert_allclose(still.eigenvalues, [0.0, 0.0], atol=1e-12)
+
+
+def test_a_continuum_is_not_left_for_round_off():
+    """z'' = u and s1' = s2' = 0 in turned coordinates: any (s1, s2) is at rest."""
+    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(4, 4)))[0]
+    shift = np.zeros((4, 4))
+    shift[0, 1] = 1.0
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x: turn @ shift @ turn.T @ x,
+        h=lambda x: turn[:, 1],
+        l=lambda x: ca.mtimes(turn[:, :1].T, x),
+        state_scale=np.ones(4),  # So that the nearest is that of the turned coordinates.
+    )
+    rest = zero_dynamics(system).equilibrium([0.7], turn @ [0.1, 0.2, 0.3, -0.4])
+    np.testing.assert_allclose(turn.T @ rest, [0.7, 0.0, 0.3, -0.4], rtol=0, atol=1e-12)
+
+
+def test_tension_as_output():
+    """The pendulum with its tension held, by hand.
+
+    At rest the control balances nothing: x = 0 is not regular, so it is held aside at angle a. With
+    T = v L constant: m x'' = v x + u, m y'' = v y - m g on the circle; u makes v what it is. With a
+    the angle from the vertical and w = -v L > 0: m L a'' = -m g sin a + u cos a and
+    w = m L a'^2 + m g cos a + u sin a, so m L a'' = (w cos a - m g) / sin a - m L a'^2 / tan a.
+    At rest cos a = m g/w, and the slope there is -w sin a/sin a = -w: m L a'' = -w (a - a_0).
+    """
+    problem = PROBLEMS["pendulum_tension"]()
+    mass, length, gravity = 2.0, 0.8, 9.81
+    dynamics, tension = zero_dynamics(problem.system), -30.0
+    weight = -tension * length
+    angle = np.arccos(mass * gravity / weight)
+    rest = dynamics.equilibrium([tension])
+    expected = [length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0]
+    np.testing.assert_allclose(rest, expected, rtol=0, atol=1e-11)
+    rate = np.sqrt(weight / (mass * length))
+    found = dynamics.eigenvalues(rest)
+    assert_same_numbers(found, np.array([1j, -1j]) * rate, rtol=1e-9, atol=1e-9)
+    # Without a given tension it is that of the equilibrium that is found.
+    free = dynamics.stability()
+    assert free.verdict is Verdict.UNDECIDED
+    np.testing.assert_allclose(dynamics.eigenvalues(free.state).imag, free.eigenvalues.imag)
+
+
+@pytest.mark.slow
+def test_verdicts_on_known_systems(problem):
+    stability = zero_dynamics(problem.system).stability()
+    if problem.zero_dynamics == 0:
+        assert stability.verdict is Verdict.STABLE
+        assert stability.reason.startswith("no zero dynamics")
+        assert (stability.state, stability.eigenvalues.shape) == (None, (0,))
+    elif problem.minimum_phase is not None:
+        assert (stability.verdict is Verdict.STABLE) == problem.minimum_phase
+        assert stability.eigenvalues.shape == (problem.zero_dynamics,)
+
+
+def test_an_equilibrium_without_zero_dynamics():
+    dynamics = zero_dynamics(free_arm())
+    rest = dynamics.equilibrium([1.2, 0.5], [0.2, 1.0, 0.3, 0.3])
+    np.testing.assert_allclose(rest[2:], 0.0, atol=1e-14)
+    assert dynamics.eigenvalues(rest).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("columns", "where"),
+    [
+        (lambda x: [[1, 1], [1, 1]], ""),
+        # x1 passes 0 among the states around (0, 0.05).
+        (lambda x: [[x[1], 0], [0, 1]], r"x = \[.*, *-?[0-9.]+e-"),
+    ],
+)
+def test_a_singular_b_leaves_undecided_what_has_no_zero_dynamics(columns, where):
+    """Two outputs that move alike, and one that is not moved where x1 = 0: n = mu_1 + mu_2."""
+    system = DaeSystem.from_functions(
+        2, f=lambda x: [0, 0], h=columns, l=lambda x: [x[0], x[1]], nominal_state=[0.0, 0.05]
+    )
+    structure, violation = examine_structure(system, spread=0.1)
+    assert violation is not None
+    dynamics = ZeroDynamics(structure.system, structure=structure)
+    assert dynamics.dimension == 0
+    stability = dynamics.stability()
+    assert (stability.verdict, stability.state) == (Verdict.UNDECIDED, None)
+    assert re.search(r"B\(x\) of \(16\) is singular at " + where, stability.reason)
+
+
+def slider() -> DaeSystem:
+    """On a floor that pushes with v, and beside it xi' = xi (v - 40); z = (place, v)."""
+    return DaeSystem.from_functions(
+        ["x", "y", "vx", "vy", "xi"],
+        f=lambda s: [s[2], s[3], 0, -9.81, -40 * s[4]],
+        g=lambda s: [0, 0, 0, 1, s[4]],
+        h=lambda s: [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
+        k=lambda s: [s[1]],
+        l=lambda s: [s[0], 0],
+        m=lambda s: [[0], [1]],
+        name="slider",
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("force", "rate"), [(20.0, -20.0), (80.0, 40.0)])
+def test_the_force_that_is_asked_for_decides(force, rate):
+    """The force is met at once, so that no state tells it: the eigenvalue is v - 40."""
+    system = slider()
+    structure = find_structure(system)
+    dynamics = ZeroDynamics(structure.system, structure=structure)
+    outputs = [0.0, force]
+    rest = dynamics.equilibrium(outputs)
+    assert dynamics.eigenvalues(rest, outputs=outputs) == pytest.approx([rate], rel=1e-9)
+    verdict = dynamics.stability(outputs=outputs).verdict
+    assert verdict is (Verdict.UNSTABLE if rate > 0 else Verdict.STABLE)
+    told = analyze(
+        system, reference=lambda t: np.array([0.0, 0.0, 0.0, force]), times=np.linspace(0, 0.1, 5)
+    )
+    assert told.zero_dynamics.verdict is verdict
+    law = TrackingLaw(system, poles(-3.0), structure=structure)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        make_closed_loop(
+            DaePlant(structure.system, structure=structure), law, [ConstantReference(outputs)]
+        )
+    assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
+
+
+def test_a_loop_is_judged_when_it_begins():
+    """The force grows from 20 to 60 N in 2 s: unstable above 40 N."""
+    law = TrackingLaw(slider(), poles(-3.0))
+    force = ExpressionReference(lambda t: [20 + 20 * t])
+    for start, unstable in ((0.0, False), (2.0, True)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            make_closed_loop(
+                DaePlant(law.structure.system, structure=law.structure),
+                law,
+                [ConstantReference([0.0]), force],
+                start_time=start,
+            )
+        assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
+
+
+@pytest.mark.parametrize(
+    ("rate", "nominal"),
+    [(lambda x: -(x**2), 0.1), (lambda x: ca.cos(x) - 1, 0.3), (lambda x: 0 * x, 0.2)],
+)
+def test_an_equilibrium_that_is_found_slowly_decides_nothing(rate, nominal):
+    """Its eigenvalue is 0, and Newton's method ends where it is only near 0."""
+    system = DaeSystem.from_functions(
+        ["y", "xi"],
+        f=lambda x: [0, rate(x[1])],
+        h=lambda x: [1, 0],
+        l=lambda x: [x[0]],
+        nominal_state=[0.0, nominal],
+    )
+    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
+
+
+def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
+    """The zero is s = 0 exactly; what is left of it after cancellation is round-off."""
+    a = [[0, 0, 0], [1, 0, 0], [0, 0, 1]]
+    system = DaeSystem.from_functions(
+        3,
+        f=lambda x: ca.mtimes(ca.DM(a), x),
+        h=lambda x: [[-2, 0], [2, 0], [0, 1]],
+        l=lambda x: [2 * x[0], x[1] - 2 * x[2]],
+    )
+    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
+
+
+def test_rest_does_not_depend_on_the_unit_of_time():
+    """An electrostatic actuator with its voltage held: a plate on a spring, modes of 2e4 1/s.
+
+    Place, speed and charge in units of the gap, 0.1 m/s and q. What is left of x' where Newton's
+    method ends is round-off of these, times the rates. At a voltage V the force is
+    e V^2 / (2 (gap - x)^2), so that m s^2 + b s + k - e V^2 / (gap - x)^3 = 0.
+    """
+    mass, damping, stiffness, gap, e, resistance = 1e-9, 1e-6, 1.0, 2e-6, 8.85e-20, 1e3
+    q = np.sqrt(2 * e * stiffness * 0.4 * gap)
+
+    def force(x: ca.SX) -> ca.SX:
+        return (q * x[2]) ** 2 / (2 * e) - 0.1 * damping * x[1] - stiffness * gap * x[0]
+
+    system = DaeSystem.from_functions(
+        3,
+        f=lambda x: [
+            0.1 * x[1] / gap,
+            force(x) / mass / 0.1,
+            -gap * x[2] * (1 - x[0]) / e / resistance,
+        ],
+        h=lambda x: [0, 0, 1 / resistance / q],
+        l=lambda x: [q * gap * x[2] * (1 - x[0]) / e],
+        nominal_state=[0.42, 0.0, 1.0],
+    )
+    stability = ZeroDynamics(
+        find_structure(system, spread=[0.02, 0.01, 0.02]).system,
+        structure=find_structure(system, spread=[0.02, 0.01, 0.02]),
+    ).stability()
+    assert stability.verdict is Verdict.UNSTABLE
+    place, _, charge = stability.state
+    voltage = q * gap * charge * (1 - place) / e
+    softened = stiffness - e * voltage**2 / (gap * (1 - place)) ** 3
+    expected = np.roots([mass, damping, softened])
+    # The place is known to 1e-9 of the gap.
+    np.testing.assert_allclose(np.sort(stability.eigenvalues.real), np.sort(expected), rtol=1e-8)
+
+
+def test_a_clock_among_the_states_is_told():
+    """A force beside c' = 1, held through a matrix whose round-off was divided by: z1 = 3e13."""
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy", "c"],
+        f=lambda s: [s[2], s[3], 0, 0, 1],
+        g=lambda s: [0, 0, 0, 1, 0],
+        h=lambda s: [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
+        k=lambda s: [s[1] - ca.sin(s[4])],
+        l=lambda s: [s[0], 0],
+        m=lambda s: [[0], [1]],
+        name="moved",
+    )
+    dynamics = ZeroDynamics(system)
+    for outputs in (None, [0.0, 10.0]):
+        stability = dynamics.stability(dynamics.structure.states[0], outputs=outputs)
+        assert stability.verdict is Verdict.UNDECIDED
+        assert "no state is at rest, since c' = 1" in stability.reason
+        assert "z1" not in stability.reason
+
+
+def test_a_constant_rate_that_something_steers_is_no_clock():
+    """x' = 1 + u rests at u = -1, which keeps x, and xi' = -xi + x with it."""
+    system = DaeSystem.from_functions(
+        ["x", "xi"],
+        f=lambda s: [1, s[0] - s[1]],
+        h=lambda s: [1, 0],
+        l=lambda s: [s[0]],
+    )
+    dynamics = ZeroDynamics(system)
+    assert dynamics.stability(dynamics.structure.states[0]).verdict is Verdict.STABLE

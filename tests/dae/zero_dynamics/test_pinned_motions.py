@@ -1,0 +1,229 @@
+"""Pinned motions against closed forms, closed loops and MultibodyPlant."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from actuated import OFFSET, actuated, at_rest, drive, rates, start_position
+from problems import (
+    Problem,
+    closed_loop_outputs,
+    double_integrator,
+    reference_at,
+    wanted_outputs,
+)
+from scipy.integrate import solve_ivp
+from zero_systems import (
+    GRAVITY,
+    Array,
+    aircraft,
+    cart_pendulum,
+    derivatives,
+    free_arm,
+    zero_dynamics,
+)
+
+from drake_dae.dae.tracking.gains import poles
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import (
+    InconsistentStateError,
+    ModelError,
+)
+
+
+def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, PinnedMotion]:
+    """A problem's reference from a random start, without failure."""
+    times = np.linspace(0.0, problem.horizon, count)
+    dynamics = zero_dynamics(problem.system)
+    start = problem.consistent(np.random.default_rng(3))
+    motion = dynamics.motion(lambda t: reference_at(problem, t), times, start)
+    assert motion.ending is None
+    np.testing.assert_array_equal(motion.times, times)
+    return dynamics, times, motion
+
+
+def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
+    """By the closed forms of the problem: k and its derivatives, z = l + m (alpha + beta u)."""
+    _, times, motion = following(problem)
+    system = problem.system
+    numbers = ca.Function(
+        "lm", [system.state, system.parameter_symbol], [ca.densify(system.l), ca.densify(system.m)]
+    )
+    for i, x in enumerate(motion.states):
+        # Round-off of numbers of order 10.
+        np.testing.assert_allclose(problem.derivatives(x), 0.0, atol=1e-13)
+        known = problem.known(x)
+        force = known.alpha + known.beta @ motion.controls[i]
+        np.testing.assert_allclose(motion.constraint_inputs[i], force, rtol=1e-10, atol=1e-10)
+        el, em = (np.array(e) for e in numbers(x, system.parameter_values))
+        # The promise of 1e-9; Newton's method leaves 1e-12 of a state.
+        wanted = wanted_outputs(problem, times[[i]])[0]
+        np.testing.assert_allclose(el[:, 0] + em @ force, wanted, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_motions_agree_with_the_closed_loop_started_on_them(problem):
+    """The law (28) without an initial error moves the same way; integrated by DOP853."""
+    _, times, motion = following(problem)
+    law = TrackingLaw(problem.system, poles(-3.0))
+    _, states = closed_loop_outputs(problem, law, motion.states[0], times)
+    # Internal states: the integration error at TOLERANCE 1e-6, which is 2e-8 at most here.
+    np.testing.assert_allclose(motion.states, states, rtol=1e-7, atol=1e-7)
+    controls = [
+        law.control(x, reference_at(problem, t)) for t, x in zip(times, states, strict=True)
+    ]
+    # Up to 1000 times as steep in the state, as in a stiff system.
+    np.testing.assert_allclose(motion.controls, controls, rtol=1e-5, atol=1e-5)
+
+
+def test_margins_are_the_singular_values_of_a_and_b(problem):
+    _, _, motion = following(problem, 5)
+    for i, x in enumerate(motion.states):
+        known = problem.known(x)
+        expected = np.linalg.svd(known.control_matrix, compute_uv=False)[-1]
+        assert motion.control_margins[i] == pytest.approx(expected, rel=1e-9)
+        if problem.constraint_degrees:
+            expected = np.linalg.svd(known.constraint_matrix, compute_uv=False)[-1]
+        else:
+            expected = np.inf
+        assert motion.constraint_margins[i] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_shapes(problem):
+    dynamics, times, motion = following(problem, 4)
+    system, k = problem.system, times.size
+    assert dynamics.dimension == problem.zero_dynamics
+    assert motion.states.shape == (k, system.num_states)
+    assert motion.controls.shape == (k, system.num_controls)
+    assert motion.constraint_inputs.shape == (k, system.num_constraints)
+    assert motion.constraint_margins.shape == motion.control_margins.shape == (k,)
+    assert len(dynamics.residual_signals) == system.num_states - dynamics.dimension
+
+
+@pytest.mark.slow
+def test_a_state_on_the_reference_from_a_guess_off_it(problem):
+    dynamics = zero_dynamics(problem.system)
+    guess = problem.consistent(np.random.default_rng(3)) + 0.01
+    reference = reference_at(problem, 0.0)
+    state = dynamics.state(reference, guess)
+    law = TrackingLaw(problem.system, poles(-3.0), structure=dynamics.structure)
+    # Newton's method ends at the round-off of numbers of order 10.
+    np.testing.assert_allclose(problem.derivatives(state), 0.0, atol=1e-13)
+    np.testing.assert_allclose(law.error_coordinates(state, reference), 0.0, atol=1e-12)
+    # Steps below 1e-12 of the state end the search.
+    np.testing.assert_allclose(dynamics.state(reference, state), state, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4])
+def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
+    """Against L a'' = g sin a - s'' cos a, written and integrated in the angle."""
+    system = cart_pendulum(angle=angle)
+    reference = derivatives(lambda t: [0.3 * ca.cos(2.0 * t)], (2,))
+    times = np.linspace(0.0, 2.0, 21)
+    motion = zero_dynamics(system).motion(reference, times)
+    assert motion.ending is None
+
+    def angle_rate(t, a):
+        pushed = GRAVITY * np.sin(a[0]) - reference(t)[2] * np.cos(a[0])
+        return [a[1], pushed / 0.7]
+
+    expected = solve_ivp(
+        angle_rate, (0, 2), [angle, 0.0], "DOP853", times, rtol=1e-11, atol=1e-12
+    ).y
+    found = np.arctan2(motion.states[:, 1] - motion.states[:, 0], motion.states[:, 2])
+    # Errors of 1e-9 a step grow by exp(sqrt(g/L) 2 s) = 1800 before it falls over.
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected[0]), rtol=0, atol=2e-5)
+    np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+@pytest.mark.parametrize("kind", ["flexible", "damped", "motor"])
+def test_motions_of_robots_agree_with_multibody_plant(name, kind):
+    """x' by differences of the states, and lambda, against MultibodyPlant with the same control."""
+    robot = actuated(name, kind)
+    dynamics = ZeroDynamics(robot.structure.system, structure=robot.structure)
+    degrees = robot.structure.output_degrees
+    rest, _ = at_rest(name, kind, start_position(name), 20.0)
+
+    def function(t):
+        moved = [start + 0.03 * (1 - ca.cos(1.3 * t)) ** 3 for start in OFFSET[name]]
+        return [*moved, 20.0 + 3.0 * ca.sin(t)]
+
+    step = 1e-3
+    times = 1.0 + step * np.arange(-4, 5)
+    motion = dynamics.motion(derivatives(function, degrees), [0.0, *times], rest)
+    assert motion.ending is None
+    states = motion.states[1:]
+    weights = np.array([3, -32, 168, -672, 0, 672, -168, 32, -3]) / (840.0 * step)
+    slope = weights @ states
+    truth = rates(name, drive(name, kind), states[4], motion.controls[5])
+    size = np.maximum(1.0, np.abs(truth.state))
+    # Differences of order 8: round-off 1e-13/step, and the motion's own 1e-9/step where integrated.
+    np.testing.assert_allclose(slope / size, truth.state / size, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(motion.constraint_inputs[5], truth.force, rtol=1e-8)
+    np.testing.assert_allclose(truth.force, 20.0 + 3.0 * np.sin(1.0), rtol=1e-8)
+
+
+def test_a_motion_may_be_one_state():
+    motion = zero_dynamics(aircraft()).motion(lambda t: np.zeros(6), [2.0])
+    assert motion.ending is None
+    np.testing.assert_allclose(motion.states, np.zeros((1, 6)), atol=1e-15)
+
+
+def test_motions_take_parameters():
+    """The zero dynamics of the aircraft with another epsilon, against their own equation."""
+    times = np.linspace(0.0, 1.0, 6)
+    start = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+    motion = zero_dynamics(aircraft()).motion(lambda t: np.zeros(6), times, start, [0.7])
+    expected = solve_ivp(
+        lambda t, a: [a[1], np.sin(a[0]) / 0.7],
+        (0, 1),
+        start[[2, 5]],
+        "DOP853",
+        times,
+        rtol=1e-11,
+        atol=1e-12,
+    ).y
+    # 1e-8 a step.
+    np.testing.assert_allclose(motion.states[:, [2, 5]].T, expected, rtol=0, atol=1e-7)
+    u1, u2 = np.cos(expected[0]), np.sin(expected[0]) / 0.7
+    np.testing.assert_allclose(motion.controls, np.transpose([u1, u2]), rtol=0, atol=1e-7)
+
+
+def test_wrong_arguments_are_refused():
+    dynamics = zero_dynamics(free_arm())
+    still = np.array([1.2, 0, 0, 0.5, 0, 0])
+    for times in ([], [0.0, 0.0], [1.0, 0.0]):
+        with pytest.raises(ModelError, match="times must increase"):
+            dynamics.motion(lambda t: still, times)
+    with pytest.raises(ModelError, match="times must be finite"):
+        dynamics.motion(lambda t: still, [0.0, np.inf])
+    with pytest.raises(ModelError, match=r"reference must have size 6 .* \(2, 2\).*got 2"):
+        dynamics.motion(lambda t: still[:2], [0.0, 1.0])
+    with pytest.raises(ModelError, match=r"reference must be finite and of shape \(6,\)"):
+        dynamics.state(still[:2])
+    with pytest.raises(ModelError, match=r"state must be finite and of shape \(4,\)"):
+        dynamics.state(still, [0, 0, 0])
+    with pytest.raises(ModelError, match="guess must be finite real numbers or None"):
+        dynamics.state(still, [0, np.nan, 0, 0])
+    with pytest.raises(ModelError, match=r"parameters must be finite and of shape \(0,\)"):
+        dynamics.state(still, parameters=[1.0])
+    with pytest.raises(ModelError, match=r"outputs must be finite and of shape \(2,\)"):
+        dynamics.equilibrium([1, 2, 3])
+    with pytest.raises(ModelError, match="outputs must be finite real numbers"):
+        dynamics.equilibrium(["far", "away"])
+
+
+def test_outputs_out_of_reach_are_named():
+    dynamics = zero_dynamics(free_arm())
+    with pytest.raises(InconsistentStateError, match=r"free arm: the outputs x = 2, y = 0") as info:
+        dynamics.state([2.0, 0, 0, 0, 0, 0])
+    # The nearest the tip gets is 0.2 short.
+    assert np.max(np.abs(info.value.residual)) > 0.1
+    with pytest.raises(InconsistentStateError, match="have no value near the given state"):
+        zero_dynamics(double_integrator(l=lambda x: ca.sqrt(x[0]), nominal_state=[1, 0])).state(
+            [1.0, 0.0, 0.0], [-1.0, 0.0]
+        )
