@@ -4,20 +4,27 @@ import re
 import subprocess
 import sys
 from collections.abc import Collection
+from pathlib import Path
 
 import pytest
 from draw_house import draw
 from house import (
+    LONG,
     PAPER,
     ROOMS,
     ROOT,
     WITHOUT_DRAKE,
+    borrowed,
     circle,
+    crowded,
+    folder_imports,
+    folders,
     imported_modules,
     imports,
     may_import,
     modules,
     room,
+    too_long,
     violations,
 )
 
@@ -34,6 +41,40 @@ def test_no_imports_go_round() -> None:
     assert circle(imports()) == []
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"d"}}) == []
     assert circle({"a": {"b"}, "b": {"c", "d"}, "c": {"b"}}) == ["b", "c"]
+
+
+@pytest.mark.slow
+def test_no_imports_go_round_between_folders() -> None:
+    found = imports()
+    for folder in folders(found):
+        assert circle(folder_imports(found, folder)) == [], folder
+    around = {"a.b.x": {"a.c.y"}, "a.c.z": {"a.b.w"}, "a.d": {"a.b.x"}}
+    assert circle(around) == []
+    assert circle(folder_imports(around, "a")) == ["b", "c"]
+
+
+def test_no_folder_is_crowded() -> None:
+    found = modules()
+    assert crowded(found) == []
+    names = [f"drake_dae.more.file{i}" for i in range(13)]
+    assert len(crowded([*names[1:], "drake_dae.more.__init__"])) == 0
+    assert len(crowded(names)) == 1
+
+
+def test_long_files_have_a_reason() -> None:
+    lines = {name: path.read_text().count("\n") for name, path in modules().items()}
+    assert too_long(lines) == []
+    assert len(too_long({**lines, "drake_dae.long": 351})) == 1
+    assert len(too_long(dict.fromkeys(LONG, 350))) == len(LONG)
+
+
+def test_tests_borrow_from_support_alone(tmp_path: Path) -> None:
+    assert borrowed(ROOT / "tests") == []
+    for name in ("a/test_one.py", "b/test_two.py"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("from test_one import one\n")
+    (wrong,) = borrowed(tmp_path)
+    assert "test_two.py imports test_one" in wrong
 
 
 EXISTING = {

@@ -1,147 +1,33 @@
+"""Integrators before controls, asked for and found: degrees, motions and controls."""
+
 import casadi as ca
 import numpy as np
 import pytest
-from arms import touching
 from problems import (
     PROBLEMS,
     changed,
     double_integrator,
     early_control,
     hidden_normal_form,
-    integrated,
+)
+from problems.extensions import (
+    CRANE,
+    GRAVITY,
+    REGULAR,
+    crane,
+    evaluated,
+    extension_of,
+    unicycle,
+    vtol,
 )
 from runs import some
 
 from drake_dae.dae.extension.dynamic_extension import dynamic_extension
-from drake_dae.dae.extension.extension import Extension, extend
+from drake_dae.dae.extension.extension import extend
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import AssumptionError, ModelError
-from drake_dae.trace.functions import TracedFunction
-
-GRAVITY = 9.81
-
-
-def unicycle(**changes) -> DaeSystem:
-    """A wheel that rolls and turns: x' = v cos, y' = v sin, heading' = w (Isidori 1995, 5.4)."""
-    fields = {
-        "f": lambda x: [0, 0, 0],
-        "h": lambda x: [[ca.cos(x[2]), 0], [ca.sin(x[2]), 0], [0, 1]],
-        "l": lambda x: [x[0], x[1]],
-        "control_signals": [Signal("v", "m/s"), Signal("w", "rad/s")],
-        "name": "unicycle",
-    }
-    return DaeSystem.from_functions(["x", "y", "heading"], **{**fields, **changes})
-
-
-def wheels() -> DaeSystem:
-    """The same on two wheels of radius 0.5, 0.5 apart: v = (left + right)/4, w = right - left."""
-    return unicycle(
-        h=lambda x: [
-            [0.25 * ca.cos(x[2]), 0.25 * ca.cos(x[2])],
-            [0.25 * ca.sin(x[2]), 0.25 * ca.sin(x[2])],
-            [-1, 1],
-        ],
-        control_signals=["left", "right"],
-    )
-
-
-def vtol() -> DaeSystem:
-    """A planar aircraft without the coupling of roll to lift (Hauser, Sastry and Meyer 1992)."""
-    return DaeSystem.from_functions(
-        ["x", "y", "roll", "vx", "vy", "rate"],
-        f=lambda x: [x[3], x[4], x[5], 0, -GRAVITY, 0],
-        h=lambda x: [*[[0, 0]] * 3, [-ca.sin(x[2]), 0], [ca.cos(x[2]), 0], [0, 1]],
-        l=lambda x: [x[0], x[1]],
-        control_signals=[Signal("thrust", "m/s^2"), "torque"],
-        name="vtol",
-    )
-
-
-def quadrotor() -> DaeSystem:
-    """A quadrotor of four thrusts, with z = (position, yaw)."""
-
-    def thrust_axis(a: ca.SX) -> list[ca.SX]:
-        roll, pitch, yaw = a[0], a[1], a[2]
-        forward, side = ca.sin(pitch) * ca.cos(roll), ca.sin(roll)
-        return [
-            ca.cos(yaw) * forward + ca.sin(yaw) * side,
-            ca.sin(yaw) * forward - ca.cos(yaw) * side,
-            ca.cos(pitch) * ca.cos(roll),
-        ]
-
-    def f(x: ca.SX) -> list:
-        roll, pitch, (p, q, r) = x[3], x[4], ca.vertsplit(x[9:])
-        turn = ca.sin(roll) * q + ca.cos(roll) * r
-        angles = [p + ca.tan(pitch) * turn, ca.cos(roll) * q - ca.sin(roll) * r]
-        rates = [-0.6 * q * r, 0.5 * p * r, 0.1 * p * q]
-        return [*ca.vertsplit(x[6:9]), *angles, turn / ca.cos(pitch), 0, 0, -GRAVITY, *rates]
-
-    arms = [[0, 5, 0, -5], [-5, 0, 5, 0], [0.4, -0.4, 0.4, -0.4]]
-    return DaeSystem.from_functions(
-        ["x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "p", "q", "r"],
-        f=f,
-        h=lambda x: [*[[0] * 4] * 6, *[[axis] * 4 for axis in thrust_axis(x[3:6])], *arms],
-        l=lambda x: [x[0], x[1], x[2], x[5]],
-        control_signals=["front", "left", "back", "right"],
-        output_signals=["x", "y", "z", "yaw"],
-        name="quadrotor",
-    )
-
-
-CRANE = np.array([3.0, 0.5, 1.0])
-"""Masses of the trolley, of the winch and of the load, in kg."""
-
-
-def crane(**changes) -> DaeSystem:
-    """A load on a rope from a winch on a trolley, z = load (Fliess et al. 1995: it is flat).
-
-    k = ((X - s)^2 + Y^2 - l^2)/2 keeps the rope tight, v is its tension over its length.
-    """
-    fields = {
-        "f": lambda x: [*ca.vertsplit(x[4:]), 0, 0, 0, -GRAVITY],
-        "g": lambda x: [
-            *[0] * 4,
-            -(x[2] - x[0]) / CRANE[0],
-            -x[1] / CRANE[1],
-            (x[2] - x[0]) / CRANE[2],
-            x[3] / CRANE[2],
-        ],
-        "h": lambda x: [*[[0, 0]] * 4, [1 / CRANE[0], 0], [0, 1 / CRANE[1]], [0, 0], [0, 0]],
-        "k": lambda x: ((x[2] - x[0]) ** 2 + x[3] ** 2 - x[1] ** 2) / 2,
-        "l": lambda x: [x[2], x[3]],
-        "m": lambda x: [0, 0],
-        "control_signals": [Signal("trolley", "N"), Signal("winch", "N")],
-        "output_signals": ["X", "Y"],
-        "nominal_state": [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0],
-        "name": "crane",
-    }
-    names = ["s", "l", "X", "Y", "s'", "l'", "X'", "Y'"]
-    return DaeSystem.from_functions(names, **{**fields, **changes})
-
-
-def sleigh() -> DaeSystem:
-    """The knife edge of the problems, steered by where it is."""
-    system = PROBLEMS["knife_edge"]().system
-    return changed(system, l=system.state[:2], output_signals=("x", "y"))
-
-
-def evaluated(system: DaeSystem, state, **expressions: ca.SX) -> list[np.ndarray]:
-    """As matrices."""
-    function = TracedFunction(
-        "values", {"x": system.state, "p": system.parameter_symbol}, expressions
-    )
-    found = function(state, system.parameter_values)
-    return [
-        value.reshape(e.shape) if value.ndim == 1 else value
-        for value, e in zip(found, expressions.values(), strict=True)
-    ]
-
-
-# ---- integrators that are asked for
 
 
 def test_an_integrator_is_a_state_and_its_rate_the_control():
@@ -226,28 +112,6 @@ def test_no_integrators_change_nothing():
 def test_wrong_arguments_are_refused(integrators, nominal, message):
     with pytest.raises(ModelError, match=f"(unicycle|extend): .*{message}"):
         extend(unicycle(), integrators, nominal)
-
-
-# ---- integrators that are found
-
-REGULAR = {
-    "unicycle": (unicycle, {"v": 0.8}, {"v": 1}, (2, 2)),
-    "wheels": (wheels, {"left": 1.0, "right": 2.0}, {"left": 1}, (2, 2)),
-    "vtol": (vtol, {"thrust": GRAVITY}, {"thrust": 2}, (4, 4)),
-    "quadrotor": (
-        quadrotor,
-        dict.fromkeys(("front", "left", "back", "right"), GRAVITY / 4),
-        {"front": 2},
-        (4, 4, 4, 2),
-    ),
-    "crane": (crane, {"winch": -GRAVITY}, {"winch": 2}, (4, 4)),
-    "sleigh": (sleigh, {}, {"u0": 1}, (3, 3)),
-}
-
-
-def extension_of(name: str) -> Extension:
-    make, nominal, _, _ = REGULAR[name]
-    return dynamic_extension(make(), nominal_control=nominal)
 
 
 @pytest.mark.slow
@@ -434,258 +298,3 @@ def test_controls_that_act_together_with_the_force_need_none():
     extension = dynamic_extension(system)
     assert extension.integrators == {"u0": 1}
     assert extension.structure.output_degrees == (2, 0)
-
-
-# ---- closed loops
-
-
-def rope_force(x: np.ndarray, free: np.ndarray) -> float:
-    """v that keeps k'' of the crane at 0, where the free motion would not."""
-    gap, rate = x[2] - x[0], x[6] - x[4]
-    bend = rate**2 + x[7] ** 2 - x[5] ** 2
-    pull = gap * (free[6] - free[4]) + x[3] * free[7] - x[1] * free[5]
-    inverse = gap**2 * (1 / CRANE[0] + 1 / CRANE[2]) + x[3] ** 2 / CRANE[2] + x[1] ** 2 / CRANE[1]
-    return -(bend + pull) / inverse
-
-
-def original_loop(extension: Extension, law: TrackingLaw, start, reference, times) -> np.ndarray:
-    """Outputs of the original system under the law as a dynamic state feedback.
-
-    The original's states follow (1) with `original_control`; from the extended system come only
-    the integrators. By SciPy's DOP853 with tolerances of 1e-11.
-    """
-    original, extended = extension.original, extension.system
-    n = original.num_states
-    fields = ca.Function("fields", [original.state], [original.f, original.g, original.h])
-    output = ca.Function("output", [original.state], [original.l])
-    rows = slice(n, None)
-    integrators = ca.Function(
-        "integrators", [extended.state], [extended.f[rows], extended.h[rows, :]]
-    )
-
-    def rate(t: float, state: np.ndarray) -> np.ndarray:
-        w = law.control(state, reference(t))
-        f, g, h = (np.array(e) for e in fields(state[:n]))
-        moving = f[:, 0] + h @ extension.original_control(state, w)
-        if original.num_constraints:
-            moving = moving + g[:, 0] * rope_force(state, moving)
-        held, following = (np.array(e) for e in integrators(state))
-        return np.concatenate([moving, held[:, 0] + following @ w])
-
-    states = integrated(rate, start, times)
-    return np.array([np.array(output(state[:n]))[:, 0] for state in states])
-
-
-def wave(center: float, size: float, rate: float, degree: int, phase: float = 0.0):
-    """center + size sin(rate t + phase) and its derivatives."""
-
-    def at(t: float) -> list[float]:
-        values = [
-            size * rate**j * np.sin(rate * t + phase + j * np.pi / 2) for j in range(degree + 1)
-        ]
-        return [center + values[0], *values[1:]]
-
-    return at
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("make", "speed"), [(unicycle, {"v": 2.5}), (wheels, {"left": 10.0})])
-def test_a_figure_of_eight(make, speed):
-    """x = 2 sin t, y = sin 2t from beside it: the error is the closed form, over both lobes."""
-    extension = dynamic_extension(make(), nominal_control=speed)
-    law = TrackingLaw(extension.system, poles(-2.0), structure=extension.structure)
-    across, along = wave(0.0, 2.0, 1.0, 2), wave(0.0, 1.0, 2.0, 2)
-
-    def reference(t: float) -> np.ndarray:
-        return np.concatenate([across(t), along(t)])
-
-    start = np.array([0.2, -0.1, 0.6, *speed.values()])
-    times = np.linspace(0.0, 2 * np.pi, 30)
-    outputs = original_loop(extension, law, start, reference, times)
-    wanted = np.array([reference(t)[[0, 3]] for t in times])
-    predicted = law.predicted_error(times, start, reference(0.0))
-    np.testing.assert_allclose(predicted[0], [0.2, -0.1], rtol=1e-15)
-    # The integrator keeps 1e-11 a step of numbers of order 1.
-    np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_load_on_a_crane():
-    """The load moves on an ellipse with the predicted error, by trolley and winch."""
-    extension = extension_of("crane")
-    law = TrackingLaw(extension.system, poles(-3.0), structure=extension.structure)
-    across, up = wave(0.0, 0.3, 1.5, 4), wave(-1.0, 0.1, 1.5, 4, np.pi / 2)
-
-    def reference(t: float) -> np.ndarray:
-        return np.concatenate([across(t), up(t)])
-
-    start = extension.structure.manifold.project(extension.system.nominal_state)
-    times = np.linspace(0.0, 3.0, 10)
-    outputs = original_loop(extension, law, start, reference, times)
-    wanted = np.array([reference(t)[[0, 5]] for t in times])
-    predicted = law.predicted_error(times, start, reference(0.0))
-    assert np.abs(predicted[1:]).max() > 0.05
-    # The integrator keeps 1e-11 a step; the law of order 4 amplifies it.
-    np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-8)
-
-
-# ---- systems that no integrators help
-
-
-def violation(system: DaeSystem, **options) -> AssumptionError:
-    with pytest.raises(AssumptionError) as caught:
-        dynamic_extension(system, **options)
-    return caught.value
-
-
-def pair(outputs) -> DaeSystem:
-    """Two nonlinear double integrators."""
-    return DaeSystem.from_functions(
-        4,
-        f=lambda x: [x[1], ca.sin(x[0]), x[3], x[0] * x[1]],
-        h=lambda x: [[0, 0], [1, 0], [0, 0], [0, 1]],
-        l=outputs,
-        output_signals=["a", "b"],
-        name="pair",
-    )
-
-
-@pytest.mark.parametrize(
-    "outputs",
-    [
-        lambda x: [x[0], 2 * x[0] + 1],
-        lambda x: [x[0], ca.sin(x[0])],
-        lambda x: [x[0], x[1]],
-        lambda x: [x[1], x[0] + x[1]],
-        lambda x: [x[0], x[0] * x[1] + x[1]],
-    ],
-)
-def test_outputs_that_depend_on_each_other(outputs):
-    """One is a function of the other, of its derivative, or of both."""
-    error = violation(pair(outputs))
-    assert error.assumption == 5
-    assert "the outputs a, b and their derivatives depend on each other" in str(error)
-
-
-def test_outputs_that_depend_on_each_other_through_the_motion():
-    """b' = a + b, found when the chains meet."""
-    system = DaeSystem.from_functions(
-        5,
-        f=lambda x: [x[1], 0, x[0] + x[2], x[4], 0],
-        h=lambda x: [[0, 0], [1, 0], [0, 0], [0, 0], [0, 1]],
-        l=lambda x: [x[0], x[2]],
-    )
-    error = violation(system)
-    assert error.assumption == 5
-    assert "not right-invertible" in str(error)
-
-
-def test_outputs_that_depend_on_each_other_are_found_before_integrators_are_added():
-    """Beside states that are free, which could feed some rounds."""
-    system = DaeSystem.from_functions(
-        8,
-        f=lambda x: [x[1], ca.sin(x[0]), x[3], x[0], x[5], x[6], x[7], -x[4]],
-        h=lambda x: [[0, 0], [1, 0], [0, 0], [0, 1], *[[0, 1]] * 4],
-        l=lambda x: [x[0], ca.exp(x[0])],
-    )
-    assert "not right-invertible" in str(violation(system, max_integrators=0))
-
-
-def test_an_output_that_repeats_the_constraint():
-    def rope(x: ca.SX) -> ca.SX:
-        return (x[2] - x[0]) ** 2 + x[3] ** 2 - x[1] ** 2
-
-    error = violation(crane(l=lambda x: [x[2], x[2] + rope(x)]))
-    assert error.assumption == 5
-    assert "the outputs X, Y and their derivatives depend on each other or on the" in str(error)
-    error = violation(crane(l=lambda x: [x[2], rope(x)]))
-    assert error.assumption == 5
-    assert "the control never acts on output 'Y'" in str(error)
-
-
-def test_isolated_singularities_are_not_mended():
-    """Ball and beam (Hauser, Sastry and Kokotovic 1992): 2 x1 x4 u in x1''' vanishes at rest."""
-    system = DaeSystem.from_functions(
-        ["ball", "ball'", "beam", "beam'"],
-        f=lambda x: [x[1], 0.7143 * (x[0] * x[3] ** 2 - GRAVITY * ca.sin(x[2])), x[3], 0],
-        h=lambda x: [0, 0, 0, 1],
-        l=lambda x: x[0],
-        name="ball and beam",
-    )
-    error = violation(system)
-    assert error.assumption == 4
-    assert "singular at isolated states, which more integrators do not mend" in str(error)
-    np.testing.assert_array_equal(error.state, np.zeros(4))
-    assert dynamic_extension(changed(system, nominal_state=[1, 0, 0, 1])).integrators == {}
-
-
-@pytest.mark.parametrize(("make", "count"), [(unicycle, "1 before v"), (vtol, "2 before thrust")])
-def test_at_rest_another_nominal_control_is_asked_for(make, count):
-    error = violation(make())
-    name = count.split()[-1]
-    assert f'give another nominal_control, for example nominal_control={{"{name}": 1.0}}; ' in str(
-        error
-    )
-    assert str(error).endswith(f"integrators: {count}")
-    assert error.state[make().num_states] == 0.0
-
-
-def test_more_integrators_than_allowed():
-    hovering = {"nominal_control": {"thrust": GRAVITY}}
-    assert dynamic_extension(vtol(), max_integrators=2, **hovering).integrators == {"thrust": 2}
-    error = violation(vtol(), max_integrators=1, **hovering)
-    assert error.assumption == 5
-    assert "more than max_integrators = 1 are needed" in str(error)
-    assert "for a regular B(x) of (16), so far 2 before thrust" in str(error)
-
-
-def test_a_constraint_that_binds_the_control_forever():
-    """No constraint input ever acts on x0' = u, whatever stands before u."""
-    system = DaeSystem.from_functions(
-        2,
-        f=lambda x: [0, 0],
-        g=lambda x: [0, 1],
-        h=lambda x: [1, 0],
-        k=lambda x: x[0],
-        l=lambda x: x[1],
-        m=lambda x: 0,
-    )
-    error = violation(system)
-    assert error.assumption == 2
-    assert "no constraint input ever acts on constraint 'y0'" in str(error)
-
-
-def test_a_rank_that_changes_from_state_to_state():
-    """B = [[1, 0, 0], [1, 0, 0], [1, x3^60, 0]] has rank 2 or, to the eye, 1 around x3 = 1."""
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x: [0, 0, 0, 0],
-        h=lambda x: [[1, 0, 0], [1, 0, 0], [1, x[3] ** 60, 0], [0, 0, 1]],
-        l=lambda x: x[:3],
-        nominal_state=[0, 0, 0, 1],
-    )
-    error = violation(system, spread=0.1)
-    assert "the rank of B(x) of (16) falls from 2 to 1" in str(error)
-    assert 0.5 < error.state[3] < 1.0
-
-
-def test_a_spread_of_a_wrong_shape_is_refused():
-    with pytest.raises(ModelError, match=r"spread must be a number or have shape \(3,\)"):
-        dynamic_extension(unicycle(), spread=[0.1, 0.2])
-
-
-def test_a_robot_keeps_its_mass_matrix():
-    """Torques that are set by their rates: force and height of the arm have one degree more.
-
-    And B(x) is the same: what the torque did to z^(mu), its rate does to z^(mu + 1).
-    """
-    arm = touching("two_link").dae
-    names = [signal.name for signal in arm.control_signals]
-    plain, slow = find_structure(arm), find_structure(extend(arm, names))
-    assert slow.constraint_degrees == plain.constraint_degrees
-    assert slow.output_degrees == tuple(degree + 1 for degree in plain.output_degrees)
-    for state in slow.states:
-        one = evaluated(arm, state[:4], b=plain.control_matrix)[0]
-        two = evaluated(slow.system, state, b=slow.control_matrix)[0]
-        # A hundred operations on numbers of order 1.
-        np.testing.assert_allclose(one, two, rtol=1e-11, atol=1e-12)

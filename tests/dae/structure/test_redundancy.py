@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from arms import arm
 from problems import redundant, system_of
-from tables import TABLE, plate
+from problems.tables import TABLE, plate
 
 from drake_dae import DaePlant, drop_constraints, find_structure
 from drake_dae.dae.states.samples import draw

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems import system_of
+from problems.tables import TABLE, plate
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -17,7 +18,6 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UnitInertia,
 )
-from tables import TABLE, plate
 
 from drake_dae import (
     CoincidentPoints,

@@ -5,8 +5,7 @@ import re
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from zero_systems import (
+from problems.zero_systems import (
     GRAVITY,
     MINIMUM_PHASE,
     Array,
@@ -18,6 +17,7 @@ from zero_systems import (
     spring_masses,
     zero_dynamics,
 )
+from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pursuit as module
 from drake_dae.dae.system.system import DaeSystem

@@ -10,7 +10,7 @@ from actuated import OFFSET, actuated, at_rest, start_position
 from problems import (
     PROBLEMS,
 )
-from zero_systems import (
+from problems.zero_systems import (
     GRAVITY,
     HOLES,
     MINIMUM_PHASE,

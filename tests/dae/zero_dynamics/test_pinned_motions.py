@@ -11,8 +11,7 @@ from problems import (
     reference_at,
     wanted_outputs,
 )
-from scipy.integrate import solve_ivp
-from zero_systems import (
+from problems.zero_systems import (
     GRAVITY,
     Array,
     aircraft,
@@ -21,6 +20,7 @@ from zero_systems import (
     free_arm,
     zero_dynamics,
 )
+from scipy.integrate import solve_ivp
 
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.dae.tracking.tracking import TrackingLaw

@@ -9,7 +9,7 @@ from problems import (
     PROBLEMS,
     in_other_units,
 )
-from zero_systems import (
+from problems.zero_systems import (
     GRAVITY,
     NON_MINIMUM_PHASE,
     Array,

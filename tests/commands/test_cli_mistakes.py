@@ -1,0 +1,226 @@
+"""Mistakes, folders that cannot be written to, runs that fail: one line, and what fits is kept."""
+
+import gc
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import BARE, QUICK, SHORT, command, error_line
+from matplotlib.figure import Figure
+from recordings import animation
+
+import drake_dae
+from drake_dae import Record
+from drake_dae.cli import main
+from drake_dae.commands import simulate
+from drake_dae.pictures import view
+from drake_dae.pictures.plots import PLOTS
+from drake_dae.scenario.shipped import find_scenario
+
+
+@pytest.mark.slow
+def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path, capsys):
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, *QUICK]) == 0
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main([*arguments, *BARE]) == 0
+    # Nothing of the first run stands beside the summary of the second.
+    left = ["notes.txt", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    assert "notes.txt" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["scenario.yaml", "controls.png"])
+def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *BARE]) == 1
+    assert re.search(rf"error: .*{name}, not from an earlier run", error_line(capsys))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_a_scenario_is_not_overwritten_by_its_own_run(tmp_path, capsys):
+    path = tmp_path / "scenario.yaml"
+    text = find_scenario("two_link_wall").read_text()
+    path.write_text(f"# My wall.\n{text}")
+    assert main(["simulate", str(path), "--out", str(tmp_path), *SHORT, *BARE]) == 1
+    assert "not from an earlier run" in error_line(capsys)
+    assert path.read_text() == f"# My wall.\n{text}"
+
+
+def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        assert main(["simulate", "two_link_wall", "--out", str(folder), *SHORT, *BARE]) == 1
+        assert re.search(
+            rf"error: ('{folder}' is a file|cannot write to '{folder}': )", error_line(capsys)
+        )
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_folder(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *BARE]) == 1
+    assert "Permission denied" in error_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["two_link_wal"], "error: no scenario file 'two_link_wal'; did you mean 'two_link_wall'?"),
+        (["two_link_wall", "--set", "duration=-1"], "error: duration: .* positive, got -1"),
+        (["two_link_wall", "--set", "duration"], "error: --set duration: expected key=value"),
+        (
+            ["two_link_wall", "--set", "outputs.0.frame=tol"],
+            "error: outputs.0: .*did you mean 'tool'",
+        ),
+        (["two_link_wall", "--set", "robot.file=x.urdf"], "error: robot.file: no file '.*x.urdf'"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(arguments, line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", *arguments]) == 1
+    assert re.match(line, error_line(capsys))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_mistake_in_a_scenario_has_its_line(capsys):
+    assert main(["simulate", "two_link_wall", "--set", "duration=0", "--set", "foo=1"]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: duration: ")
+    assert second.startswith("error: scenario: has no key 'foo'; ")
+
+
+@pytest.mark.slow
+def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, capsys):
+    """The arm is stretched out at z = 1.6 m, which the reference passes after 0.13 s."""
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
+    assert main([*arguments, "--set", move, "--set", "write.plots=false"]) == 1
+    assert re.match(r"error: .* at t = 0\.1\d+ s, state \[", error_line(capsys))
+    record = Record.load(tmp_path / "record.npz")
+    assert 0.1 < record.time[-1] < 0.2
+    assert 1.0 < record["controlled_output"][-1, 0] < 1.6
+    text = (tmp_path / "summary.txt").read_text()
+    assert re.search(r"failed +the record ends at 0\.1\d+ s: ", text)
+    assert "simulated" not in text
+    assert animation((tmp_path / "animation.html").read_text())
+
+
+def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
+    def fill(self, path):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Record, "save", fill)
+    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *QUICK]) == 1
+    reason = "No space left on device; record.part has the record up to 0.2 s"
+    assert error_line(capsys) == f"error: {tmp_path}/record.npz: {reason}"
+    # The record is there in its other form, and nothing unfinished stays.
+    left = ["record.part", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    assert Record.load(tmp_path / "record.part").time[-1] == 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", [0, 5000])
+def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monkeypatch, capsys):
+    """Room for so many bytes, and nowhere a file that is cut off."""
+
+    def fill(*_arguments, **_options):
+        raise OSError(28, "No space left on device")
+
+    def write(file, data, at):
+        if at >= room:
+            fill()
+        return pwrite(file, data[: room - at], at)
+
+    pwrite = os.pwrite
+    monkeypatch.setattr(os, "pwrite", write)
+    monkeypatch.setattr(np, "savez_compressed", fill)
+    monkeypatch.setattr(Figure, "savefig", fill)
+    monkeypatch.setattr(simulate, "animate", fill)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
+    assert main(arguments) == 1
+    out, err = capsys.readouterr()
+    assert "simulated            5 s in" in out
+    lines = err.splitlines()
+    reason = "No space left on device"
+    kept = "; record.part has the record up to " if room else ""
+    assert lines[0].startswith(f"error: {tmp_path}/record.npz: {reason}{kept}")
+    rest = [f"error: {tmp_path}/{name}: {reason}" for name in (PLOTS[0], "animation.html")]
+    assert lines[1:] == rest
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left >= {"scenario.yaml", "summary.txt"}
+    if room:
+        record = Record.load(tmp_path / "record.part")
+        assert 0.1 < record.time[-1] < 5.0
+        assert lines[0].endswith(f" {record.time[-1]:.6g} s")
+
+
+@pytest.mark.slow
+def test_the_reason_of_a_failure_is_printed_too_when_files_fail(tmp_path, monkeypatch, capsys):
+    def fill(self, path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Record, "save", fill)
+    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
+    assert main([*arguments, "--set", move, *QUICK]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert "record.npz: No space left on device; record.part has the record up to 0.1" in first
+    assert "cannot go on at t = 0.1" in second
+
+
+@pytest.mark.slow
+def test_a_terminal_without_letters_of_a_name(tmp_path):
+    out = tmp_path / "größe \N{SNOWMAN}"
+    process = command(
+        *("simulate", "two_link_wall", "--out", out, *SHORT, *BARE),
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+    )
+    printed, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert r"gr\xf6\xdfe \u2603/: scenario.yaml, summary.txt" in printed
+    assert (out / "summary.txt").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux which ports listen")
+def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monkeypatch, capsys):
+    def listening():
+        """Inodes of the sockets of this process that listen."""
+        gc.collect()  # The systems of an earlier animation hold its server.
+        own = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.exists()}
+        rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
+        return {row[9] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
+
+    def watched(*arguments, **options):
+        seen.append(listening())
+        result = drake_dae.simulate(*arguments, **options)
+        seen.append(listening())
+        return result
+
+    seen = [listening()]
+    monkeypatch.setattr(simulate, "simulate", watched)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, "--set", "write.plots=false"]) == 0
+    assert (tmp_path / "animation.html").exists()
+    assert seen[1:] == [seen[0], seen[0]]
+    assert main([*arguments, *QUICK, "--meshcat"]) == 0
+    assert len(seen[3] - seen[0]) == 1
+    capsys.readouterr()
+
+
+def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch, capsys):
+    def full(parameters):
+        raise RuntimeError("Meshcat failed to open a websocket port.")
+
+    monkeypatch.setattr(view, "Meshcat", full)
+    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
+    assert main([*arguments, "--set", "write.plots=false"]) == 1
+    reason = "no port for Meshcat: Meshcat failed to open a websocket port."
+    assert error_line(capsys) == f"error: {tmp_path}/animation.html: {reason}"
+    left = ["record.npz", "scenario.yaml", "summary.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == left

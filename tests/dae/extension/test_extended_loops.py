@@ -1,0 +1,109 @@
+"""Closed loops of extended systems against the original ones."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import (
+    integrated,
+)
+from problems.extensions import (
+    CRANE,
+    extension_of,
+    unicycle,
+    wheels,
+)
+
+from drake_dae.dae.extension.dynamic_extension import dynamic_extension
+from drake_dae.dae.extension.extension import Extension
+from drake_dae.dae.tracking.gains import poles
+from drake_dae.dae.tracking.tracking import TrackingLaw
+
+
+def rope_force(x: np.ndarray, free: np.ndarray) -> float:
+    """v that keeps k'' of the crane at 0, where the free motion would not."""
+    gap, rate = x[2] - x[0], x[6] - x[4]
+    bend = rate**2 + x[7] ** 2 - x[5] ** 2
+    pull = gap * (free[6] - free[4]) + x[3] * free[7] - x[1] * free[5]
+    inverse = gap**2 * (1 / CRANE[0] + 1 / CRANE[2]) + x[3] ** 2 / CRANE[2] + x[1] ** 2 / CRANE[1]
+    return -(bend + pull) / inverse
+
+
+def original_loop(extension: Extension, law: TrackingLaw, start, reference, times) -> np.ndarray:
+    """Outputs of the original system under the law as a dynamic state feedback.
+
+    The original's states follow (1) with `original_control`; from the extended system come only
+    the integrators. By SciPy's DOP853 with tolerances of 1e-11.
+    """
+    original, extended = extension.original, extension.system
+    n = original.num_states
+    fields = ca.Function("fields", [original.state], [original.f, original.g, original.h])
+    output = ca.Function("output", [original.state], [original.l])
+    rows = slice(n, None)
+    integrators = ca.Function(
+        "integrators", [extended.state], [extended.f[rows], extended.h[rows, :]]
+    )
+
+    def rate(t: float, state: np.ndarray) -> np.ndarray:
+        w = law.control(state, reference(t))
+        f, g, h = (np.array(e) for e in fields(state[:n]))
+        moving = f[:, 0] + h @ extension.original_control(state, w)
+        if original.num_constraints:
+            moving = moving + g[:, 0] * rope_force(state, moving)
+        held, following = (np.array(e) for e in integrators(state))
+        return np.concatenate([moving, held[:, 0] + following @ w])
+
+    states = integrated(rate, start, times)
+    return np.array([np.array(output(state[:n]))[:, 0] for state in states])
+
+
+def wave(center: float, size: float, rate: float, degree: int, phase: float = 0.0):
+    """center + size sin(rate t + phase) and its derivatives."""
+
+    def at(t: float) -> list[float]:
+        values = [
+            size * rate**j * np.sin(rate * t + phase + j * np.pi / 2) for j in range(degree + 1)
+        ]
+        return [center + values[0], *values[1:]]
+
+    return at
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "speed"), [(unicycle, {"v": 2.5}), (wheels, {"left": 10.0})])
+def test_a_figure_of_eight(make, speed):
+    """x = 2 sin t, y = sin 2t from beside it: the error is the closed form, over both lobes."""
+    extension = dynamic_extension(make(), nominal_control=speed)
+    law = TrackingLaw(extension.system, poles(-2.0), structure=extension.structure)
+    across, along = wave(0.0, 2.0, 1.0, 2), wave(0.0, 1.0, 2.0, 2)
+
+    def reference(t: float) -> np.ndarray:
+        return np.concatenate([across(t), along(t)])
+
+    start = np.array([0.2, -0.1, 0.6, *speed.values()])
+    times = np.linspace(0.0, 2 * np.pi, 30)
+    outputs = original_loop(extension, law, start, reference, times)
+    wanted = np.array([reference(t)[[0, 3]] for t in times])
+    predicted = law.predicted_error(times, start, reference(0.0))
+    np.testing.assert_allclose(predicted[0], [0.2, -0.1], rtol=1e-15)
+    # The integrator keeps 1e-11 a step of numbers of order 1.
+    np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_load_on_a_crane():
+    """The load moves on an ellipse with the predicted error, by trolley and winch."""
+    extension = extension_of("crane")
+    law = TrackingLaw(extension.system, poles(-3.0), structure=extension.structure)
+    across, up = wave(0.0, 0.3, 1.5, 4), wave(-1.0, 0.1, 1.5, 4, np.pi / 2)
+
+    def reference(t: float) -> np.ndarray:
+        return np.concatenate([across(t), up(t)])
+
+    start = extension.structure.manifold.project(extension.system.nominal_state)
+    times = np.linspace(0.0, 3.0, 10)
+    outputs = original_loop(extension, law, start, reference, times)
+    wanted = np.array([reference(t)[[0, 5]] for t in times])
+    predicted = law.predicted_error(times, start, reference(0.0))
+    assert np.abs(predicted[1:]).max() > 0.05
+    # The integrator keeps 1e-11 a step; the law of order 4 amplifies it.
+    np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-8)

@@ -1,0 +1,213 @@
+"""States that decide about a structure: off the domain, singular, or of round-off."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems import (
+    changed,
+    double_integrator,
+    redundant,
+    system_of,
+)
+from problems.found import degrees, violation
+
+from drake_dae.analysis.analyze import analyze
+from drake_dae.dae.structure.constrained import find_constraint_structure
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.functions import TracedFunction
+
+
+@pytest.mark.parametrize("k", [lambda x: x[1] ** 2 + 1, lambda x: ca.exp(x[1]) + 0.5])
+def test_a_constraint_that_cannot_be_met(k):
+    with pytest.raises(InconsistentStateError, match="test: no consistent state found near"):
+        find_structure(
+            system_of(
+                2,
+                f=lambda x: [0, 0],
+                g=lambda x: [0, 1],
+                h=lambda x: [1, 0],
+                k=k,
+                l=lambda x: x[0],
+                m=lambda x: 0,
+            )
+        )
+
+
+def test_constraints_that_contradict_each_other():
+    with pytest.raises(InconsistentStateError, match="constraints contradict each other"):
+        find_structure(redundant(lambda x: [x[0] - 1, x[0] - 2]))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"f": lambda x: [ca.sqrt(x[0] - 1), 0]}, "f of .* not finite"),
+        ({"h": lambda x: [0, 1 / x[0]]}, "h of .* not finite"),
+        ({"f": lambda x: [x[1], ca.log(x[0])], "l": lambda x: 1 / x[1]}, "f, l of .* not finite"),
+        # Finite, but with an infinite derivative.
+        ({"l": lambda x: ca.sqrt(x[0])}, "is not finite at the consistent state"),
+    ],
+)
+def test_functions_that_are_not_finite_at_the_nominal_state(fields, message):
+    with pytest.raises(ModelError, match=message):
+        find_structure(double_integrator(**fields))
+
+
+def test_a_constraint_that_is_not_finite_at_the_nominal_state():
+    with pytest.raises(InconsistentStateError, match="y0 is not finite at the given state"):
+        find_structure(redundant(lambda x: [ca.sqrt(x[0] - 1) - 1, x[2]]), spread=0.0)
+
+
+def test_samples_outside_the_domain_are_left_out():
+    """A tank x' = u - sqrt(x) near empty: about a third of the states drawn are below zero."""
+    tank = system_of(1, f=lambda x: -ca.sqrt(x), h=lambda x: 1, l=lambda x: x, nominal_state=[0.05])
+    structure = find_structure(tank, spread=0.1)
+    assert structure.output_degrees == (1,)
+    assert 1 < len(structure.states) < 13
+    assert structure.states.min() > 0.0
+
+
+def test_branches_of_the_manifold_are_no_singularity():
+    """x0^2 = 1 from around 0 ends at both 1 and -1, where A has opposite signs, with no way."""
+    structure = find_structure(
+        system_of(
+            2,
+            f=lambda x: [0, 0],
+            g=lambda x: [1, 0],
+            h=lambda x: [0, 1],
+            k=lambda x: x[0] ** 2 - 1,
+            l=lambda x: x[1],
+            m=lambda x: 0,
+        )
+    )
+    assert {-1.0, 1.0} == set(structure.states[:, 0])
+    assert structure.constraint_degrees == (1,)
+
+
+def test_infinite_matrices_are_no_singularity():
+    """B = 1/(x0 - 0.02) changes its sign through infinity."""
+    with pytest.raises(ModelError, match="not finite"):
+        find_structure(system_of(1, f=lambda x: 0, h=lambda x: 1 / x, l=lambda x: x))
+    structure = find_structure(
+        system_of(1, f=lambda x: 0, h=lambda x: 1 / (x - 0.02), l=lambda x: x)
+    )
+    assert structure.output_degrees == (1,)
+
+
+def test_a_law_needs_as_many_outputs_as_controls():
+    with pytest.raises(ModelError, match="no control input, so there is nothing to steer"):
+        find_structure(system_of(1, f=lambda x: 0))
+    for outputs, l in ((0, None), (2, lambda x: x[:2])):  # noqa: E741
+        system = system_of(3, f=lambda x: 0 * x, h=lambda x: [1, 0, 0], l=l)
+        with pytest.raises(ModelError, match=f"{outputs} controlled outputs and 1 controls; the"):
+            find_structure(system)
+
+
+def test_constraints_alone_decide_how_a_system_moves():
+    """The same degrees, A(x) and rate as with outputs; B(x) may be singular, or not square."""
+    x = ca.SX.sym("x", 4)
+    pendulum = {
+        "state": x,
+        "f": ca.vertcat(x[2], x[3], 0, -9.81),
+        "g": ca.vertcat(0, 0, x[0], x[1]),
+        "k": (ca.sumsqr(x[:2]) - 1) / 2,
+        "nominal_state": [1.0, 0.0, 0.0, 0.0],
+    }
+    h = ca.vertcat(0, 0, -x[1], x[0])
+    whole = find_structure(DaeSystem(**pendulum, h=h, l=x[0] * x[3] - x[1] * x[2], m=[0]))
+    others = {
+        "nothing": {"h": ca.SX(4, 0), "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
+        "control alone": {"h": h, "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
+        "the constraint as an output": {"h": h, "l": ca.sumsqr(x[:2]), "m": [0]},
+        "two outputs": {"h": h, "l": x[:2], "m": [[0], [1]]},
+    }
+    state = whole.manifold.project([0.6, 0.8, 0.4, -0.3])
+    for name, fields in others.items():
+        found = find_constraint_structure(DaeSystem(**pendulum, **fields))
+        assert (found.constraint_degrees, found.index) == ((2,), 3), name
+        elimination = found.elimination
+        values = found.system.trace("values", {"f": elimination.f_star, "v": elimination.alpha})
+        expected = whole.system.trace(
+            "values", {"f": whole.elimination.f_star, "v": whole.elimination.alpha}
+        )
+        for one, other in zip(values(state, []), expected(state, []), strict=True):
+            assert_allclose(one, other, atol=1e-14)  # The same operations.
+    analysis = analyze(DaeSystem(**pendulum, **others["nothing"]))
+    assert [str(a.finding) for a in analysis.assumptions] == ["satisfied"] * 3 + [
+        "not examined"
+    ] * 2
+    assert (
+        analysis.assumptions[3].reason == "there is no control input, so there is nothing to steer"
+    )
+    assert analysis.constraint_structure.constraint_degrees == (2,)
+    assert not analysis.problems
+
+
+def test_parameters_take_part_with_their_defaults():
+    """The same expressions with other numbers: where the gain is 0 the control never acts."""
+    gain = Parameter("gain", 2.0)
+    fields = {
+        "h": lambda x: ca.vertcat(0, gain.symbol),
+        "parameters": None,
+    }
+    x = ca.SX.sym("x", 2)
+    for value, degree in ((2.0, 2), (0.0, None)):
+        system = DaeSystem(
+            state=x,
+            f=ca.vertcat(x[1], 0),
+            g=[],
+            h=fields["h"](x),
+            k=[],
+            l=x[0],
+            m=[],
+            parameters=(Parameter("gain", value, symbol=gain.symbol),),
+        )
+        if degree:
+            assert degrees(system) == ((), (degree,))
+        else:
+            assert violation(system).assumption == 5
+
+
+@pytest.mark.parametrize(
+    "mass", [[[2.0, 1.0], [0.0, 3.0]], [[2.0, 0.0], [0.0, -3.0]], [[1.0, 1.0], [1.0, 1.0]]]
+)
+def test_mass_matrices_must_be_symmetric_and_positive_definite(mass):
+    with pytest.raises(ModelError, match="mass_matrix is not symmetric and positive"):
+        find_structure(changed(double_integrator(), mass_matrix=ca.SX(np.array(mass))))
+
+
+def test_a_column_of_b_that_is_only_round_off_is_zero():
+    """As 1e-17 in place of 0 is, where a table of sines was typed in."""
+    system = system_of(
+        3,
+        f=lambda x: [0, 0, 0],
+        h=lambda x: [[ca.cos(x[2]), 1e-17], [ca.sin(x[2]), 2e-17], [0, 1]],
+        l=lambda x: [x[0], x[1]],
+        nominal_state=[0.0, 0.0, 0.3],
+    )
+    error = violation(system)
+    assert error.assumption == 5
+    assert "dynamic_extension" in str(error)
+
+
+def test_b_keeps_what_is_zero_at_the_default_parameters_alone():
+    coupling = Parameter("c", 0.0)
+    x = ca.SX.sym("x", 2)
+    system = DaeSystem(
+        state=x,
+        f=-x,
+        g=[],
+        h=[[1, coupling.symbol], [0, 1]],
+        k=[],
+        l=[x[0], x[1]],
+        m=[],
+        parameters=(coupling,),
+    )
+    function = TracedFunction(
+        "B", {"x": x, "c": coupling.symbol}, {"B": find_structure(system).control_matrix}
+    )
+    np.testing.assert_array_equal(function([0.1, 0.2], [0.5])[0], [[1.0, 0.5], [0.0, 1.0]])

@@ -1,0 +1,411 @@
+"""Which assumption of the paper a system violates, and where."""
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import (
+    PROBLEMS,
+    changed,
+    double_integrator,
+    early_control,
+    hidden_normal_form,
+    redundant,
+    system_of,
+)
+from problems.found import degrees, untidy_one, violation
+
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.structure import relative_degrees
+from drake_dae.dae.structure.structure import examine_structure, find_structure
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import AssumptionError
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.lie import lie_derivative
+
+
+def test_1_a_degree_that_is_not_defined_at_the_nominal_state():
+    error = violation(
+        system_of(
+            3,
+            f=lambda x: [0, 0, 0],
+            g=lambda x: [0, x[0], 0],
+            h=lambda x: [1, 0, 0],
+            k=lambda x: x[1] - 1,
+            l=lambda x: x[0],
+            m=lambda x: 0,
+        )
+    )
+    assert error.assumption == 1
+    assert "degree of constraint 'y0' is not defined at x = [0., 1., 0.]" in str(error)
+    np.testing.assert_array_equal(error.state, [0.0, 1.0, 0.0])
+
+
+def test_1_a_gradient_that_vanishes_on_the_constraint():
+    error = violation(
+        system_of(
+            2,
+            f=lambda x: [0, 0],
+            g=lambda x: [0, 1],
+            h=lambda x: [1, 0],
+            k=lambda x: x[1] ** 2,
+            l=lambda x: x[0],
+            m=lambda x: 0,
+        )
+    )
+    assert error.assumption == 1
+    assert "write the constraint so that its gradient does not vanish" in str(error)
+
+
+def test_1_a_degree_that_is_lost_between_the_sampled_states():
+    """g = x0 - 0.03 vanishes beside the nominal state: its sign changes on the way."""
+    error = violation(
+        system_of(
+            3,
+            f=lambda x: [0, 0, 0],
+            g=lambda x: [0, x[0] - 0.03, 0],
+            h=lambda x: [1, 0, 0],
+            k=lambda x: x[1] - 1,
+            l=lambda x: x[0],
+            m=lambda x: 0,
+        ),
+        spread=0.1,
+    )
+    assert error.assumption == 1
+    assert "constraint 'y0'" in str(error)
+    # Bisection ends at neighbouring numbers.
+    assert error.state[0] == pytest.approx(0.03, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "k",
+    [
+        lambda x: [x[0], x[0]],
+        lambda x: [x[0] - 1, 2 * x[0] - 2],
+        lambda x: [x[0] - 1, (x[0] - 1) * (2 + ca.sin(x[2]))],
+        lambda x: [ca.sin(x[0]) - 0.1, 0.99 - ca.cos(x[0]) ** 2],
+        lambda x: [x[0] - 1, (x[0] - 1) * untidy_one(x[2])],
+        lambda x: [x[0] - 1, (1 + 1e-9) * (x[0] - 1) + 1e-10 * (x[0] - 1) * x[2]],
+    ],
+)
+def test_2_redundant_constraints(k):
+    """Exactly, by a factor, on N* alone, by an identity, and but for round-off."""
+    error = violation(redundant(k))
+    assert error.assumption == 2
+    assert "A(x) loses rank at x = " in str(error)
+    assert "The constraints are redundant" in str(error)
+
+
+def test_2_forces_that_do_not_act_independently():
+    error = violation(
+        redundant(
+            lambda x: [x[0], x[2]],
+            g=lambda x: [[0, 0], [1, 2], [0, 0], [1, 2]],
+            h=lambda x: [0, 1, 0, 0],
+        )
+    )
+    assert error.assumption == 2
+
+
+def test_2_a_rank_that_is_lost_between_the_sampled_states():
+    """A = [[1, 1], [1, 1 + x4 - 0.02]]: no row vanishes where it is singular."""
+    error = violation(
+        system_of(
+            5,
+            f=lambda x: [x[1], 0, x[3], 0, 0],
+            g=lambda x: [[0, 0], [1, 1], [0, 0], [1, 1 + x[4] - 0.02], [0, 0]],
+            h=lambda x: [0, 0, 0, 0, 1],
+            k=lambda x: [x[0], x[2]],
+            l=lambda x: x[4],
+            m=lambda x: [[0, 0]],
+        )
+    )
+    assert error.assumption == 2
+    assert error.state[4] == pytest.approx(0.02, abs=1e-6)
+
+
+def test_2_more_constraints_than_states():
+    error = violation(
+        system_of(
+            1,
+            f=lambda x: 0,
+            g=lambda x: [[1, 1]],
+            h=lambda x: 1,
+            k=lambda x: [x[0], x[0] + 1],
+            l=lambda x: x[0],
+            m=lambda x: [[0, 0]],
+        )
+    )
+    assert error.assumption == 2
+    assert "m = 2 constraints are more than the states" in str(error)
+
+
+@pytest.mark.parametrize(
+    "k",
+    [
+        lambda x: x[2],  # A state that moves by itself,
+        lambda x: ca.sin(x[2]) + x[3] ** 2,  # two of them,
+        lambda x: x[0] ** 2 - x[0] * x[0] * untidy_one(x[2]) + x[2],  # or by a sum that cancels.
+        lambda x: x[4] - 0.1,  # A state that does not move.
+    ],
+)
+def test_2_no_force_keeps_the_constraint(k):
+    error = violation(
+        system_of(
+            5,
+            f=lambda x: [x[1], 0, x[3], -x[2], 0],
+            g=lambda x: [0, 1, 0, 0, 0],
+            h=lambda x: [0, 1, 0, 0, 0],
+            k=k,
+            l=lambda x: x[0],
+            m=lambda x: 0,
+        )
+    )
+    assert error.assumption == 2
+    assert "no constraint input ever acts on constraint 'y0'" in str(error)
+
+
+def test_3_a_control_that_enters_before_the_force_does():
+    error = violation(early_control())
+    assert error.assumption == 3
+    assert "the control acts on derivative 1 of constraint 'y0', before any" in str(error)
+    # At the same order it is allowed.
+    assert degrees(PROBLEMS["pendulum"]().system)[0] == (2,)
+
+
+def test_4_a_degree_that_is_not_defined_at_the_nominal_state():
+    error = violation(double_integrator(l=lambda x: x[0] + x[1] ** 2))
+    assert error.assumption == 4
+    assert "output 'z0' is not defined at x = [0., 0.]" in str(error)
+    assert "acts on its derivative 1 around this state" in str(error)
+    # An output that is met at once nearly everywhere.
+    tension = PROBLEMS["pendulum_tension"]().system
+    error = violation(changed(tension, nominal_state=[0.0, -0.8, 0.0, 0.0]))
+    assert error.assumption == 4
+    assert "acts on its derivative 0" in str(error)
+
+
+def test_4_a_degree_that_is_lost_between_the_sampled_states():
+    system = double_integrator(l=lambda x: x[0] + x[1] ** 2, nominal_state=[0.0, -0.04])
+    error = violation(system, spread=0.1)
+    assert error.assumption == 4
+    assert "output 'z0'" in str(error)
+    assert error.state[1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_5_outputs_that_repeat():
+    """An output that repeats another, a constraint, a combination, a function of both."""
+    system = PROBLEMS["gantry"]().system
+    q = system.state
+    one_more = [system.l[i] for i in range(4)]
+    no_force = np.array([[1, 0], [0, 0], [0, 1], [0, 0]])
+    for row, output in (
+        (3, q[2]),
+        (3, 2 * q[2] + 1),
+        (3, ca.sin(q[2])),
+        (3, q[2] + q[0]),
+        (3, q[2] * (1 + (q[0] - 1) * q[3])),
+    ):
+        error = violation(changed(system, l=ca.vertcat(*one_more[:row], output), m=no_force))
+        assert error.assumption == 5
+        assert "the controlled outputs v1, q3, v2, q4 cannot be steered" in str(error)
+    for output in (q[0], 3 * q[0] + q[1], q[0] ** 2, (q[0] - 1) * q[2], q[4], ca.SX(0), ca.SX(7)):
+        error = violation(changed(system, l=ca.vertcat(*one_more[:3], output), m=no_force))
+        assert error.assumption == 5
+        assert "the control never acts on output 'q4'" in str(error)
+
+
+def test_5_an_output_that_repeats_a_curved_constraint():
+    arm = PROBLEMS["two_link_arm"]().system
+    for output in (arm.k, arm.k + arm.k**2, ca.sin(arm.k)):
+        error = violation(changed(arm, l=ca.vertcat(0, output)))
+        assert error.assumption == 5
+        assert "the control never acts on output 'height'" in str(error)
+    error = violation(changed(arm, l=ca.vertcat(0, 0), m=[1, 2]))
+    assert error.assumption == 5
+    assert "B(x) of (16) is singular" in str(error)
+
+
+@pytest.fixture
+def derivatives_taken(monkeypatch) -> list[int]:
+    """Counts the derivatives of outputs and of constraints, which grow without bound in size."""
+    taken = []
+
+    def counted(derivative: Callable) -> Callable:
+        def count(*arguments):
+            taken.append(1)
+            return derivative(*arguments)
+
+        return count
+
+    monkeypatch.setattr(Derivatives, "derivative", counted(Derivatives.derivative))
+    monkeypatch.setattr(relative_degrees, "lie_derivative", counted(lie_derivative))
+    return taken
+
+
+def beside_an_integrator(n: int, **fields) -> DaeSystem:
+    """x0'' = u + v, and nonlinear states that nothing reaches; after ten derivatives of these
+    CasADi takes minutes."""
+    moving = [ca.sin, *[lambda x: x] * (n - 3)]
+    base = {
+        "f": lambda x: [
+            x[1],
+            0,
+            *[moving[i](x[2 + (i + 1) % (n - 2)]) * x[2 + i] ** 2 for i in range(n - 2)],
+        ],
+        "h": lambda x: [0, 1, *[0] * (n - 2)],
+        "nominal_state": [0.5] * n,
+    }
+    return system_of(n, **{**base, **fields})
+
+
+def test_5_an_output_that_no_control_reaches(derivatives_taken):
+    error = violation(beside_an_integrator(20, l=lambda x: x[5]))
+    assert error.assumption == 5
+    assert "no control reaches it" in str(error)
+    assert len(derivatives_taken) <= 1
+
+
+def test_2_a_constraint_that_no_force_reaches(derivatives_taken):
+    error = violation(
+        beside_an_integrator(
+            20,
+            g=lambda x: [0, 1, *[0] * 18],
+            k=lambda x: x[5] - 0.5,
+            l=lambda x: x[0],
+            m=lambda x: 0,
+        )
+    )
+    assert error.assumption == 2
+    assert "none reaches it" in str(error)
+    assert len(derivatives_taken) == 0
+
+
+def test_5_an_output_that_repeats_the_constraint_is_found_at_once(derivatives_taken):
+    """By Theorem 2.1, before its derivatives fill the state; h* is zero by cancellation alone."""
+    system = beside_an_integrator(
+        20,
+        g=lambda x: [0, untidy_one(x[4]), *[0] * 18],
+        h=lambda x: [0, untidy_one(x[3]), *[0] * 18],
+        k=lambda x: x[0] * (2 + x[6]) + x[5] ** 2 - 0.75,
+        l=lambda x: (x[0] * (2 + x[6]) + x[5] ** 2 - 0.75) * (1 + x[3]),
+        m=lambda x: 0,
+    )
+    error = violation(system)
+    assert error.assumption == 5
+    assert "its derivatives repeat those of the constraints" in str(error)
+    # One of the constraint, two of the output.
+    assert len(derivatives_taken) <= 3
+
+
+def test_2_a_constraint_whose_derivatives_repeat_is_found_at_once(derivatives_taken):
+    """x2 oscillates by itself; x0 enters and cancels, so that the structure does not tell."""
+    n = 20
+    system = system_of(
+        n,
+        f=lambda x: [x[1], 0, x[3], -x[2], *[0] * (n - 4)],
+        g=lambda x: [0, 1, *[0] * (n - 2)],
+        h=lambda x: [0, 1, *[0] * (n - 2)],
+        k=lambda x: x[2] + x[0] ** 2 - x[0] ** 2 * untidy_one(x[4]),
+        l=lambda x: x[0],
+        m=lambda x: 0,
+    )
+    error = violation(system)
+    assert error.assumption == 2
+    assert "no constraint input ever acts on constraint 'y0'" in str(error)
+    assert len(derivatives_taken) <= 2
+
+
+def test_2_redundant_constraints_that_fill_the_state():
+    """Their four derivatives have no room in three states."""
+    error = violation(
+        system_of(
+            3,
+            f=lambda x: [x[1], 0, 0],
+            g=lambda x: [[0, 0], [1, 1], [0, 1]],
+            h=lambda x: [0, 0, 1],
+            k=lambda x: [x[0], x[0]],
+            l=lambda x: x[2],
+            m=lambda x: [[0, 0]],
+        )
+    )
+    assert error.assumption == 2
+    assert "repeat each other or fill the state" in str(error)
+
+
+def test_5_a_b_that_is_singular_between_the_sampled_states():
+    """x' = (u1 + u2, u1 + (1 + x2 - 0.02) u2, 0.1 u1 ...): no row vanishes."""
+    error = violation(
+        system_of(
+            3,
+            f=lambda x: [0, 0, 0],
+            h=lambda x: [[1, 1, 0], [1, 1 + x[2] - 0.02, 0], [0, 0, 1]],
+            l=lambda x: x,
+        )
+    )
+    assert error.assumption == 5
+    assert error.state[2] == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 15, 40, 46])
+def test_5_a_singular_b_hidden_in_a_random_system(seed):
+    """In place of a second output of degree mu >= 1, a function of the first one and of k."""
+    while True:
+        hidden = hidden_normal_form(seed)
+        system, mu = hidden.system, hidden.output_degrees
+        of_state = [i for i in range(len(mu)) if mu[i] and not system.m[i, :].nnz()]
+        if len(of_state) >= 2 and hidden.constraint_degrees:
+            break
+        seed += 100
+    first, second = of_state[:2]
+    outputs = [system.l[i] for i in range(system.num_controls)]
+    outputs[second] = outputs[first] * (1 + 0.3 * outputs[first]) + system.k[0]
+    assert violation(changed(system, l=ca.vertcat(*outputs))).assumption == 5
+
+
+@pytest.mark.slow
+def test_examine_structure_finds_the_same(problem):
+    structure, violation = examine_structure(problem.system)
+    assert violation is None
+    assert structure.output_degrees == problem.output_degrees
+
+
+def test_the_structure_of_a_singular_b_is_complete():
+    """A unicycle whose position is the output: the rate of its heading acts on neither."""
+    unicycle = system_of(
+        3,
+        f=lambda x: [0, 0, 0],
+        h=lambda x: [[ca.cos(x[2]), 0], [ca.sin(x[2]), 0], [0, 1]],
+        l=lambda x: x[:2],
+        nominal_state=[0.0, 0.0, 0.7],
+    )
+    structure, violation = examine_structure(unicycle)
+    assert violation.assumption == 5
+    assert structure.output_degrees == (1, 1)
+    b = TracedFunction("B", {"x": unicycle.state}, {"b": structure.control_matrix})([0, 0, 0.7])[0]
+    np.testing.assert_allclose(b, [[np.cos(0.7), 0.0], [np.sin(0.7), 0.0]], rtol=1e-15)
+    margin = structure.control_margin
+    assert margin.is_singular
+    assert margin.vanishing_row is None
+    np.testing.assert_array_equal(margin.state, violation.state)
+    with pytest.raises(AssumptionError, match=r"B\(x\) of \(16\) is singular") as caught:
+        find_structure(unicycle)
+    assert str(caught.value) == str(violation)
+    assert caught.value.violation.names == tuple(signal.name for signal in unicycle.output_signals)
+
+
+def test_a_vanishing_row_of_b():
+    """B = [[x1]] around x1 = 0.02: the sign changes on the way to the states beyond."""
+    system = system_of(
+        2,
+        f=lambda x: [0, 0],
+        h=lambda x: [[x[1], 0], [0, 1]],
+        l=lambda x: x,
+        nominal_state=[0.0, 0.02],
+    )
+    structure, violation = examine_structure(system, spread=0.1)
+    assert violation.assumption == 4
+    assert structure.control_margin.vanishing_row == 0
+    assert structure.control_margin.state[1] == pytest.approx(0.0, abs=1e-12)
