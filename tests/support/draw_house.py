@@ -34,14 +34,17 @@ LOOKS = {
     "arrays": ("checked numbers", "#7a6a5a"),
     "errors": ("exceptions", "#7a6a5a"),
 }
-INK, GROUND = "#27303a", "#fbfaf7"
+INK, WHITE = "#27303a", "#fbfaf7"
 
 # Lengths are in tenths of an inch, y points down. The house stands between two sides.
-LEFT, RIGHT = 0.0, 92.0
-MIDDLE = 40.0  # Where the right one of neighbours begins.
-NAME, FOLDER, LINE = 4.0, 2.6, 2.9  # Heights of a room's name, a folder's, a line of files.
+LEFT, RIGHT = 0.0, 100.0
+MIDDLE = 36.0  # Where the right one of neighbours begins.
+NAME, LINE, BETWEEN = 4.0, 2.7, 0.5  # Heights of a room's name, of a line of files, of a gap.
+COLUMN = 15.5  # The width of the names of folders, at the left of their files.
 PITCH = 1.5  # Between arrows.
-FIRST_LANE, LANE = 3.6, 1.9
+FIRST_LANE, LANE = 3.6, 1.7
+# What every room takes stands in one row, and no arrows lead there.
+GROUND = tuple(room for floor in FLOORS[: FLOORS.index(("trace",))] for room in floor)
 
 
 class Box(NamedTuple):
@@ -60,22 +63,25 @@ def draw(path: Path) -> None:
         (room(module), room(other))
         for module, imported in found.items()
         for other in imported
-        if other.split(".")[0] == "drake_dae" and room(other) != room(module)
+        if other.split(".")[0] == "drake_dae" and room(other) not in (room(module), *GROUND)
     )
     files = {name: _files(found, name) for name in ROOMS}
     boxes = _boxes(files, arrows)
     bottom = max(box.y + box.height for box in boxes.values())
-    low, high, top = LEFT - 17.0, RIGHT + 27.0, -13.0
-    figure = Figure(((high - low) / 10, (bottom + 4.0 - top) / 10), facecolor=GROUND)
+    sources = [{a for a, b in arrows if _side((a, b)) == side} for side in (0, 1)]
+    outside = [FIRST_LANE + LANE * len(one) + 1.0 for one in sources]
+    low, high, top = LEFT - outside[0], RIGHT + outside[1], -13.0
+    figure = Figure(((high - low) / 10, (bottom + 4.0 - top) / 10), facecolor=WHITE)
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1), xlim=(low, high), ylim=(bottom + 4.0, top))
     axes.set_axis_off()
     axes.text(LEFT, -7.8, "The house of drake_dae", size=22, weight="bold", color=INK)
     axes.text(
         LEFT,
-        -3.8,
+        -2.6,
         "A floor imports only from floors below it, and neighbours not from each other. "
-        "A room's imports run down the lane of its colour; the numbers count them.",
+        "A room's imports run down the lane of its\ncolour; the numbers count them. Every room may "
+        "import the ground, which has no arrows.",
         size=9.5,
         color=INK,
     )
@@ -97,6 +103,7 @@ def _files(found: dict[str, set[str]], name: str) -> dict[str, list[str]]:
         paper = [place for file in PAPER for place in (file, f"{file}/")]
         files[""] += [f"{folder}/" for folder in files if folder]
         files[""].sort(key=paper.index)
+        return dict(sorted(files.items(), key=lambda own: own[0] and f"{PAPER.index(own[0]):02}"))
     return dict(sorted(files.items()))
 
 
@@ -104,13 +111,15 @@ def _boxes(files: dict[str, dict[str, list[str]]], arrows: Counter) -> dict[str,
     """Floors above each other; of neighbours the last one to the right, the others at its left."""
 
     def height(name: str, width: float) -> float:
-        lines = sum(len(_lines(labels, width)) for labels in files[name].values())
-        folders = sum(bool(folder) for folder in files[name])
-        text = NAME + LINE * lines + FOLDER * folders + 0.8 * bool(lines)
+        own = files[name]
+        lines = sum(len(_lines(labels, width - _column(own))) for labels in own.values())
+        text = NAME + LINE * lines + BETWEEN * len(own) + 0.4
         return max(text, PITCH * (1 + max(len(_takers(arrows, name, side)) for side in (0, 1))))
 
     boxes, y = {}, 0.0
     for floor in reversed(FLOORS):
+        if floor[0] in GROUND:
+            continue
         *aside, last = floor
         left = MIDDLE if aside else LEFT
         tall = height(last, RIGHT - left)
@@ -126,7 +135,15 @@ def _boxes(files: dict[str, dict[str, list[str]]], arrows: Counter) -> dict[str,
                 top += own + gap
         boxes[last] = Box(left, y, RIGHT - left, tall)
         y += tall + 2.4
+    wide = (RIGHT - LEFT + 2.0) / len(GROUND)
+    for place, name in enumerate(GROUND):
+        boxes[name] = Box(LEFT + place * wide, y, wide - 2.0, NAME + 0.4)
     return boxes
+
+
+def _column(files: dict[str, list[str]]) -> float:
+    """Room for the names of folders, if there are any."""
+    return COLUMN if any(files) else 0.0
 
 
 def _side(pair: tuple[str, str]) -> int:
@@ -160,7 +177,11 @@ def _lines(labels: list[str], width: float) -> list[list[tuple[float, str]]]:
 
 def _draw_room(axes: Axes, name: str, box: Box, files: dict[str, list[str]]) -> None:
     (x, y, width, height), (holds, colour) = box, LOOKS[name]
-    for face, edge, alpha in ((GROUND, "none", 1.0), (colour, "none", 0.10), ("none", colour, 1.0)):
+    for face, edge, alpha in (
+        (WHITE, "none", 1.0),
+        (colour, "none", 0.10),
+        ("none", colour, 1.0),
+    ):
         style = "round,pad=0,rounding_size=0.9"
         axes.add_patch(
             FancyBboxPatch(
@@ -187,16 +208,15 @@ def _draw_room(axes: Axes, name: str, box: Box, files: dict[str, list[str]]) -> 
         zorder=4,
     )
     y += NAME
+    column = _column(files)
     for folder, labels in files.items():
         if folder:
-            axes.text(
-                x + 1.7, y + 1.7, f"{folder}/", size=9.5, weight="bold", color=colour, zorder=4
-            )
-            y += FOLDER
-        for line in _lines(labels, width):
+            axes.text(x + 1.7, y + 1.6, f"{folder}/", size=9, weight="bold", color=colour, zorder=4)
+        for line in _lines(labels, width - column):
             for offset, label in line:
-                _draw_label(axes, x + 1.6 + offset, y, label, colour)
+                _draw_label(axes, x + column + 1.6 + offset, y, label, colour)
             y += LINE
+        y += BETWEEN
 
 
 def _draw_label(axes: Axes, x: float, y: float, label: str, colour: str) -> None:
