@@ -19,12 +19,12 @@ from pydrake.systems.analysis import SimulatorConfig
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed
 from drake_dae.dae import references
-from drake_dae.diagrams import unilateral
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import actuation, force_outputs, loads, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.surfaces import maps, surface, surfaces
 from drake_dae.scenario import parts as parts
+from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import (
     Choice,
     FileName,
@@ -40,7 +40,7 @@ from drake_dae.scenario.robot_file import payloads
 from drake_dae.scenario.task import ScenarioTask
 from drake_dae.simulation.simulate import check_config, check_duration
 from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import contact_material, pushes
+from drake_dae.systems.plants.contact import pushes
 from drake_dae.systems.sensing import encoders, tolerances
 from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
@@ -116,9 +116,7 @@ Payload = Annotated[payloads.Payload, Form()]
 Push = Annotated[pushes.Push, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
-    parts.IdealConstraints
-    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")]
-    | unilateral.Unilateral,
+    plants.IdealConstraints | plants.MultibodyPlant | plants.Unilateral,
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
@@ -246,7 +244,7 @@ class Scenario:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     observer: Observer | None = None
-    plant: Plant = field(default_factory=parts.IdealConstraints)
+    plant: Plant = field(default_factory=plants.IdealConstraints)
     sampling: Sampling | None = None
     encoders: Encoders | None = None
     saturation: bool = False
@@ -274,7 +272,7 @@ class Scenario:
     @property
     def is_advised(self) -> bool:
         """Whether the gains are left to be advised."""
-        return self.gains is None and isinstance(self.plant, contact_material.ContactMaterial)
+        return self.gains is None and self.plant.material is not None
 
     def __repr__(self) -> str:
         names = listed(constraint.name for constraint in self.constraints)

@@ -22,7 +22,14 @@ from problems import (
 from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pursuit as module
-from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
+from drake_dae import (
+    ConstantReference,
+    DaePlant,
+    ExpressionReference,
+    LoopSettings,
+    analyze,
+    make_closed_loop,
+)
 from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
@@ -1105,7 +1112,7 @@ def test_a_loop_is_judged_when_it_begins():
                 DaePlant(law.structure.system, structure=law.structure),
                 law,
                 [ConstantReference([0.0]), force],
-                start_time=start,
+                LoopSettings(start_time=start),
             )
         assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
 
