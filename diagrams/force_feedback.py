@@ -4,23 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder, System
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.errors import WiringError
-from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.sampling import Sampling
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.task.controller import TaskController
 
 
 def add_force_feedback(
     builder: DiagramBuilder,
-    plant: DaePlant | ContactPlant,
-    controller: TrackingController | TaskController,
+    plant: Plant,
+    controller: Controller,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
     others: Sequence[DisturbanceObserver] = (),
@@ -52,14 +50,15 @@ def add_force_feedback(
             source = RandomSource(RandomDistribution.kGaussian, size, period)
             noise = builder.AddSystem(source)
             builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    for taker in (controller, *others):
+    takers: list[System] = [controller, *others]
+    for taker in takers:
         builder.Connect(force, taker.GetInputPort("measured_force"))
     return noise
 
 
 def _check_loop(
-    plant: DaePlant | ContactPlant,
-    controller: TrackingController | TaskController,
+    plant: Plant,
+    controller: Controller,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
 ) -> None:

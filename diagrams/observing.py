@@ -3,19 +3,18 @@
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_dae.errors import WiringError
-from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.observer import DisturbanceObserver
 from drake_dae.systems.control.observer_rates import Observing
 from drake_dae.systems.control.sampling import Sampling
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.plants.contract import Plant
 
 
 def add_observer(
     builder: DiagramBuilder,
-    plant: DaePlant | ContactPlant,
-    controller: TrackingController,
+    plant: Plant,
+    controller: Controller,
     observing: Observing,
     state: OutputPort,
     sampling: Sampling | None,

@@ -8,9 +8,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.pictures.view import RobotBlock
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 
@@ -44,13 +42,13 @@ class MeasuredState:
             self.noise.SetRandomContext(own, RandomGenerator((seed + 2**31) % 2**32))
 
 
-def make_sensor(plant: DaePlant | ContactPlant, encoders: Encoders, period: float) -> StateSensor:
+def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
     """The encoders of a robot; the arguments and errors are those of `add_encoders`."""
     if not period:
         raise WiringError(
             "encoders are read at samples, and this law acts continuously; give it a sampling"
         )
-    if not isinstance(plant, RobotBlock):
+    if plant.model is None:
         raise WiringError(
             "encoders measure the positions of a robot: a RobotPlant or a ContactPlant"
         )
@@ -68,7 +66,7 @@ def make_sensor(plant: DaePlant | ContactPlant, encoders: Encoders, period: floa
 
 
 def add_encoders(
-    builder: DiagramBuilder, plant: DaePlant | ContactPlant, encoders: Encoders, period: float
+    builder: DiagramBuilder, plant: Plant, encoders: Encoders, period: float
 ) -> MeasuredState:
     """Adds the encoders of a robot, which measure when its law reads.
 

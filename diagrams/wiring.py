@@ -1,198 +1,303 @@
-"""The parts of a closed loop: what is refused, and how sensor and exogenous signals are wired."""
+"""The wiring of a closed loop: a plant, what is wanted of it, and what computes its control."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
 
-import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
-from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, VectorLogSink
+from pydrake.geometry import Meshcat, SceneGraph
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
-from drake_dae.dae.references import Reference
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.arguments import checked
+from drake_dae.dae.references import Reference, references_by_name
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.force_feedback import add_force_feedback
+from drake_dae.diagrams.observing import add_observer
+from drake_dae.diagrams.parts import (
+    add_block,
+    add_drives,
+    add_exogenous,
+    add_hold,
+    add_watch,
+    check_sensor,
+    hold_before,
+    log_steps,
+    open_holds,
+)
+from drake_dae.diagrams.settings import LoopSettings
+from drake_dae.diagrams.state_feedback import MeasuredState, add_encoders
+from drake_dae.errors import DrakeDaeError, WiringError
+from drake_dae.pictures.view import add_live_view
+from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import ControlHold, Sampling
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.dae_plant import DaePlant
-from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.systems.control.observer import DisturbanceObserver
+from drake_dae.systems.control.references import ReferenceGenerator, SystemReference
+from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
-Block = TypeVar("Block", DaePlant, ForceSensor)
+Named = dict[str, tuple[OutputPort, Sequence[Signal]]]
+"""Name -> output port, names and units of what a record has."""
 
-
-def add_block(builder: DiagramBuilder, block: Block) -> Block:
-    """Adds what the caller made."""
-    try:
-        return builder.AddSystem(block)
-    except RuntimeError:
-        raise WiringError(
-            f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
-        ) from None
+_NEEDS = dict.fromkeys(
+    ("observer", "tolerances"), "it takes the references of a generator, and here is none"
+)
 
 
-def add_exogenous(
-    builder: DiagramBuilder, block: ParameterizedSystem, exogenous: Sequence[Reference]
-) -> ReferenceGenerator | None:
-    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
-
-    Raises:
-        WiringError: The references are not as many as the signals.
-    """
-    names = [signal.name for signal in block.dae.exogenous.signals]
-    size = sum(reference.size for reference in exogenous)
-    if exogenous and size != len(names):
-        raise WiringError(
-            f"the references of exogenous signals cover {size}, '{block.dae.name}' has "
-            f"{len(names)}: {', '.join(names) or 'none'}"
-        )
-    if not exogenous:
-        return None
-    generator = builder.AddSystem(ReferenceGenerator(exogenous, block.exogenous_layout.degrees))
-    generator.set_name(f"{block.get_name()}_exogenous")
-    builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
-    return generator
-
-
-def check_system(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
-    """Refuses what is for a system of another size than the plant's.
-
-    Args:
-        own: The plant's system.
-        other: What it is for.
-        what: What is wired to the plant.
-        remedy: What to make instead.
-    """
-    sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
-    if sizes[0] != sizes[1]:
-        has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)
-        raise WiringError(
-            f"the {what} is for '{other.name}' with {takes}, the plant '{own.name}' has {has}. "
-            f"Make {remedy}"
-        )
-
-
-def check_sizes(plant: DaePlant, law: TrackingLaw, sensor: ForceSensor | None) -> None:
-    """Refuses wrong sizes: Drake would name the ports, but not what is wrong with them."""
-    own, remedy = plant.dae, "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
-    check_system(own, law.system, "law", f"{remedy} a model of the same structure")
-    if sensor is not None:
-        size = sensor.GetInputPort("force").size()
-        if size != own.num_constraints:
-            names = ", ".join(signal.name for signal in own.constraint_input_signals) or "none"
-            raise WiringError(
-                f"the sensor measures {size} forces, the plant '{own.name}' has "
-                f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
-                "...)"
-            )
-
-
-def add_drives(
-    builder: DiagramBuilder,
-    controller: TrackingController,
-    sampling: Sampling | None,
-    control_limits: ArrayLike | None,
-) -> tuple[OutputPort, ControlLimits | None]:
-    """Adds what stands between controller and plant, and returns the control that arrives."""
-    control, limits = controller.GetOutputPort("control"), None
-    if sampling is not None:
-        hold = builder.AddSystem(ControlHold(control.size(), sampling))
-        builder.Connect(control, hold.get_input_port())
-        control = hold.get_output_port()
-    if control_limits is not None:
-        limits = builder.AddSystem(ControlLimits(control_limits))
-        if limits.limits.size != control.size():
-            raise WiringError(
-                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
-                "controls"
-            )
-        builder.Connect(control, limits.get_input_port())
-        control = limits.GetOutputPort("control")
-    return control, limits
-
-
-def add_watch(
-    builder: DiagramBuilder,
-    plant: DaePlant | ContactPlant,
-    reference: ReferenceGenerator,
+@checked(WiringError)
+def make_closed_loop(
+    plant: Plant,
     law: TrackingLaw,
-    tolerances: Tolerances,
-) -> None:
-    """Adds what ends a run whose errors are too large.
+    references: Sequence[Reference] | Mapping[str, Reference | float] | System,
+    settings: LoopSettings | None = None,
+    *,
+    scene_graph: SceneGraph | None = None,
+    meshcat: Meshcat | None = None,
+) -> ClosedLoop:
+    """Wires a plant, a tracking law and its references, with loggers and a view.
 
-    Raises:
-        WiringError: There is no such output.
-    """
-    dae = plant.dae
-    sizes = law.layout.reference_size, dae.num_states
-    # Of a continuous plant often enough for what is recent.
-    period = plant.time_step or tolerances.window / 20.0
-    lowest = law.layout.lowest
-    try:
-        made = ToleranceWatch(
-            tolerances, dae.output_signals, dae.force_signals, lowest, sizes, period
-        )
-    except ModelError as error:
-        raise WiringError(str(error)) from None
-    watch = builder.AddSystem(made)
-    builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
-    for name in ("controlled_output", "constraint_force", "state"):
-        builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))
-
-
-def add_hold(
-    builder: DiagramBuilder, controller: TrackingController, sources: Sequence[OutputPort]
-) -> None:
-    """Lets the integrals of a controller stand still while a signal is not 0.
+    While a contact of a `UnilateralRobotPlant` is open the law goes on as it is, so that
+    phi'' = -A(x) lambda_d, lambda_d being the force that is wanted, and the integral of its force
+    stands still. With a `ContactPlant` everything is logged at its steps.
 
     Args:
-        builder: The builder of the diagram.
-        controller: The controller.
-        sources: The signals: of one entry for all integrals, or of one for each.
+        plant: A `RobotPlant`, or any other `Plant`.
+        law: A law for the plant's system, or for a model of the same structure.
+        references: References that together cover all controlled outputs, in their order; or name
+            -> reference, as `references_by_name` takes them; or a Drake System that gives R(t), as
+            a `SystemReference` with all degrees of the law takes it.
+        settings: Sensors, drives, samples and what else stands in the loop; nothing of it if None.
+        scene_graph: Where the robot's MultibodyPlant was registered before it was parsed; then
+            its geometry can be drawn. Left out where nothing is drawn.
+        meshcat: Where to draw the surface, the contact force, and the robot if there is a
+            scene_graph, while it runs: `FRAME_RATE` times a second, which shortens the
+            integrator's steps. None draws nothing; `make_animation` needs none.
+
+    A loop that draws, samples, limits and watches nothing converts to AutoDiffXd, for Drake's
+    Linearize.
+
+    Warns:
+        NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
+
+    Raises:
+        WiringError: The law or the sensor has other sizes than the plant; measured force would
+            close an algebraic loop, or a sampled loop that diverges; no law uses the sensor; or an
+            observer lacks samples or measured force.
     """
-    count = len(controller.law.integral.outputs)
-    if not (count and sources):
-        return
-    total = builder.AddSystem(Adder(len(sources), count))
-    for index, source in enumerate(sources):
-        if source.size() != count:
-            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-            builder.Connect(source, spread.get_input_port())
-            source = spread.get_output_port()
-        builder.Connect(source, total.get_input_port(index))
-    builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
+    settings = settings or LoopSettings()
+    check_law(plant.dae, law)
+    if isinstance(references, System):
+        references = [SystemReference(references, law.degrees)]
+    if isinstance(references, Mapping):
+        names = [signal.name for signal in law.system.output_signals]
+        references = references_by_name(references, names, law.degrees)
+    reference = ReferenceGenerator(references, law.degrees)
+    try:
+        outputs = law.layout.values(reference.reference(settings.start_time))
+    except DrakeDaeError:
+        outputs = None  # A trajectory that begins later.
+    is_fed_back = plant.HasInputPort("feedback") and can_be_fed_back(
+        law, settings.sampling, settings.control_limits
+    )
+    controller = TrackingController(
+        law,
+        outputs,
+        sample_period=settings.period(plant.time_step),
+        references=reference if is_fed_back else None,
+        feedback=is_fed_back,
+    )
+    return wire_loop(
+        plant, controller, reference, settings, scene_graph=scene_graph, meshcat=meshcat
+    )
 
 
-def log_steps(
-    builder: DiagramBuilder,
-    port: OutputPort,
-    plant: DaePlant | ContactPlant | UnilateralRobotPlant,
-) -> VectorLogSink:
-    """Logs once per step.
+@checked(WiringError)
+def wire_loop(
+    plant: Plant,
+    controller: Controller,
+    reference: ReferenceGenerator | None = None,
+    settings: LoopSettings | None = None,
+    *,
+    scene_graph: SceneGraph | None = None,
+    meshcat: Meshcat | None = None,
+) -> ClosedLoop:
+    """Wires a plant and any controller, as that of a task, with loggers and a view.
 
-    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
-    instant that the run has not reached.
+    Args:
+        plant: The plant.
+        controller: What computes its control.
+        reference: What gives the controller its references; None where it plans them itself.
+        settings, scene_graph, meshcat: As of `make_closed_loop`.
+
+    Raises:
+        WiringError: The controller is not for this plant, or cannot be wired with one of these
+            parts; or as of `make_closed_loop`.
     """
-    if plant.time_step:
-        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
-    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
+    parts = settings or LoopSettings()
+    controller.check_plant(plant)
+    parts.check(controller.refused if reference is not None else {**_NEEDS, **controller.refused})
+    check_sensor(plant, controller, parts.sensor)
+    builder, law = DiagramBuilder(), controller.law
 
+    # The plant, its references and its controller.
+    for block in (plant, reference, controller):
+        if block is not None:
+            add_block(builder, block)
 
-def hold_before(
-    plant: DaePlant | ContactPlant | UnilateralRobotPlant, sampling: Sampling
-) -> Sampling:
-    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
-    step = plant.time_step
-    if step and sampling.delay < step * (1.0 - 1e-9):
-        raise WiringError(
-            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
-            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
-            "delay at each step of the plant needs no sampling"
+    # The state goes to the controller, through encoders.
+    state, measured = plant.GetOutputPort("state"), None
+    if parts.encoders is not None:
+        measured = add_encoders(builder, plant, parts.encoders, parts.period(plant.time_step))
+        state = measured.output
+    builder.Connect(state, controller.GetInputPort("estimated_state"))
+
+    # Its control goes back to the plant, held between samples and cut off by drives; or the plant
+    # takes the law itself.
+    held = None if parts.sampling is None else hold_before(plant, parts.sampling)
+    control, limits = add_drives(builder, controller, held, parts.control_limits)
+    if controller.HasOutputPort("feedback"):
+        builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
+    else:
+        builder.Connect(control, plant.GetInputPort("control"))
+        if reference is not None:
+            wanted = reference.GetOutputPort("reference")
+            builder.Connect(wanted, controller.GetInputPort("reference"))
+
+    # What nobody here steers goes to both, to the plant as it is and to the law as it knows it.
+    own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
+    moving = add_exogenous(builder, plant, plant.dae, own)
+    known = add_exogenous(builder, controller, law.system, parts.exogenous)
+
+    # An observer tells the law what its model lacks. Integrals stand still while a contact is open
+    # or lost, or a drive is at its limit.
+    holds, observer = open_holds(builder, plant, law), None
+    if parts.observer is not None and reference is not None:
+        wanted = reference.GetOutputPort("reference")
+        observer = add_observer(
+            builder, plant, controller, parts.observer, state, held, control, wanted, limits
         )
-    return replace(sampling, delay=max(sampling.delay - step, 0.0))
+        holds.append(observer.GetOutputPort("hold"))
+    elif limits is not None:
+        holds.append(limits.GetOutputPort("is_limited"))
+    add_hold(builder, controller, holds)
+
+    # The constraint force goes to whoever measures it, through its sensor.
+    noise = None
+    if controller.HasInputPort("measured_force"):
+        if parts.sensor is not None:
+            add_block(builder, parts.sensor)
+        others = [] if observer is None else [observer]
+        noise = add_force_feedback(builder, plant, controller, parts.sensor, parts.sampling, others)
+    if parts.tolerances is not None and reference is not None:
+        add_watch(builder, plant, reference, law, parts.tolerances)
+
+    # Every signal under its own name: exported, and logged once per step if nothing else tells it.
+    named = {
+        **_of_plant(plant, moving, reference, law, control),
+        **_of_parts(plant, controller, measured, limits, observer, parts.sensor),
+    }
+    told = _told_afterwards(plant, controller, control)
+    loggers = {}
+    for name, (port, signals) in named.items():
+        builder.ExportOutput(port, name)
+        if name not in told:
+            loggers[name] = (log_steps(builder, port, plant), signals)
+    for name in controller.shown:
+        builder.ExportOutput(controller.GetOutputPort(name), name)
+    if plant.model is not None:
+        builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+
+    # The view: the robot at its link positions, what it touches, the constraint forces.
+    if meshcat is not None:
+        source = moving.get_output_port() if moving is not None else None
+        add_live_view(builder, plant, scene_graph, meshcat, source)
+
+    diagram = builder.Build()
+    diagram.set_name("closed_loop")
+    return ClosedLoop(
+        diagram,
+        plant,
+        controller,
+        reference,
+        loggers,
+        {name: tuple(signals) for name, (_, signals) in named.items()},
+        scene_graph,
+        parts.sensor,
+        noise,
+        known,
+        moving,
+        measured,
+        observer,
+    )
+
+
+def can_be_fed_back(
+    law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
+) -> bool:
+    """Whether a plant can take a law itself, in place of its control: see `DaePlant.feedback`.
+
+    So it is where the law acts continuously, through no drive with limits, and takes the state and
+    references alone; the arguments are those of `LoopSettings`.
+    """
+    takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
+    is_direct = sampling is None and control_limits is None
+    return is_direct and law.system.num_controls > 0 and not takes_more
+
+
+def _told_afterwards(plant: Plant, controller: Controller, control: OutputPort) -> set[str]:
+    """The signals of a record that follow from what was logged: nothing logs them."""
+    if not plant.functions:
+        return set()
+    acts_at_once = controller.follows and control.get_system() is controller
+    return {*plant.functions, "reference", "exogenous", *(["control"] if acts_at_once else [])}
+
+
+def _of_plant(
+    plant: Plant,
+    moving: ReferenceGenerator | None,
+    reference: ReferenceGenerator | None,
+    law: TrackingLaw,
+    control: OutputPort,
+) -> Named:
+    """What a record has of every plant, and what goes into it."""
+    dae, named = plant.dae, Named()
+    if moving is not None:
+        signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
+        named["exogenous"] = (moving.get_output_port(), signals)
+    for name, own in {
+        "state": dae.state_signals,
+        "constraint_force": dae.force_signals,
+        "constraint_residual": plant.structure.manifold.residual_signals,
+        "controlled_output": dae.output_signals,
+    }.items():
+        named[name] = (plant.GetOutputPort(name), own)
+    if reference is not None:
+        named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)
+    return {**named, "control": (control, dae.control_signals)}
+
+
+def _of_parts(
+    plant: Plant,
+    controller: Controller,
+    measured: MeasuredState | None,
+    limits: ControlLimits | None,
+    observer: DisturbanceObserver | None,
+    sensor: ForceSensor | None,
+) -> Named:
+    """What a record has besides of this controller, these parts and this plant."""
+    dae, named = plant.dae, Named()
+    if measured is not None:
+        named["estimated_state"] = (measured.output, dae.state_signals)
+    if limits is not None:
+        named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
+    for block in (controller, observer):
+        if block is not None:
+            for name, signals in block.further_signals.items():
+                named[name] = (block.GetOutputPort(name), signals)
+    if sensor is not None:
+        port = sensor.GetOutputPort("measured_force")
+        named["measured_force"] = (port, dae.constraint_input_signals)
+    for name, signals in plant.further_signals.items():
+        named[name] = (plant.GetOutputPort(name), signals)
+    return named

@@ -46,10 +46,9 @@ from .dae.tracking.gains import poles as poles
 from .dae.tracking.tracking import TrackingLaw as TrackingLaw
 from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
-from .diagrams.closed_loop_wiring import make_closed_loop as make_closed_loop
-from .diagrams.task_loop import TaskLoop as TaskLoop
-from .diagrams.task_loop import make_task_loop as make_task_loop
-from .diagrams.unilateral import Unilateral as Unilateral
+from .diagrams.settings import LoopSettings as LoopSettings
+from .diagrams.wiring import make_closed_loop as make_closed_loop
+from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
 from .pictures.film import save_film as save_film
@@ -97,6 +96,7 @@ from .scenario.build import build_scenario as build_scenario
 from .scenario.files import load_scenario as load_scenario
 from .scenario.model import complete_scenario as complete_scenario
 from .scenario.new.new_scenario import new_scenario as new_scenario
+from .scenario.plants import Unilateral as Unilateral
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .simulation.records.record import Record as Record
@@ -108,6 +108,7 @@ from .studies.variations import grid_variations as grid_variations
 from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
+from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
 from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.observer import DisturbanceObserver as DisturbanceObserver
@@ -120,6 +121,7 @@ from .systems.control.sampling import Sampling as Sampling
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.pushes import Push as Push
+from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant

@@ -26,6 +26,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_dae import (
     ConstantReference,
     ForceSensor,
+    LoopSettings,
     Plane,
     PointCoordinates,
     PointOnSurface,
@@ -97,7 +98,9 @@ def linearize(model: RobotModel, structure: Structure) -> float:
     )
     sensor = ForceSensor(1, time_constant=lag)
     references = [ConstantReference(height), ConstantReference(force)]
-    loop = make_closed_loop(RobotPlant(model, structure=structure), law, references, sensor=sensor)
+    loop = make_closed_loop(
+        RobotPlant(model, structure=structure), law, references, LoopSettings(sensor=sensor)
+    )
 
     # Linearize takes equilibria alone: at rest at the reference, with the sensor settled.
     context = loop.diagram.CreateDefaultContext()

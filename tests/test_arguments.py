@@ -93,13 +93,12 @@ def record() -> dd.Record:
 
 
 @cache
-def task() -> dd.TaskLoop:
+def task() -> dd.ClosedLoop:
     return task_loop([dd.Approach(), dd.Press(20.0)])
 
 
 def context_of(owner: Any) -> Context:
-    of_loop = owner if isinstance(owner, dd.TaskLoop) else loop()
-    return (owner if isinstance(owner, System) else of_loop.diagram).CreateDefaultContext()
+    return (owner if isinstance(owner, System) else loop().diagram).CreateDefaultContext()
 
 
 def state() -> np.ndarray:
@@ -191,7 +190,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Structure: lambda: arm("two_link").structure,
     dd.Task: lambda: dd.Task([dd.Approach(), dd.Press(20.0)]),
     dd.TaskController: lambda: task().controller,
-    dd.TaskLoop: task,
     dd.TrackingController: lambda: loop().controller,
     dd.WaypointsReference: lambda: dd.WaypointsReference([[0.0], [1.0]], [0.0, 1.0]),
     dd.TrackingLaw: lambda: law("two_link"),
@@ -254,6 +252,8 @@ PLACES: dict[str, Callable[[], Any]] = {
     "region": lambda: None,
     "measured_force": lambda: None,
     "settings": lambda: (),
+    "settings of make_closed_loop": lambda: None,
+    "settings of wire_loop": lambda: None,
     "constraint_force": lambda: ca.SX.sym("lambda", 1),
     "constraint_force of CoincidentPoints.reaction": lambda: ca.SX.sym("lambda", 2),
     "constraint_force of WeldedFrames.reaction": lambda: ca.SX.sym("lambda", 6),
@@ -262,7 +262,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "outputs": lambda: [0.3, 10.0],
     "host": lambda: "localhost",
     "seed": lambda: 0,
-    "system of make_closed_loop": lambda: dd.RobotPlant(
+    "plant of make_closed_loop": lambda: dd.RobotPlant(
         arm("two_link").model, structure=arm("two_link").structure
     ),
     "phases": lambda: [dd.Approach()],
@@ -276,11 +276,10 @@ PLACES: dict[str, Callable[[], Any]] = {
     "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
     "name of TaskController.set_parameter": lambda: "wall.position",
     "value of TaskController.set_parameter": lambda: [1.2, 0.0, 0.0],
-    "plant of make_task_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
-    "controller of make_task_loop": lambda: dd.TaskController(
+    "plant of wire_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
+    "controller of wire_loop": lambda: dd.TaskController(
         dd.Task([dd.Approach()]), laws()[0], laws()[1]
     ),
-    "plant of TaskLoop": lambda: task().plant,
     "integrators": lambda: {"joint1_motor": 1},
     "nominal_control": lambda: None,
     "spread": lambda: None,

@@ -5,19 +5,18 @@ from pathlib import Path
 
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.running.export.export import export_code
-from drake_dae.scenario.build import build_loop, start_scenario
+from drake_dae.scenario.build import build_law_loop
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.scenario.start import start_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Writes the code of the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
-    loop = build_loop(scenario)
+    loop = build_law_loop(scenario)
     context = start_scenario(scenario, loop)
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
@@ -35,7 +34,7 @@ def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
             loop.observer is not None
         ),
         "the limits of the drives": scenario.saturation,
-        f"Drake's own contact: {closed}, and ideal": isinstance(loop.plant, ContactPlant),
-        f"how contacts open: {closed}": isinstance(loop.plant, UnilateralRobotPlant),
+        f"Drake's own contact: {closed}, and ideal": not loop.plant.is_ideal,
+        f"how contacts open: {closed}": bool(loop.plant.contacts),
     }
     return [text for text, is_run in parts.items() if is_run]

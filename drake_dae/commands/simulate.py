@@ -27,18 +27,18 @@ from drake_dae.commands.run_folder import (
 )
 from drake_dae.commands.view import show
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.course import Course, contact_paths, follow
 from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
-from drake_dae.pictures.view import RobotBlock, start_meshcat
-from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.pictures.view import start_meshcat
+from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
@@ -46,7 +46,6 @@ from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import stop_remarks, surface_remarks
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -94,7 +93,7 @@ def _unused(name: str) -> Path:
 class _Run:
     """A run: what it is of, where it is written, and how it ended."""
 
-    loop: ClosedLoop | TaskLoop
+    loop: ClosedLoop
     context: Context
     scenario: Scenario
     folder: Path
@@ -143,7 +142,7 @@ def _roll(run: _Run) -> RunStatistics:
     """
     from drake_dae.scenario.rolled import roll_scenario
 
-    if isinstance(run.loop, TaskLoop):
+    if run.loop.generator is None:
         raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
     with ending_signals(ending := Ending()):
@@ -159,7 +158,7 @@ def _roll(run: _Run) -> RunStatistics:
 
 
 def _run(
-    loop: ClosedLoop | TaskLoop,
+    loop: ClosedLoop,
     context: Context,
     completed: Completed,
     folder: Path,
@@ -194,17 +193,18 @@ def _write(run: _Run) -> bool:
         if record.time.size == 0:
             return True
         predicted = loop.predicted_error(record)
-        limits = Limits.of(loop.plant.model) if isinstance(loop.plant, RobotBlock) else Limits()
+        model = loop.plant.model
+        limits = Limits() if model is None else Limits.of(model)
         config = run.scenario.integrator
         fixed = loop.plant.time_step or not config.use_error_control
         accuracy = None if fixed else config.accuracy
-        reasons = _reasons(run.scenario, record)
+        reasons = _reasons(run.scenario, loop, record)
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
-        if isinstance(loop.plant, RobotBlock):
-            text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
-        if isinstance(loop, TaskLoop):
+        if model is not None:
+            text = "\n".join([text, *surface_remarks(model, record)])
+        if changes := loop.changes(run.context):
             stopped = stop_remarks(run.statistics, run.scenario.duration)
-            text = "\n".join([text, "", *map(str, loop.changes(run.context)), *stopped])
+            text = "\n".join([text, "", *map(str, changes), *stopped])
         if write.record:
             with _collected(problems):
                 _write_record(record, run)
@@ -215,7 +215,7 @@ def _write(run: _Run) -> bool:
         if ending.signal is not None:
             end_at_once(ending.signal)
         course: Course | None = None
-        if run.pictures and (write.plots or write.animation) and isinstance(loop.plant, RobotBlock):
+        if run.pictures and (write.plots or write.animation) and model is not None:
             course = follow(loop, record, run.context)
         if write.plots and run.pictures:
             paths = contact_paths(course) if course is not None else []
@@ -237,7 +237,7 @@ def _write(run: _Run) -> bool:
     return not problems
 
 
-def _reasons(scenario: Scenario, record: Record) -> list[str]:
+def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
     """Why a run may be off what theory predicts for an ideal one."""
     reasons = {
         "the drives were cut off at their limits": record["excess"].any()
@@ -248,7 +248,7 @@ def _reasons(scenario: Scenario, record: Record) -> list[str]:
         ),
         "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
         "the plant is pushed, and the law does not know it": bool(scenario.plant_pushes),
-        "Drake's own contact gives way": isinstance(scenario.plant, ContactMaterial),
+        "Drake's own contact gives way": not loop.plant.is_ideal,
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,

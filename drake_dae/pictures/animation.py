@@ -93,7 +93,7 @@ def animate(
     with _quiet():
         meshcat = start_meshcat()
     plant, acting = course.plant, course.acting
-    model = plant.model
+    model = course.model
     arrows = draw_scene(plant, meshcat)
     links = view_of_links(plant, scene_graph, meshcat)
     arrows.measure(course.loads)

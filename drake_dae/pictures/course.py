@@ -6,16 +6,17 @@ from typing import Protocol
 
 import numpy as np
 from pydrake.geometry import SceneGraph
-from pydrake.systems.framework import Context, System
+from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.pictures.view import FRAME_RATE, RobotBlock
+from drake_dae.errors import InconsistentStateError
+from drake_dae.pictures.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.simulation.records.events import flashes
 from drake_dae.simulation.records.record import Record
+from drake_dae.systems.plants.contract import Plant
 
 STILL = 1e-4
 """A contact point whose path is shorter than this share of its distance has no path to draw."""
@@ -25,7 +26,7 @@ class Loop(Protocol):
     """A diagram with a plant and its geometry, as a `ClosedLoop`."""
 
     @property
-    def plant(self) -> System:
+    def plant(self) -> Plant:
         """What was simulated."""
 
     @property
@@ -38,7 +39,8 @@ class Course:
     """A run of a robot at k moments, equally far apart.
 
     Attributes:
-        plant: The robot.
+        plant: What was simulated.
+        model: The robot.
         times: The moments in s after the start, shape (k,).
         start_time: When the run began, in s.
         states: x, shape (k, n).
@@ -51,7 +53,8 @@ class Course:
             (k, constraints).
     """
 
-    plant: RobotBlock
+    plant: Plant
+    model: RobotModel
     times: FloatArray
     start_time: float
     states: FloatArray
@@ -69,7 +72,7 @@ class Course:
     @property
     def wanted_points(self) -> FloatArray:
         """Where they would have acted with the desired outputs, m, shape (j, constraints, 3)."""
-        none = np.zeros(len(self.plant.model.dae.force_signals))
+        none = np.zeros(len(self.model.dae.force_signals))
         pairs = zip(self.wanted, self.parameters, strict=False)
         found = [self.acting(state, none, own).points for state, own in pairs]
         return np.array(found).reshape(len(found), len(self.acting.constraints), 3)
@@ -103,10 +106,9 @@ def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RAT
         ModelError: There is no robot.
     """
     plant = loop.plant
-    if not isinstance(plant, RobotBlock):
-        raise ModelError("an animation needs a closed loop of a RobotPlant")
+    model = plant.robot("a picture of a run")
     parameters = plant.parameters(plant.GetMyContextFromRoot(context))
-    acting = ConstraintWrenches(plant.model, parameters)
+    acting = ConstraintWrenches(model, parameters)
     times = frame_times(record.time[-1] - record.time[0], rate)
     states = _interpolated(record, "state", times)
     forces = _interpolated(record, "constraint_force", times)
@@ -115,10 +117,10 @@ def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RAT
     if "exogenous" in record.signals:
         values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
     loads = [acting(*row) for row in zip(states, forces, values, strict=True)]
-    wanted = _desired_states(plant.model, states, desired, values)
+    wanted = _desired_states(model, states, desired, values)
     begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
     bright = flashes(record.events, names, begin + times)
-    return Course(plant, times, begin, states, values, loads, wanted, acting, bright)
+    return Course(plant, model, times, begin, states, values, loads, wanted, acting, bright)
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
@@ -132,7 +134,7 @@ def contact_paths(course: Course) -> list[ContactPath]:
     They are seen along the surface's mean normal: for a plane in its own coordinates, on a surface
     that bends as in a tangent plane, relative to its reference point.
     """
-    dae = course.plant.model.dae
+    dae = course.model.dae
     size = float(np.max(np.abs(course.points), initial=0.0))
     pushes = _pushes(course)
     found = []
@@ -163,7 +165,7 @@ def _pushes(course: Course) -> FloatArray:
 
     At rest nothing rubs, so that a push is along the normal.
     """
-    model, links = course.plant.model, course.plant.model.links
+    model, links = course.model, course.model.links
     ones = [np.array(constraint.can_only_push, float) for constraint in model.constraints]
     push = np.concatenate([np.zeros(0), *ones])
     nq, nv = links.q.numel(), links.v.numel()

@@ -140,7 +140,7 @@ class _Scene:
     """The links and what they touch, before a camera."""
 
     def __init__(self, course: Course, scene_graph: SceneGraph | None) -> None:
-        model, links = course.plant.model, course.plant.model.links.plant
+        model, links = course.model, course.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")
         middle, self._size = _extent(course)
@@ -219,7 +219,7 @@ class _Scene:
         if self._frames:
             poses = FramePoseVector()
             for constraint, frame in self._frames.items():
-                own = own_values(constraint, course.plant.model.dae, course.parameters[number])
+                own = own_values(constraint, course.model.dae, course.parameters[number])
                 poses.set_value(frame, constraint.placement(own))
             diagram.GetInputPort("surroundings").FixValue(context, poses)
         query = diagram.GetOutputPort("query").Eval(context)
@@ -230,7 +230,7 @@ class _Scene:
 def _extent(course: Course) -> tuple[FloatArray, float]:
     """The middle and the size, in m, of the box around all places of the robot."""
     some = course.states[:: max(1, len(course.states) // _PLACES)]
-    boxes = [scene_extent(course.plant.model, course.acting, state) for state in some]
+    boxes = [scene_extent(course.model, course.acting, state) for state in some]
     half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
     middles = np.array([middle for middle, _ in boxes])
     low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)

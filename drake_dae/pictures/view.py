@@ -1,7 +1,6 @@
 """A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
 
 import errno
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from pydrake.geometry import (
@@ -12,17 +11,16 @@ from pydrake.geometry import (
     Rgba,
     SceneGraph,
 )
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import ConstraintForceVisualizer, ForceArrows, path_of
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.functions import TracedFunction
 
 FRAME_RATE = 32.0
@@ -30,25 +28,6 @@ FRAME_RATE = 32.0
 
 _ON_REQUEST = 1e9
 """A publish period so long that only a forced publish draws."""
-
-
-@runtime_checkable
-class RobotBlock(Protocol):
-    """A block that simulates a robot, as a `RobotPlant`."""
-
-    model: RobotModel
-    dae: DaeSystem
-    structure: ConstraintStructure
-    exogenous_places: list[int]
-
-    def GetOutputPort(self, port_name: str) -> OutputPort:
-        """Ports as `link_state` and `constraint_force`."""
-
-    def GetMyContextFromRoot(self, root_context: Context) -> Context:
-        """Its part of a diagram's context."""
-
-    def parameters(self, context: Context) -> FloatArray:
-        """All parameters in the order of `dae.parameters`, shape (k,)."""
 
 
 _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
@@ -73,7 +52,7 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
 
 def add_live_view(
     builder: DiagramBuilder,
-    plant: RobotBlock,
+    plant: Plant,
     scene_graph: SceneGraph | None,
     meshcat: Meshcat,
     exogenous: OutputPort | None = None,
@@ -82,11 +61,13 @@ def add_live_view(
 
     Args:
         builder: The builder of the diagram, with the plant in it.
-        plant: The robot.
+        plant: The plant; nothing is drawn of one that is no robot.
         scene_graph: The geometry of the MultibodyPlant that the links come from, or None.
         meshcat: Where to draw.
         exogenous: What the plant reads at its port of that name, if anything.
     """
+    if plant.model is None:
+        return
     period = 1.0 / FRAME_RATE
     arrows = draw_scene(plant, meshcat)
     forces = builder.AddSystem(
@@ -100,16 +81,20 @@ def add_live_view(
     if links is not None:
         builder.AddSystem(links)
         builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
+    plant.add_own_view(builder, meshcat)
 
 
-def draw_scene(plant: RobotBlock, meshcat: Meshcat) -> ForceArrows:
+def draw_scene(plant: Plant, meshcat: Meshcat) -> ForceArrows:
     """Draws what does not move, and returns what draws the constraint forces.
 
     Args:
         plant: The robot.
         meshcat: Where to draw.
+
+    Raises:
+        ModelError: The plant is no robot.
     """
-    model, dae = plant.model, plant.dae
+    model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
     loads = ConstraintWrenches(model)
     draw_surroundings(meshcat, model, loads, state, dae.parameter_values)
@@ -120,7 +105,7 @@ def draw_scene(plant: RobotBlock, meshcat: Meshcat) -> ForceArrows:
 
 
 def view_of_links(
-    plant: RobotBlock, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
+    plant: Plant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
 ) -> Diagram | None:
     """Drake's own picture of a robot, posed by our link state; its plant is not simulated.
 
@@ -134,7 +119,7 @@ def view_of_links(
     Returns:
         A diagram with (q, v) as its input, or None if the links have no geometry.
     """
-    drawn = plant.model.links.plant
+    drawn = plant.robot("a view").links.plant
     if scene_graph is None or drawn is None or drawn.get_source_id() is None:
         return None
     builder = DiagramBuilder()

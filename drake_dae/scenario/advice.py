@@ -39,11 +39,13 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         The scenario, the same where nothing is advised, and what was chosen in words.
 
     Raises:
-        ScenarioError: Nothing is known to advise, since there are stages of actuation.
+        ScenarioError: Nothing is known to advise, since there is a task, or stages of actuation.
     """
-    material = scenario.plant
-    if not (scenario.is_advised and isinstance(material, ContactMaterial)):
+    material = scenario.plant.material
+    if material is None or not scenario.is_advised:
         return Completed(scenario)
+    if scenario.task is not None:
+        raise ScenarioError(("gains", "none are advised for a task in Drake's contact: give some"))
     if model.stages:
         raise ScenarioError(
             (

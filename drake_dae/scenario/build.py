@@ -1,6 +1,7 @@
 """The closed loop that a scenario describes."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
@@ -14,40 +15,29 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.closed_loop_wiring import can_be_fed_back, make_closed_loop
+from drake_dae.diagrams.parts import hold_before
+from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.state_feedback import make_sensor
-from drake_dae.diagrams.task_loop import TaskLoop
-from drake_dae.diagrams.unilateral import Unilateral
-from drake_dae.diagrams.wiring import hold_before
-from drake_dae.errors import (
-    AssumptionError,
-    ModelError,
-    ScenarioError,
-)
+from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
+from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice import advised
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.forms.keys import at, violated
-from drake_dae.scenario.model import (
-    completed_model,
-    scenario_structure,
-)
+from drake_dae.scenario.model import add_robot, completed_model, scenario_structure
 from drake_dae.scenario.observed import observed_structure
-from drake_dae.scenario.own_model import own_model
-from drake_dae.scenario.plant import contact_plant
+from drake_dae.scenario.own_model import check_pushes, own_model
+from drake_dae.scenario.plants import Planted
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.start import start_closed_loop
-from drake_dae.scenario.task_build import check_task, start_task, wire_task
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.robot_plant import RobotPlant
-from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+from drake_dae.scenario.start import start_scenario
+from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
+from drake_dae.systems.plants.contract import Plant
 
 
 @checked(lambda text: ScenarioError(("", text)))
 def build_scenario(
     scenario: Scenario, meshcat: Meshcat | None = None
-) -> tuple[ClosedLoop | TaskLoop, Context]:
+) -> tuple[ClosedLoop, Context]:
     """The closed loop of a scenario, and its context at the start.
 
     Args:
@@ -63,7 +53,7 @@ def build_scenario(
 
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None
-) -> tuple[Completed, ClosedLoop | TaskLoop]:
+) -> tuple[Completed, ClosedLoop]:
     """A scenario completed, and its loop, which `start_scenario` starts as often as one likes.
 
     The arguments and errors are those of `build_scenario`.
@@ -76,69 +66,36 @@ def build_completed(
         structure = scenario_structure(model)
     except AssumptionError as error:
         raise violated(error) from error
-    if completed.scenario.task is not None:
-        return completed, wire_task(completed.scenario, model, structure, scene_graph, meshcat)
     chosen = advised(completed.scenario, model, structure)
     completed = Completed(chosen.scenario, (*completed.notes, *chosen.notes))
-    return completed, wire_loop(completed.scenario, model, structure, scene_graph, meshcat)
+    return completed, build_loop(completed.scenario, model, structure, scene_graph, meshcat)
 
 
-def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
-    """The closed loop of a scenario of which nothing is left open.
+def build_law_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
+    """The closed loop of a scenario without a task.
 
     The arguments and errors are those of `build_scenario`.
     """
     loop = build_completed(scenario, meshcat)[1]
-    if isinstance(loop, TaskLoop):
+    if loop.generator is None:
         raise ScenarioError(
             ("task", "sweeps and exports know `references` alone; `drake-dae simulate` runs a task")
         )
     return loop
 
 
-def start_scenario(scenario: Scenario, loop: ClosedLoop | TaskLoop) -> Context:
-    """A new context of a closed loop at a scenario's start.
-
-    Args:
-        scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
-            uncoupled gains, and the seed of the sensor may be others than those it was built with.
-        loop: What `build_loop` made.
-
-    Raises:
-        ScenarioError: Something does not fit; the message names its key.
-    """
-    if isinstance(loop, TaskLoop):
-        return start_task(scenario, loop)
-    return start_closed_loop(scenario, loop)
-
-
-def wire_scenario(
+def build_loop(
     scenario: Scenario,
     model: RobotModel,
     structure: Structure,
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
-) -> tuple[ClosedLoop, Context]:
-    """The closed loop of a scenario's robot, and its context at the start.
-
-    The arguments and errors are those of `wire_loop`.
-    """
-    loop = wire_loop(scenario, model, structure, scene_graph, meshcat)
-    return loop, start_scenario(scenario, loop)
-
-
-def wire_loop(
-    scenario: Scenario,
-    model: RobotModel,
-    structure: Structure,
-    scene_graph: SceneGraph | None = None,
-    meshcat: Meshcat | None = None,
-    plant: RobotPlant | ContactPlant | UnilateralRobotPlant | None = None,
+    plant: Plant | None = None,
 ) -> ClosedLoop:
     """The closed loop of a scenario's robot.
 
     Args:
-        scenario: What `load_scenario` returns.
+        scenario: A scenario of which nothing is left open, with gains: by `advised`.
         model: The scenario's robot, by `scenario_model`.
         structure: The structure of the model's system.
         scene_graph: Where the robot's geometry is registered; needed to draw it.
@@ -148,86 +105,112 @@ def wire_loop(
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    scenario = advised(scenario, model, structure).scenario
-    # The law, the sensor that it may need, and the references.
-    force = scenario.force
-    with at("force"):
-        sensor = force.sensor(model.dae.num_constraints)
-    damping = scenario.constraint_damping
-    keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
-    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
-    observed = observed_structure(scenario, model, structure)
-    with at(" or ".join(keys)):
-        assert scenario.gains is not None  # advised.
-        assert scenario.integral is not None
-        gains = scenario.gains.design()
-        law = TrackingLaw(
-            observed.system,
-            gains,
-            structure=observed,
-            measured_force=force.is_measured,
-            force_gain=force.gain,
-            constraint_damping=None if damping is None else damping.design(),
-            integral=scenario.integral,
-        )
-    references = _references(scenario.references, law)
+    # The law, and what it knows of what moves.
+    task, sampling = scenario.task, scenario.sampling
+    opens = "" if task is None else opening_contact(scenario, model).name
+    law = _law(scenario, observed_structure(scenario, model, structure))
+    references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
-
-    # The diagram.
     limits = _limits(scenario, model)
-    feedback = can_be_fed_back(law, scenario.sampling, limits)
+
+    # The plant, which may know more.
+    feedback = task is None and can_be_fed_back(law, sampling, limits)
     own = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
-    if own is None:
-        plant = plant or _plant(scenario, model, structure, feedback)
-    else:
-        plant, scene_graph = _plant(scenario, own.model, own.structure, False), own.scene_graph
+    if own is not None:
+        plant, scene_graph = make_plant(scenario, own.model, own.structure), own.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
-    if scenario.sampling is not None:
-        with at("sampling"):
-            hold_before(plant, scenario.sampling)
-    if scenario.encoders is not None:
-        with at("encoders"):
-            period = scenario.sampling.period if scenario.sampling else plant.time_step
-            make_sensor(plant, scenario.encoders, period)
-    if scenario.tolerances is not None:
-        with at("tolerances"):
-            scenario.tolerances.places(model.dae.output_signals)
-    observer = scenario.observer
-    keys = ["observer"] if observer is not None else []
-    keys += ["force"] if force.is_measured or observer is not None else []
+    plant = plant or make_plant(scenario, model, structure, feedback, opens)
+
+    # The parts between them; what does not fit is told with its key.
+    with at("force"):
+        sensor = scenario.force.sensor(model.dae.num_constraints)
+    settings = LoopSettings(
+        sensor=sensor,
+        encoders=scenario.encoders,
+        sampling=sampling,
+        control_limits=limits,
+        observer=scenario.observer,
+        exogenous=exogenous,
+        plant_exogenous=plant_exogenous,
+        tolerances=scenario.tolerances,
+        start_time=scenario.integrator.start_time,
+    )
+    _check_parts(settings, plant)
+
+    # The wiring.
+    if task is not None:
+        controller = task_controller(scenario, model, law, settings.period(plant.time_step))
+        with at("task"):
+            return wire_loop(
+                plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
+            )
+    keys = ["observer"] if scenario.observer is not None else []
+    keys += ["force"] if scenario.force.is_measured or keys else []
     with at(" or ".join(keys) or "start.positions"):
         return make_closed_loop(
-            plant,
-            law,
-            references,
-            exogenous=exogenous,
-            plant_exogenous=plant_exogenous,
-            sensor=sensor,
-            sampling=scenario.sampling,
-            encoders=scenario.encoders,
-            control_limits=limits,
-            tolerances=scenario.tolerances,
-            observer=observer,
-            scene_graph=scene_graph,
-            meshcat=meshcat,
-            start_time=scenario.integrator.start_time,
+            plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
         )
 
 
-def _plant(
-    scenario: Scenario, model: RobotModel, structure: Structure, feedback: bool
-) -> RobotPlant | ContactPlant | UnilateralRobotPlant:
-    """What is simulated."""
-    if isinstance(scenario.plant, Unilateral):
-        with at("plant.restitution"):
-            return scenario.plant.plant(model, structure)
-    if not isinstance(scenario.plant, ContactMaterial):
-        return RobotPlant(model, structure=structure, feedback=feedback)
-    return contact_plant(scenario, model, structure)
+def make_plant(
+    scenario: Scenario,
+    model: RobotModel,
+    structure: Structure,
+    feedback: bool = False,
+    opens: str = "",
+) -> Plant:
+    """What is simulated of a scenario.
+
+    Args:
+        scenario: The scenario.
+        model: The robot, with what the plant carries where that is not the plant's own affair.
+        structure: The structure of the model's system.
+        feedback: Whether the plant may take a law itself.
+        opens: The contact that a task opens and closes; empty without a task.
+
+    Raises:
+        ScenarioError: The robot cannot be simulated so; the message names the key.
+    """
+    check_pushes(scenario.plant_pushes, model.links)
+    adds = partial(add_robot, scenario.robot, payloads=scenario.plant_payloads)
+    parameters, pushes = scenario.plant_parameters, scenario.plant_pushes
+    robot = Planted(model, structure, feedback, opens, adds, parameters, pushes)
+    return scenario.plant.plant(robot)
+
+
+def _law(scenario: Scenario, known: Structure) -> TrackingLaw:
+    """The law of a scenario, for a system of which it knows so much."""
+    force, damping = scenario.force, scenario.constraint_damping
+    keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
+    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
+    with at(" or ".join(keys)):
+        assert scenario.gains is not None  # advised.
+        return TrackingLaw(
+            known.system,
+            scenario.gains.design(),
+            structure=known,
+            measured_force=force.is_measured,
+            force_gain=force.gain,
+            constraint_damping=None if damping is None else damping.design(),
+            integral=scenario.integral or (),
+        )
+
+
+def _check_parts(settings: LoopSettings, plant: Plant) -> None:
+    """Refuses parts that do not fit the plant, by the keys that they have in a scenario."""
+    if settings.sampling is not None:
+        with at("sampling"):
+            hold_before(plant, settings.sampling)
+    if settings.encoders is not None:
+        with at("encoders"):
+            make_sensor(plant, settings.encoders, settings.period(plant.time_step))
+    if settings.tolerances is not None:
+        with at("tolerances"):
+            settings.tolerances.places(plant.dae.output_signals)
 
 
 @at("saturation")

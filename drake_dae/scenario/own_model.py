@@ -14,7 +14,6 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import each
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 from drake_dae.systems.plants.contact.pushes import Push
 
 
@@ -48,7 +47,7 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
         ScenarioError: Something does not fit; the message names its key.
     """
     payloads, pushes = scenario.plant_payloads, scenario.plant_pushes
-    if not (payloads or pushes) or isinstance(scenario.plant, ContactMaterial):
+    if scenario.plant.carries or not (payloads or pushes):
         return None
     check_pushes(pushes, links)
     named = {f"plant_push_{index}": push for index, push in enumerate(pushes)}

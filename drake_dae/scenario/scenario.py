@@ -14,6 +14,7 @@ from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
+from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.reader import Reader
 from drake_dae.scenario.parts import parts as parts
@@ -37,7 +38,6 @@ from drake_dae.scenario.parts.families import (
 )
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.simulation.simulate import check_config, check_duration
-from drake_dae.systems.plants.contact import contact_material
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
@@ -152,7 +152,7 @@ class Scenario:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     observer: Observer | None = None
-    plant: Plant = field(default_factory=parts.IdealConstraints)
+    plant: Plant = field(default_factory=plants.IdealConstraints)
     sampling: Sampling | None = None
     encoders: Encoders | None = None
     saturation: bool = False
@@ -180,7 +180,7 @@ class Scenario:
     @property
     def is_advised(self) -> bool:
         """Whether the gains are left to be advised."""
-        return self.gains is None and isinstance(self.plant, contact_material.ContactMaterial)
+        return self.gains is None and self.plant.material is not None
 
     def __repr__(self) -> str:
         names = listed(constraint.name for constraint in self.constraints)

@@ -1,51 +1,69 @@
 """Where the runs of a scenario start."""
 
-from typing import cast
-
 import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.robot_plant import RobotPlant
 
 
-def new_context(scenario: Scenario, loop: ClosedLoop | TaskLoop) -> Context:
-    """A new context of a loop, at a scenario's start_time and with its plant_parameters.
+def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
+    """A new context of a closed loop at a scenario's start.
+
+    It is at rest, or, where something moves, in motion with the references. A law begins where its
+    references begin, plus the errors; a task at start.positions, on what its first phase touches.
+
+    Args:
+        scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
+            uncoupled gains, and the seed of the sensor may be others than those it was built with.
+        loop: What `build_completed` made.
 
     Raises:
-        ScenarioError: A parameter does not fit; the message names its key.
+        ScenarioError: Something does not fit; the message names its key.
     """
     context = loop.diagram.CreateDefaultContext()
     context.SetTime(scenario.integrator.start_time)
-    plant = loop.plant
-    if not isinstance(plant, ContactPlant):
-        own = plant.GetMyMutableContextFromRoot(context)
+    plant, controller = loop.plant, loop.controller
+    own = plant.GetMyMutableContextFromRoot(context)
+    if not scenario.plant.carries:
         with at("plant_parameters"):
             for name, numbers in scenario.plant_parameters.items():
                 plant.set_parameter(own, name, numbers)
+    if controller.takes_over:
+        with at("start"):
+            plant.set_state(own, _standing(scenario, loop, plant.current_parameters(own)))
+    else:
+        _begin_with_references(scenario, loop, context)
+    loop.set_seed(context, scenario.force.seed)
+    if loop.encoders is not None and scenario.encoders is not None:
+        loop.encoders.set_seed(context, scenario.encoders.seed)
     return context
 
 
-def start_closed_loop(scenario: Scenario, loop: ClosedLoop) -> Context:
-    """A new context of a closed loop: at rest, where the references begin, plus the errors.
+def _standing(scenario: Scenario, loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
+    """The state at rest at start.positions, or next to them where constraints hold."""
+    model = loop.plant.robot("a scenario")
+    guess = start_guess(scenario.start.positions, model.links)
+    forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
+    near = model.rest_state(guess, forces, parameters)
+    q = loop.controller.start_structure.manifold.settle(near, parameters)[: guess.size]
+    return model.rest_state(q, forces, parameters)
 
-    The arguments and errors are those of `start_scenario`.
-    """
-    context, plant = new_context(scenario, loop), loop.plant
-    model = cast(RobotPlant, plant).model
+
+def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
+    """Puts plant and sensor where the references begin, plus the errors."""
+    plant, controller = loop.plant, loop.controller
+    model = plant.robot("a scenario")
     if scenario.gains is not None:  # Those that were advised are in the law.
         with at("gains"):
-            of_law = loop.controller.GetMyMutableContextFromRoot(context)
-            loop.controller.set_gains(of_law, scenario.gains.design())
+            of_law = controller.GetMyMutableContextFromRoot(context)
+            controller.set_gains(of_law, scenario.gains.design())
     own = plant.GetMyMutableContextFromRoot(context)
     parameters = plant.current_parameters(own)
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
@@ -60,10 +78,6 @@ def start_closed_loop(scenario: Scenario, loop: ClosedLoop) -> Context:
     if loop.sensor is not None:
         force = model.rest_forces(q, forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
-        loop.set_seed(context, scenario.force.seed)
-    if loop.encoders is not None and scenario.encoders is not None:
-        loop.encoders.set_seed(context, scenario.encoders.seed)
-    return context
 
 
 def _in_motion(

@@ -14,7 +14,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.errors import (
     AssumptionError,
     DrakeDaeError,
@@ -23,16 +22,16 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
-from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.scenario import Scenario, read_scenario
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import exceeded, run_figures
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
 from drake_dae.studies.variations import Variation
-from drake_dae.systems.plants.robot_plant import RobotPlant
 
 
 class Outcome(StrEnum):
@@ -141,10 +140,10 @@ class Runner:
         self._base = base
         self._lasting = lasting
         self._key = ""
-        self._built: ClosedLoop | TaskLoop | DrakeDaeError | None = None
+        self._built: ClosedLoop | DrakeDaeError | None = None
         self.builds = 0
 
-    def loop(self, data: Mapping[str, Any]) -> ClosedLoop | TaskLoop:
+    def loop(self, data: Mapping[str, Any]) -> ClosedLoop:
         """The closed loop of a scenario's data.
 
         Raises:
@@ -164,7 +163,7 @@ class Runner:
             self._key = key
         if isinstance(self._built, DrakeDaeError):
             raise self._built
-        return cast(ClosedLoop | TaskLoop, self._built)
+        return cast(ClosedLoop, self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
         """What is wrong with the words of a variation; None if nothing is.
@@ -179,7 +178,7 @@ class Runner:
             return None if _is_about_states(error) else error
         except DrakeDaeError:
             return None
-        if self._lasting is not None and isinstance(loop, ClosedLoop):
+        if self._lasting is not None:
             from drake_dae.running.rollout.rollout import functions_of
 
             try:
@@ -221,14 +220,14 @@ def _is_about_states(error: BaseException | None) -> bool:
 
 
 def _simulated(
-    number: int, scenario: Scenario, loop: ClosedLoop | TaskLoop, lasting: float | None
+    number: int, scenario: Scenario, loop: ClosedLoop, lasting: float | None
 ) -> RunResult:
     """What a run comes to, from a new context of the loop."""
     try:
         context = start_scenario(scenario, loop)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if lasting is None or isinstance(loop, TaskLoop):
+            if lasting is None:
                 record, steps, failure = _stepped(scenario, loop, context)
             else:
                 from drake_dae.scenario.rolled import roll_scenario
@@ -238,7 +237,7 @@ def _simulated(
     except DrakeDaeError as error:
         outcome = Outcome.NO_START if _is_about_states(error) else Outcome.REFUSED
         return RunResult(number, outcome, str(error))
-    limits = Limits.of(cast(RobotPlant, loop.plant).model)
+    limits = Limits.of(loop.plant.robot("a study"))
     figures, beyond = run_figures(record, limits), tuple(exceeded(record, limits))
     if failure is not None:
         return RunResult(number, Outcome.FAILED, str(failure), figures, beyond)
@@ -246,7 +245,7 @@ def _simulated(
 
 
 def _stepped(
-    scenario: Scenario, loop: ClosedLoop | TaskLoop, context: Context
+    scenario: Scenario, loop: ClosedLoop, context: Context
 ) -> tuple[Record, int, SimulationError | None]:
     """What Drake's Simulator makes of a run: its record, how many steps it took, why it failed."""
     steps, failure = 0, None

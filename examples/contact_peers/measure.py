@@ -26,10 +26,10 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice import advised
-from drake_dae.scenario.build import start_scenario, wire_loop
+from drake_dae.scenario.build import build_loop, make_plant
 from drake_dae.scenario.model import scenario_model, scenario_structure
-from drake_dae.scenario.plant import contact_plant
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.simulate import simulate
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import ControlHold
@@ -107,7 +107,7 @@ class Setup:
         return cls(advised(scenario, model, structure).scenario, model, structure)
 
     def plant(self, condition: Condition) -> MeasuredPlant:
-        plant = contact_plant(self.scenario, self.model, self.structure)
+        plant = make_plant(self.scenario, self.model, self.structure)
         return MeasuredPlant(plant, condition.noise)
 
 
@@ -115,7 +115,7 @@ def run_ours(condition: Condition, friction: float, settings: tuple[str, ...] = 
     """Our law, as its scenario wires it; the settings are those of `--set`."""
     setup = Setup.of(condition, friction, settings)
     plant = setup.plant(condition)
-    loop = wire_loop(setup.scenario, setup.model, setup.structure, plant=plant)
+    loop = build_loop(setup.scenario, setup.model, setup.structure, plant=plant)
     context = start_scenario(setup.scenario, loop)
     vary(condition, plant, context)
     try:
@@ -140,7 +140,7 @@ class Beginning:
     @cache
     def of(cls, condition: Condition) -> "Beginning":
         setup = Setup.of(condition, 0.0)
-        loop: ClosedLoop = wire_loop(
+        loop: ClosedLoop = build_loop(
             setup.scenario, setup.model, setup.structure, plant=setup.plant(condition)
         )
         context = start_scenario(setup.scenario, loop)

@@ -29,11 +29,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
 
 import drake_dae as dd
-from drake_dae.scenario.build import build_completed, start_scenario
+from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.model import add_robot
-from drake_dae.scenario.parts.parts import IdealConstraints
+from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.start import start_scenario
 
 SETTLED, DURATION = 2.0, 6.0
 ROUGHNESS = 0.4  # N m from one sample to the next.
@@ -187,9 +188,11 @@ def closed_loop(condition: Condition) -> tuple[Scenario, dd.ClosedLoop]:
         NoisyPlant(fresh),
         law,
         dict(scenario.references),
-        sensor=scenario.force.sensor(plant.dae.num_constraints),
-        sampling=scenario.sampling,
-        observer=scenario.observer,
+        dd.LoopSettings(
+            sensor=scenario.force.sensor(plant.dae.num_constraints),
+            sampling=scenario.sampling,
+            observer=scenario.observer,
+        ),
     )
 
 

@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 from drake_dae import (
     ConstantReference,
     LinkExpressions,
+    LoopSettings,
     Plane,
     PointCoordinates,
     PointOnSurface,
@@ -288,7 +289,7 @@ def test_a_sampled_law_begins_in_contact_and_leaves_at_its_first_sample_that_pul
     tracking, period = TrackingLaw(slider.dae, poles(-5.0)), 0.03
     plant = UnilateralRobotPlant(slider, {"wall": BOUNCE}, structure=tracking.structure)
     references = [ConstantReference(0.2), SinusoidReference(PUSH, SWING, RATE)]
-    loop = make_closed_loop(plant, tracking, references, sampling=Sampling(period))
+    loop = make_closed_loop(plant, tracking, references, LoopSettings(sampling=Sampling(period)))
     context = loop.diagram.CreateDefaultContext()
     plant.set_consistent_state(plant.GetMyMutableContextFromRoot(context), [0.0, 0.2, 0.0, 0.0])
     simulate(loop.diagram, context, 2.2, error_controlled(1e-9))
@@ -325,7 +326,7 @@ def test_the_integral_of_a_force_stands_still_while_its_contact_is_open(slider, 
     )
     plant = UnilateralRobotPlant(slider, {"wall": 0.0}, structure=tracking.structure)
     references = [ConstantReference(0.2), SinusoidReference(0.0, -6.0, 4.0, -0.4)]
-    loop = make_closed_loop(plant, tracking, references, control_limits=limits)
+    loop = make_closed_loop(plant, tracking, references, LoopSettings(control_limits=limits))
     context = loop.diagram.CreateDefaultContext()
     plant.set_consistent_state(plant.GetMyMutableContextFromRoot(context), [0.0, 0.25, 0.0, 0.0])
     controller = loop.controller

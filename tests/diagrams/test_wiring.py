@@ -9,6 +9,7 @@ from drake_dae import (
     ConstantReference,
     DcMotors,
     ForceSensor,
+    LoopSettings,
     NormalForm,
     RobotPlant,
     StateRealization,
@@ -33,7 +34,7 @@ def rigid(sensor=None, gain=1.0, measured=True):
         force_gain=gain if measured else 0.0,
     )
     plant = RobotPlant(found.model, structure=found.structure)
-    return make_closed_loop(plant, law, REFERENCES, sensor=sensor)
+    return make_closed_loop(plant, law, REFERENCES, LoopSettings(sensor=sensor))
 
 
 def test_a_direct_connection_that_loops_is_refused_with_the_remedy():
@@ -184,5 +185,5 @@ def test_a_gain_without_effect_is_refused():
 def test_a_state_realization_is_no_plant_for_the_closed_loop():
     chosen = law("two_link")
     realization = StateRealization(NormalForm(chosen.structure.system, structure=chosen.structure))
-    with pytest.raises(WiringError, match="UnilateralRobotPlant, got StateRealization"):
+    with pytest.raises(WiringError, match="plant must be a Plant, got StateRealization"):
         make_closed_loop(realization, chosen, [ConstantReference([0.2, 20.0])])

@@ -12,6 +12,7 @@ from drake_dae import (
     ExpressionReference,
     FlexibleJoints,
     KnownForce,
+    LoopSettings,
     RobotModel,
     RobotPlant,
     SinusoidReference,
@@ -78,7 +79,7 @@ def test_a_law_that_knows_a_push_is_not_moved_by_it(actuation):
     law = TrackingLaw(model.dae, poles(-6.0))
     goals = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
     plant = RobotPlant(model, structure=law.structure)
-    loop = make_closed_loop(plant, law, goals, exogenous=[push])
+    loop = make_closed_loop(plant, law, goals, LoopSettings(exogenous=[push]))
     simulator = Simulator(loop.diagram)
     config = error_controlled(1e-10)
     config.integration_scheme = "runge_kutta5"

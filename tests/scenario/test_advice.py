@@ -10,6 +10,7 @@ from runs import scenario
 from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import plants
 from drake_dae.scenario.advice import advised
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import save_scenario
@@ -106,7 +107,7 @@ def test_nothing_is_advised_behind_springs():
 
 
 def test_ideal_plants_are_not_advised():
-    found = replace(two_link(), plant=parts.IdealConstraints())
+    found = replace(two_link(), plant=plants.IdealConstraints())
     assert found.gains == parts.Poles(all=[-4.0])
     model = scenario_model(found)
     assert advised(found, model, scenario_structure(model)).scenario is found

@@ -7,9 +7,8 @@ from runs import run_scenario, scenario
 
 from drake_dae import Record, build_scenario, load_scenario, simulate, start_meshcat
 from drake_dae.cli import main
-from drake_dae.diagrams.task_loop import TaskLoop
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.build import build_loop
+from drake_dae.scenario.build import build_law_loop
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 
 # At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
@@ -86,7 +85,7 @@ def test_shipped_task_touches_as_designed_and_is_as_predicted():
     loop, context, record = run_scenario(
         scenario("wall_polish", "duration=3.5", "integrator.accuracy=1e-6")
     )
-    assert isinstance(loop, TaskLoop)
+    assert loop.generator is None
     touch = loop.changes(context)[2]
     assert touch.phase == "Press"
     assert_allclose(touch.time, 2.1 + 1.0 + 0.25, atol=1e-5)
@@ -125,7 +124,7 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
 
 def test_what_knows_no_tasks_says_so(file):
     with pytest.raises(ScenarioError, match="task: sweeps and exports know `references` alone"):
-        build_loop(load_scenario(file))
+        build_law_loop(load_scenario(file))
 
 
 def test_a_rollout_of_a_task_is_refused_in_its_words(file, tmp_path, capsys):

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae import (
     Approach,
+    ClosedLoop,
     KnownForce,
     Move,
     PointToPointReference,
@@ -21,14 +22,13 @@ from drake_dae import (
     RobotModel,
     Task,
     TaskController,
-    TaskLoop,
     TrackingLaw,
     UnilateralRobotPlant,
-    make_task_loop,
     open_contact,
     poles,
     shipped_model,
     simulate,
+    wire_loop,
 )
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.systems.task.phases import Phase
@@ -66,13 +66,13 @@ def laws() -> tuple[TrackingLaw, TrackingLaw]:
     return TrackingLaw(system, poles(POLE)), TrackingLaw(free, poles(POLE))
 
 
-def task_loop(phases: Sequence[Phase], **settings: float) -> TaskLoop:
+def task_loop(phases: Sequence[Phase], **settings: float) -> ClosedLoop:
     """The ideal plant under a task."""
     controller = TaskController(Task(phases, **settings), *laws())
-    return make_task_loop(UnilateralRobotPlant(polisher(), {"wall": 0.0}), controller)
+    return wire_loop(UnilateralRobotPlant(polisher(), {"wall": 0.0}), controller)
 
 
-def started(loop: TaskLoop, distance: float = FAR, height: float = 0.3) -> Context:
+def started(loop: ClosedLoop, distance: float = FAR, height: float = 0.3) -> Context:
     """A context of a loop with the arm at rest, off the wall."""
     context = loop.diagram.CreateDefaultContext()
     guess = polisher().dae.nominal_state
@@ -80,14 +80,14 @@ def started(loop: TaskLoop, distance: float = FAR, height: float = 0.3) -> Conte
     return context
 
 
-def run_on(loop: TaskLoop, context: Context, end: float, accuracy: float = 1e-6) -> RunStatistics:
+def run_on(loop: ClosedLoop, context: Context, end: float, accuracy: float = 1e-6) -> RunStatistics:
     """Goes on until a time."""
     config = error_controlled(accuracy)
     config.start_time = context.get_time()
     return simulate(loop.diagram, context, end - context.get_time(), config)
 
 
-def push(loop: TaskLoop, context: Context, force: float) -> None:
+def push(loop: ClosedLoop, context: Context, force: float) -> None:
     """A hand that pushes the tool into the wall, or pulls it off."""
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_parameter(own, "push.force", np.array([force, 0.0, 0.0]))

@@ -14,11 +14,12 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.build import exogenous_references, wire_scenario
+from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.model import completed_model, scenario_structure
-from drake_dae.scenario.parts.parts import IdealConstraints
+from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 
@@ -65,7 +66,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         observer=None,
         tolerances=None,
     )
-    loop, context = wire_scenario(ideal, model, structure)
+    loop = build_loop(ideal, model, structure)
+    context = start_scenario(ideal, loop)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 
     def signals(time: float) -> FloatArray:

@@ -8,10 +8,10 @@ from casadi import SX
 from numpy.typing import ArrayLike
 
 from drake_dae.dae import references
-from drake_dae.diagrams import unilateral
 from drake_dae.robots import actuation, force_outputs, loads, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.surfaces import implicit, maps, surface, surfaces
+from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
 from drake_dae.scenario.parts import parts as parts
@@ -19,7 +19,7 @@ from drake_dae.scenario.parts import written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import contact_material, pushes
+from drake_dae.systems.plants.contact import pushes
 from drake_dae.systems.sensing import encoders, tolerances
 from drake_dae.systems.task import phases
 
@@ -91,9 +91,7 @@ Payload = Annotated[payloads.Payload, Form()]
 Push = Annotated[pushes.Push, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
-    parts.IdealConstraints
-    | Annotated[contact_material.ContactMaterial, Form(tag="!MultibodyPlant")]
-    | unilateral.Unilateral,
+    plants.IdealConstraints | plants.MultibodyPlant | plants.Unilateral,
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]

@@ -68,11 +68,6 @@ class Observer(Observing):
 
 
 @dataclass(frozen=True)
-class IdealConstraints:
-    """The plant is a `RobotPlant`: its constraints hold exactly."""
-
-
-@dataclass(frozen=True)
 class PerOutput:
     """Numbers for all outputs, or for each.
 

@@ -1,6 +1,7 @@
 """The tracking law as a LeafSystem."""
 
 import warnings
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -17,6 +18,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.stability import Verdict
@@ -27,12 +29,13 @@ from drake_dae.systems.blocks.feedback import Feedback, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
-class TrackingController(ParameterizedSystem):
+class TrackingController(ParameterizedSystem, Controller):
     """The law (28) of any `TrackingLaw`: u = B(x)^-1 (-a(x) + ubar(x, R)).
 
     Input ports:
@@ -85,6 +88,7 @@ class TrackingController(ParameterizedSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    follows, shown = True, ("tracking_error",)
 
     def __init__(
         self,
@@ -215,6 +219,26 @@ class TrackingController(ParameterizedSystem):
         """What the law's function takes as parameters: the model's at the context's time, and K."""
         self.check_context(context)
         return np.array(self._values(context))
+
+    @property
+    def further_signals(self) -> Mapping[str, Sequence[Signal]]:
+        integral = self.law.integral
+        return {"integral": integral.signals} if integral.outputs else {}
+
+    def derived(
+        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
+    ) -> Derived:
+        """`desired_output` r and `tracking_error` z - r (29), from "reference" and z."""
+        desired, signals = values["reference"][:, self.law.layout.lowest], self.dae.output_signals
+        error = values["controlled_output"] - desired
+        return {"desired_output": (desired, signals), "tracking_error": (error, signals)}
+
+    def predicted_error(
+        self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
+    ) -> FloatArray:
+        integral = values["integral"][0] if self.law.integral.outputs else None
+        start = values["state"][0], values["reference"][0]
+        return self.law.predicted_error(times - times[0], *start, parameters, integral)
 
     def _calc_control(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._evaluate(context)[0])

@@ -183,6 +183,12 @@ class DisturbanceObserver(ParameterizedSystem):
             {self.input_port_ticket(port.get_index()) for port in ports},
         )
 
+    @property
+    def further_signals(self) -> dict[str, Sequence[Signal]]:
+        """Name of an output port that a record has -> names and units of its entries."""
+        known = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
+        return {name: signals for name, signals in known.items() if signals}
+
     def _told(self, names: Sequence[str], degrees: Sequence[int]) -> list[int]:
         """Where the estimate has what the port `exogenous` tells."""
         size = len(self.observation.rows)

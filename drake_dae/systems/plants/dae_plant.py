@@ -42,6 +42,7 @@ from drake_dae.systems.blocks.feedback import Feedback, motion_under, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.functions import TracedFunction
 
 _CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
@@ -68,7 +69,7 @@ class _FedBack(NamedTuple):
 
 
 @checked(ModelError)
-class DaePlant(ParameterizedSystem):
+class DaePlant(ParameterizedSystem, Plant):
     """The solution of a differential-algebraic system (1)-(3) on its manifold N*:
 
         x' = f(x) + g(x) v + h(x) u,    v = alpha(x) + beta(x) u,    z = l(x) + m(x) v.
@@ -140,8 +141,6 @@ class DaePlant(ParameterizedSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
-    #: The step of a discrete plant in s; 0 for one that is continuous, as this is.
-    time_step = 0.0
 
     def __init__(
         self,
@@ -171,7 +170,7 @@ class DaePlant(ParameterizedSystem):
         self._output = structure.trace(
             "controlled output", output, self._output_needs_control, doubt
         )
-        self.functions = {
+        self.functions: dict[str, TracedFunction] = {
             "constraint_force": self._force,
             "constraint_residual": structure.manifold.residual_function,
             "controlled_output": self._output,

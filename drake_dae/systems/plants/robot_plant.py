@@ -1,11 +1,14 @@
 """A RobotModel as a LeafSystem."""
 
+from collections.abc import Mapping, Sequence
+
 import casadi as ca
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
@@ -59,13 +62,17 @@ class RobotPlant(DaePlant):
         feedback: bool = False,
     ) -> None:
         super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
-        self.model = model
+        self.model: RobotModel = model
         own = weakly(self._values), weakly(self._shown_force)
         by_force = self._by_control if self._force_needs_control else self._by_state
         self._ports = RobotPorts(self, model, model.dae, *own, self._by_state, by_force)
         self.wrench_signals = self._ports.wrench_signals
         if self._ports.loops is not None:
             self.functions["loop_state"] = self._ports.loops
+
+    @property
+    def further_signals(self) -> Mapping[str, Sequence[Signal]]:
+        return self._ports.loop_signals
 
     def _shown_force(self, context: Context) -> FloatArray:
         return self._evaluate(self._force, context, self._force_needs_control)

@@ -1,11 +1,12 @@
 """The ports that every plant of a RobotModel has beside those of its system."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import casadi as ca
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
@@ -32,6 +33,7 @@ class RobotPorts:
         parts: Name of a port -> the part of the state that it shows.
         wrench_signals: Names and units of `constraint_wrenches`.
         wrenches, force: That port as expressions, and the symbols of lambda in it.
+        loop_signals: Names and units of `loop_state` under that name; empty without it.
         loops, joint_force: What the ports `loop_state` and `joint_torque` compute; None without.
     """
 
@@ -65,7 +67,9 @@ class RobotPorts:
         plant.DeclareVectorOutputPort("constraint_wrenches", size, calc, by_force)
 
         self.loops = self.joint_force = None
+        self.loop_signals: dict[str, Sequence[Signal]] = {}
         if model.loop_joints.signals:
+            self.loop_signals = {"loop_state": model.loop_joints.signals}
             self.loops = dae.trace("loop state", {"value": model.loop_joints.state})
             size, calc = len(model.loop_joints.signals), weakly(self._calc_of, self.loops)
             plant.DeclareVectorOutputPort("loop_state", size, calc, by_state)

@@ -1,5 +1,7 @@
 """A task as a controller: a law for each member, and what leads from one to the other."""
 
+from collections.abc import Mapping, Sequence
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,21 +10,37 @@ from pydrake.systems.primitives import MatrixGain, PortSwitch
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, WiringError
+from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.control.contract import Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.open_contact import output_of_force
 from drake_dae.systems.task.planner import CONTACT, FREE
+from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import PhaseChange, Segment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
+_REFUSED = {
+    "exogenous": "nothing may move in a task; leave it out",
+    "plant_exogenous": "a task does not know it; leave it out",
+    "control_limits": "the drives of a task have no limits; leave it out",
+    "observer": "a task does not know it; leave it out",
+    "encoders": "a task does not know it; leave it out",
+    "tolerances": "a task does not know it; leave it out",
+}
+"""What a task cannot be wired with, and why."""
+
 
 @checked(ModelError)
-class TaskController(Diagram):
+class TaskController(Diagram, Controller):
     """A task in phases: approach, touch, press, move, release, retreat.
 
     In contact the law (28) of the robot with the contact acts, which tracks the contact's force;
@@ -81,6 +99,7 @@ class TaskController(Diagram):
     """
 
     __slots__ = SHARED_DICTIONARY
+    takes_over, shown, refused = True, ("desired_output",), _REFUSED
 
     def __init__(
         self,
@@ -200,6 +219,84 @@ class TaskController(Diagram):
                 for i, time in zip(places_at(segments, moments), moments, strict=True)
             ]
         ).reshape(moments.size, -1)
+
+    @property
+    def phase_signals(self) -> tuple[Signal, ...]:
+        """The names of the phases as a record has them: "1 Approach", "2 Press", ..., "end"."""
+        names = [phase.name for phase in self.task.phases]
+        return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal("end"))
+
+    @property
+    def further_signals(self) -> Mapping[str, Sequence[Signal]]:
+        named: dict[str, Sequence[Signal]] = {"phase": (Signal("phase"),)}
+        for name, law in (("integral", self.law), ("free_integral", self.free_law)):
+            if law.integral.outputs:
+                named[name] = law.integral.signals
+        return named
+
+    @property
+    def start_structure(self) -> ConstraintStructure:
+        law = self.law if self.task.contacts[0] else self.free_law
+        return law.structure
+
+    def all_parameters(self, context: Context) -> FloatArray:
+        return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
+
+    def check_plant(self, plant: Plant) -> None:
+        system = self.law.system
+        check_same_sizes(plant.dae, system, "task", "the laws for the plant's robot")
+        if plant.time_step and not self.sample_period:
+            raise WiringError(
+                f"the plant steps by {plant.time_step:g} s, and its state jumps there: make the "
+                f"controller with sample_period={plant.time_step:g} or a multiple of it"
+            )
+        name = system.force_signals[self.force].name
+        if plant.contacts and name.split(".")[0] not in plant.contacts:
+            raise WiringError(
+                f"the contact with the force '{name}' does not open in this plant; what does is "
+                f"{', '.join(plant.contacts)}"
+            )
+
+    def derived(
+        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
+    ) -> Derived:
+        """What a record has of a task.
+
+        The outputs are the positions, the force and the distance; in contact the distance that is
+        wanted is zero, and else the force. "distance" has the distance and its derivative, "phase"
+        1 for the phase that goes on and 0 for all others, "predicted_error" what theory says, see
+        `predicted_errors`.
+        """
+        count, signals = self.law.system.parameter_values.size, self.output_signals
+        given = {
+            "state": values["state"],
+            "force": values["constraint_force"],
+            "parameters": values["parameters"][:, :count],
+        }
+        found = function_along(self.outputs, given)
+        outputs = found[:, :-1]
+        desired = np.zeros_like(outputs)
+        segments = () if context is None else self.segments(context)
+        if times.size and context is not None:  # Not where a run failed before it began.
+            desired = self.desired_along(context, times)
+        places = values["phase"].astype(int)
+        predicted = predicted_errors(
+            (self.free_law, self.law), self.place, self.force, segments, times, values
+        )
+        names = self.phase_signals
+        return {
+            "phase": ((places == np.arange(len(names))).astype(float), names),
+            "distance": (found[:, -2:], (signals[-1], signals[-1].derivative(1))),
+            "controlled_output": (outputs, signals),
+            "desired_output": (desired, signals),
+            "tracking_error": (outputs - desired, signals),
+            "predicted_error": (predicted, signals),
+        }
+
+    def predicted_error(
+        self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
+    ) -> FloatArray:
+        return values["predicted_error"]
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of the laws' model in a context, as `TrackingController` does.

@@ -5,12 +5,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.systems.task.controller import TaskController
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.progress import Segment, places_at
 
 
 def predicted_errors(
-    controller: TaskController,
+    laws: tuple[TrackingLaw, TrackingLaw],
+    place: int,
+    force: int,
     segments: tuple[Segment, ...],
     times: FloatArray,
     values: Mapping[str, FloatArray],
@@ -23,23 +26,24 @@ def predicted_errors(
     should hold there is no theory.
 
     Args:
-        controller: The controller.
-        segments: Its references in the run.
+        laws: The law of the free robot and that in contact.
+        place: Which output is the distance of the first, and the force of the second.
+        force: Which of the constraint forces is that force.
+        segments: The references of the run.
         times: Of the run, in s, shape (k,).
         values: At these times: "state", "constraint_force", and "integral" and "free_integral"
             where the laws have any; one row for each.
     """
     places = places_at(segments, times)
-    found = np.zeros((times.size, len(controller.output_signals)))
+    found = np.zeros((times.size, len(laws[CONTACT].degrees) + 1))
     for which, segment in enumerate(segments):
         rows = np.flatnonzero(places == which)
         if not rows.size:
             continue
         start = max(rows[0] - 1, 0)  # At a change the state is known, and what was before.
         is_free = not segment.change.in_contact
-        law, name = controller.law, "integral"
-        if is_free:
-            law, name = controller.free_law, "free_integral"
+        law = laws[FREE if is_free else CONTACT]
+        name = "free_integral" if is_free else "integral"
         errors = law.predicted_error(
             times[rows] - times[start],
             values["state"][start],
@@ -48,7 +52,7 @@ def predicted_errors(
         )
         columns = np.arange(errors.shape[1])
         if is_free:
-            columns[controller.place] = found.shape[1] - 1
-            found[rows, controller.place] = values["constraint_force"][rows, controller.force]
+            columns[place] = found.shape[1] - 1
+            found[rows, place] = values["constraint_force"][rows, force]
         found[rows[:, None], columns] = errors
     return found

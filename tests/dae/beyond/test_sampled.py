@@ -10,6 +10,7 @@ from runs import run
 from drake_dae import (
     ConstantReference,
     DaeSystem,
+    LoopSettings,
     RobotPlant,
     Sampling,
     SinusoidReference,
@@ -65,7 +66,7 @@ def pressing(sampling, duration, gains=-4.0, errors=0.0):
     chosen = law("two_link", poles(gains))
     references = [ConstantReference(0.3), ConstantReference(20.0)]
     plant = RobotPlant(found.model, structure=found.structure)
-    loop = make_closed_loop(plant, chosen, references, sampling=sampling)
+    loop = make_closed_loop(plant, chosen, references, LoopSettings(sampling=sampling))
     context = loop.diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
     q = found.model.configuration([0.3 + errors], plant.state(own)[:2])
@@ -103,7 +104,7 @@ def test_error_of_a_sampled_run_is_told_beforehand():
 
     def record_of(sampling, step):
         plant = RobotPlant(found.model, structure=found.structure)
-        loop = make_closed_loop(plant, chosen, references, sampling=sampling)
+        loop = make_closed_loop(plant, chosen, references, LoopSettings(sampling=sampling))
         return run(loop, loop.diagram.CreateDefaultContext(), 0.6, fixed_step(step))
 
     ideal = record_of(None, 4e-3)

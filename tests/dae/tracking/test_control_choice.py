@@ -12,6 +12,7 @@ from pydrake.systems.analysis import Simulator
 from drake_dae import (
     DaePlant,
     DaeSystem,
+    LoopSettings,
     NormalForm,
     Parameter,
     SinusoidReference,
@@ -141,7 +142,7 @@ def test_outputs_are_as_predicted_and_a_free_control_moves_none_of_them(law):
         references = [SinusoidReference(0.0, [0.5], [1.0]), SinusoidReference(2.0, [1.0], [1.5])]
         exogenous = [SinusoidReference(0.0, [amplitude], [2.0 + k]) for k in range(4)]
         plant = DaePlant(system, structure=structure)
-        loop = make_closed_loop(plant, moving, references, exogenous=exogenous)
+        loop = make_closed_loop(plant, moving, references, LoopSettings(exogenous=exogenous))
         simulator = Simulator(loop.diagram)
         simulator.get_mutable_integrator().set_target_accuracy(1e-9)
         context = simulator.get_mutable_context()

@@ -292,7 +292,7 @@ def test_a_loop_is_judged_when_it_begins():
                 DaePlant(law.structure.system, structure=law.structure),
                 law,
                 [ConstantReference([0.0]), force],
-                start_time=start,
+                LoopSettings(start_time=start),
             )
         assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
 

@@ -37,7 +37,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.dae.references import SinusoidReference
-from drake_dae.diagrams.closed_loop_wiring import make_closed_loop
+from drake_dae.diagrams.wiring import make_closed_loop
 from drake_dae.errors import ModelError
 from drake_dae.simulation.summary import Limits, summary
 

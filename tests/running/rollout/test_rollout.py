@@ -11,6 +11,7 @@ from runs import each_scenario, run, scenario
 from drake_dae import (
     ConstantReference,
     ForceSensor,
+    LoopSettings,
     RobotPlant,
     TrackingLaw,
     TrajectoryReference,
@@ -247,7 +248,7 @@ def test_sensors_measure_as_in_drake(sensor, compiled):
         RobotPlant(built.plant.model, structure=law.structure),
         law,
         built.reference.references,
-        sensor=ForceSensor(1, **sensor),
+        LoopSettings(sensor=ForceSensor(1, **sensor)),
     )
     context = loop.diagram.CreateDefaultContext()
     loop.set_seed(context, 7)

@@ -35,6 +35,7 @@ from drake_dae import (
     DaeSystem,
     ExpressionReference,
     ForceSensor,
+    LoopSettings,
     PointToPointReference,
     ReferenceGenerator,
     RobotPlant,
@@ -282,7 +283,7 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
         plant,
         TrackingLaw(model.dae, gains, structure=structure, **force_feedback),
         [ConstantReference(outputs[:-1]), ConstantReference(20.0)],
-        sensor=sensor,
+        LoopSettings(sensor=sensor),
     )
     whole = loop.diagram.CreateDefaultContext()
     plant.set_state(plant.GetMyMutableContextFromRoot(whole), plant.state(context))

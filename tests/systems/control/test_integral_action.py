@@ -13,6 +13,7 @@ from drake_dae import (
     FlexibleJoints,
     ForceSensor,
     KnownForce,
+    LoopSettings,
     RobotModel,
     RobotPlant,
     SinusoidReference,
@@ -35,7 +36,7 @@ WANTED = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
 def follow(model, tracking, duration, *, start=None, change=None, wanted=WANTED, sensor=None):
     """The closed loop and its record, from rest with errors, or with other plant parameters."""
     plant = RobotPlant(model, structure=tracking.structure)
-    loop = make_closed_loop(plant, tracking, wanted, sensor=sensor)
+    loop = make_closed_loop(plant, tracking, wanted, LoopSettings(sensor=sensor))
     context = loop.diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
     q = model.configuration([0.28], [1.2, -1.6])

@@ -25,6 +25,7 @@ from drake_dae import (
     DaeSystem,
     DisturbanceObserver,
     ForceSensor,
+    LoopSettings,
     Observing,
     RobotModel,
     RobotPlant,
@@ -69,9 +70,7 @@ def pushed(push: float, delay: float = 0.0, **more):
         DaePlant(system),
         law,
         [ConstantReference(0.0)],
-        sampling=Sampling(T, delay),
-        observer=Observing(RATE),
-        **more,
+        LoopSettings(sampling=Sampling(T, delay), observer=Observing(RATE), **more),
     )
     context = loop.diagram.CreateDefaultContext()
     own = loop.plant.GetMyMutableContextFromRoot(context)
@@ -167,7 +166,7 @@ def slide(wanted, duration, observing, friction=0.3, change=None):
     sensor = ForceSensor(1, sample_period=1e-3)
     sampling = Sampling(1e-3)
     loop = make_closed_loop(
-        plant, law, wanted, sensor=sensor, sampling=sampling, observer=observing
+        plant, law, wanted, LoopSettings(sensor=sensor, sampling=sampling, observer=observing)
     )
     context = loop.diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
@@ -366,10 +365,13 @@ def test_what_cannot_be_observed_is_refused():
         Observing(5.0, force_rate=0.0)
     wanted, plant = [ConstantReference(0.3), ConstantReference(20.0)], RobotPlant(model)
     with pytest.raises(WiringError, match="observes at samples"):
-        make_closed_loop(plant, law, wanted, observer=Observing(5.0))
+        make_closed_loop(plant, law, wanted, LoopSettings(observer=Observing(5.0)))
     with pytest.raises(WiringError, match="measured force"):
         make_closed_loop(
-            RobotPlant(model), law, wanted, observer=Observing(5.0), sampling=Sampling(T)
+            RobotPlant(model),
+            law,
+            wanted,
+            LoopSettings(observer=Observing(5.0), sampling=Sampling(T)),
         )
     observer = DisturbanceObserver(law, Observing(5.0), T)
     context = observer.CreateDefaultContext()
@@ -404,8 +406,7 @@ def test_push_behind_a_spring_is_found_with_its_derivatives_and_cancelled():
         DaePlant(law.system),
         law,
         [ConstantReference(0.0)],
-        sampling=Sampling(T),
-        observer=Observing(RATE),
+        LoopSettings(sampling=Sampling(T), observer=Observing(RATE)),
     )
 
     def pushed_for(duration):

@@ -20,6 +20,7 @@ from drake_dae import (
     DaePlant,
     DaeSystem,
     ForceSensor,
+    LoopSettings,
     RobotPlant,
     Sampling,
     SinusoidReference,
@@ -45,7 +46,7 @@ def pursue(reference, sampling, duration, **more):
     system = integrator()
     plant = DaePlant(system)
     loop = make_closed_loop(
-        plant, TrackingLaw(system, poles(-K)), [reference], sampling=sampling, **more
+        plant, TrackingLaw(system, poles(-K)), [reference], LoopSettings(sampling=sampling, **more)
     )
     context = loop.diagram.CreateDefaultContext()
     return loop, context, run(loop, context, duration, STEP)
@@ -122,7 +123,7 @@ def test_delay_is_an_error_of_its_own():
         RobotPlant(found.model, structure=found.structure),
         law("two_link", poles(-10.0)),
         [ConstantReference(0.3), ConstantReference(20.0)],
-        sampling=Sampling(2e-3, 3e-3),
+        LoopSettings(sampling=Sampling(2e-3, 3e-3)),
     )
     context = loop.diagram.CreateDefaultContext()
     record = run(loop, context, 3.0, fixed_step(1e-3))
@@ -149,7 +150,7 @@ def test_integrals_stand_still_while_a_drive_is_at_its_limit():
     system = integrator()
     tracking = TrackingLaw(system, poles(-K), integral=[system.output_signals[0].name])
     loop = make_closed_loop(
-        DaePlant(system), tracking, [ConstantReference(5.0)], control_limits=[0.5]
+        DaePlant(system), tracking, [ConstantReference(5.0)], LoopSettings(control_limits=[0.5])
     )
     context = loop.diagram.CreateDefaultContext()
     record = run(loop, context, 1.0, STEP)
@@ -175,7 +176,7 @@ def test_sampled_law_reads_a_force_as_it_is():
         RobotPlant(found.model, structure=found.structure),
         tracking,
         wanted,
-        sampling=Sampling(0.01),
+        LoopSettings(sampling=Sampling(0.01)),
     )
     context = loop.diagram.CreateDefaultContext()
     plant = loop.plant
@@ -232,8 +233,7 @@ def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
             RobotPlant(found.model, structure=found.structure),
             tracking,
             wanted,
-            sensor=sensor and ForceSensor(1, *sensor),
-            sampling=sampling,
+            LoopSettings(sensor=sensor and ForceSensor(1, *sensor), sampling=sampling),
         )
 
 
@@ -246,7 +246,9 @@ def test_a_law_that_reads_the_force_of_its_own_first_control_is_told():
 
     def pressed(sensor):
         plant = RobotPlant(arms.model, structure=arms.structure)
-        loop = make_closed_loop(plant, tracking, wanted, sensor=sensor, sampling=sampling)
+        loop = make_closed_loop(
+            plant, tracking, wanted, LoopSettings(sensor=sensor, sampling=sampling)
+        )
         context = loop.diagram.CreateDefaultContext()
         simulate(loop.diagram, context, 0.3, error_controlled(1e-6))
         return loop.record(context)["constraint_force"][-1]

@@ -14,6 +14,7 @@ from drake_dae import (
     DaePlant,
     DaeSystem,
     ExpressionReference,
+    LoopSettings,
     NormalForm,
     Parameter,
     ReferenceGenerator,
@@ -132,7 +133,7 @@ def test_the_law_keeps_its_prediction_while_the_constraint_moves():
     system = rod()
     law = TrackingLaw(system, poles(-4.0))
     goal = ExpressionReference(lambda t: [0.5 + 0.2 * ca.sin(t), 3 + ca.cos(2 * t)])
-    loop = make_closed_loop(DaePlant(system), law, [goal], exogenous=[LENGTH])
+    loop = make_closed_loop(DaePlant(system), law, [goal], LoopSettings(exogenous=[LENGTH]))
     simulator = Simulator(loop.diagram)
     config = error_controlled(1e-10)
     config.integration_scheme = "runge_kutta5"

@@ -12,7 +12,7 @@ from runs import run, run_scenario, scenario
 
 from drake_dae import Encoders, StateSensor, build_scenario
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.build import start_scenario
+from drake_dae.scenario.start import start_scenario
 
 T, W = 1e-3, 300.0
 A = np.exp(-W * T)

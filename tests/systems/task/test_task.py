@@ -29,6 +29,7 @@ from drake_dae import (
     ContactPlant,
     Dwell,
     FlexibleJoints,
+    LoopSettings,
     Move,
     Press,
     Release,
@@ -38,10 +39,10 @@ from drake_dae import (
     TaskController,
     TrackingLaw,
     UnilateralRobotPlant,
-    make_task_loop,
     open_contact,
     poles,
     simulate,
+    wire_loop,
 )
 from drake_dae.errors import ModelError, SimulationError, WiringError
 from drake_dae.pictures.phases import phase_spans, phases_at
@@ -278,7 +279,7 @@ def test_arm_with_springs_in_its_joints_touches_and_presses():
     controller = TaskController(
         Task([Approach(0.1, over=0.1), Press(20.0, over=0.1), Dwell(0.05)]), law, free
     )
-    loop = make_task_loop(UnilateralRobotPlant(model, {"wall": 0.0}), controller)
+    loop = wire_loop(UnilateralRobotPlant(model, {"wall": 0.0}), controller)
     context = loop.diagram.CreateDefaultContext()
     loop.set_state(context, controller.rest_state([0.3, 0.005], model.dae.nominal_state))
     run_on(loop, context, 0.24, accuracy=1e-8)
@@ -365,7 +366,7 @@ def test_drakes_own_contact_is_the_plant():
         Retreat(0.01, over=0.2),
     )
     controller = TaskController(Task(phases), law, free, sample_period=1e-3)
-    loop = make_task_loop(plant, controller, sampling=Sampling(1e-3, 1e-3))
+    loop = wire_loop(plant, controller, settings=LoopSettings(sampling=Sampling(1e-3, 1e-3)))
     context = loop.diagram.CreateDefaultContext()
     loop.set_state(context, controller.rest_state([0.3, 0.25 * FAR], system.nominal_state))
     simulate(loop.diagram, context, 1.15, SimulatorConfig())
@@ -435,4 +436,4 @@ def test_discrete_plant_needs_guards_in_samples():
     found = arm("two_link")
     plant = ContactPlant(found.model, add_arm, ContactMaterial(), structure=found.structure)
     with pytest.raises(WiringError, match=r"make the controller with sample_period=0\.001"):
-        make_task_loop(plant, TaskController(Task([Approach()]), *laws()))
+        wire_loop(plant, TaskController(Task([Approach()]), *laws()))

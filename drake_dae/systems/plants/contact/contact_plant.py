@@ -10,11 +10,13 @@ from pydrake.geometry import (
     GeometryId,
     GeometrySet,
     HalfSpace,
+    Meshcat,
     Role,
     SceneGraph,
     Sphere,
 )
 from pydrake.math import RigidTransform
+from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
@@ -27,7 +29,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.layout import Layout
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.links.frames import frame_named
@@ -46,6 +48,7 @@ from drake_dae.systems.plants.contact.contact_material import (
 )
 from drake_dae.systems.plants.contact.pushes import AppliedPushes, Push
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
+from drake_dae.systems.plants.contract import Plant
 
 
 def _is_of_use(record: logging.LogRecord) -> bool:
@@ -54,7 +57,7 @@ def _is_of_use(record: logging.LogRecord) -> bool:
 
 
 @checked(ModelError)
-class ContactPlant(Diagram):
+class ContactPlant(Diagram, Plant):
     """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
 
     What an ideal constraint keeps exactly, compliant contact with friction keeps nearly, and it may
@@ -102,6 +105,7 @@ class ContactPlant(Diagram):
     """
 
     __slots__ = SHARED_DICTIONARY
+    is_ideal = False
 
     def __init__(
         self,
@@ -115,9 +119,9 @@ class ContactPlant(Diagram):
     ) -> None:
         super().__init__()
         check_model(model)
-        self.model, self.dae, self.structure = model, model.dae, structure
+        self.model: RobotModel = model
+        self.dae, self.structure = model.dae, structure
         self.time_step = material.time_step
-        self.exogenous_layout, self.exogenous_places = Layout(()), list[int]()
         self._values = changed_parameters(model, parameters or {})
         if model.stages:
             check_step(model, material.time_step, self._values)
@@ -247,9 +251,14 @@ class ContactPlant(Diagram):
         """All parameters in the order of `dae.parameters`, shape (k,)."""
         return self._values.copy()
 
-    def current_parameters(self, context: Context) -> FloatArray:
-        """The same: nothing moves."""
-        return self._values.copy()
+    @property
+    def further_signals(self) -> Mapping[str, Sequence[Signal]]:
+        return {"contact_force": self.contact_force_signals}
+
+    def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
+        contact = builder.AddSystem(ContactVisualizer(meshcat))
+        for name in ("contact_results", "query_object"):
+            builder.Connect(self.GetOutputPort(name), contact.GetInputPort(name))
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
@@ -285,6 +294,4 @@ class ContactPlant(Diagram):
         Raises:
             InconsistentStateError: None is found near the guess.
         """
-        state = self.structure.manifold.settle(guess, self._values)
-        self.set_state(context, state)
-        return state
+        return super().set_consistent_state(context, guess)

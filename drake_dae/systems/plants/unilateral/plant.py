@@ -99,8 +99,7 @@ class UnilateralRobotPlant(ModalPorts):
     """
 
     __slots__ = SHARED_DICTIONARY
-    #: As of `DaePlant`.
-    time_step = 0.0
+    projects = True
 
     def __init__(
         self,

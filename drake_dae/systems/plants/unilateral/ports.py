@@ -1,6 +1,6 @@
 """What a robot shows whose contacts open and close, in the mode that its context is in."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -22,6 +22,7 @@ from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.systems.plants.unilateral.contacts import UnilateralContacts, coefficient
 from drake_dae.systems.plants.unilateral.modes import Mode, Modes, closed_of
@@ -29,7 +30,7 @@ from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
-class ModalPorts(ParameterizedSystem):
+class ModalPorts(ParameterizedSystem, Plant):
     """State, mode and ports of a `UnilateralRobotPlant`, with its attributes; the mode stays.
 
     Args:
@@ -54,7 +55,7 @@ class ModalPorts(ParameterizedSystem):
         super().__init__(dae, dae.parameter_values, signals)
         self.DeclareNumericParameter(BasicVector(bound.restitution))
         self.set_name(model.name)
-        self.model = model
+        self.model: RobotModel = model
         self.contacts = bound.names
         self.normals = tuple(bound.normals)
         self.gap_signals = tuple(Signal(f"{name}.gap", "m") for name in bound.names)
@@ -92,6 +93,8 @@ class ModalPorts(ParameterizedSystem):
         own = weakly(self._values), weakly(self._shown_force)
         self._ports = RobotPorts(self, model, dae, *own, self._by_state, self._by_control)
         self.wrench_signals = self._ports.wrench_signals
+        known = ("gap", "constraint_force", "constraint_residual", "controlled_output")
+        self.functions = (*known, *self._ports.loop_signals)
 
     def _declare(
         self, name: str, size: int, calc: Callable[..., None], by_control: bool = False
@@ -134,6 +137,11 @@ class ModalPorts(ParameterizedSystem):
         names = [f"{contact}.restitution" for contact in self.contacts]
         return names.index(name) if name in names else None
 
+    @property
+    def further_signals(self) -> Mapping[str, Sequence[Signal]]:
+        own = {"mode": self.mode_signals, "gap": self.gap_signals}
+        return {**self._ports.loop_signals, **own}
+
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         self.check_context(context)
@@ -155,7 +163,7 @@ class ModalPorts(ParameterizedSystem):
         return self._contacts.gaps.evaluate(self.state(context), self._values(context))[0].copy()
 
     @cached_property
-    def structure(self) -> ConstraintStructure:
+    def structure(self) -> ConstraintStructure:  # type: ignore[override]
         """The structure of the system with all contacts closed.
 
         Raises:
@@ -178,12 +186,6 @@ class ModalPorts(ParameterizedSystem):
         self.check_context(context)
         shut = closed_of(context.get_discrete_state_vector().value())
         return tuple(name for name, is_shut in zip(self.contacts, shut, strict=True) if is_shut)
-
-    @property
-    def functions(self) -> tuple[str, ...]:
-        """Names of the ports that `along` knows."""
-        known = ("gap", "constraint_force", "constraint_residual", "controlled_output")
-        return (*known, "loop_state") if self.model.loop_joints.signals else known
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """What a port of `functions` showed at moments, one row for each; nan where nothing.

@@ -1,0 +1,213 @@
+"""The parts of a closed loop: how each is added to a diagram, and what of it is refused."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
+from pydrake.systems.primitives import (
+    Adder,
+    AffineSystem,
+    LogVectorOutput,
+    MatrixGain,
+    VectorLogSink,
+)
+
+from drake_dae.dae.references import Reference
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError, WiringError
+from drake_dae.systems.control.contract import Controller
+from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
+
+Block = TypeVar("Block", bound=System)
+
+
+def add_block(builder: DiagramBuilder, block: Block) -> Block:
+    """Adds what the caller made."""
+    try:
+        return builder.AddSystem(block)
+    except RuntimeError:
+        raise WiringError(
+            f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
+        ) from None
+
+
+def add_exogenous(
+    builder: DiagramBuilder,
+    block: Plant | Controller,
+    dae: DaeSystem,
+    exogenous: Sequence[Reference],
+) -> ReferenceGenerator | None:
+    """Adds the generator of a block's exogenous signals, each with the derivatives that it needs.
+
+    Args:
+        builder: The builder of the diagram.
+        block: The block.
+        dae: The block's system.
+        exogenous: The references, in the order of the signals.
+
+    Raises:
+        WiringError: The references are not as many as the signals.
+    """
+    names = [signal.name for signal in dae.exogenous.signals]
+    size = sum(reference.size for reference in exogenous)
+    if exogenous and size != len(names):
+        raise WiringError(
+            f"the references of exogenous signals cover {size}, '{dae.name}' has "
+            f"{len(names)}: {', '.join(names) or 'none'}"
+        )
+    if not exogenous:
+        return None
+    generator = builder.AddSystem(ReferenceGenerator(exogenous, block.exogenous_layout.degrees))
+    generator.set_name(f"{block.get_name()}_exogenous")
+    builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))
+    return generator
+
+
+def check_sensor(plant: Plant, controller: Controller, sensor: ForceSensor | None) -> None:
+    """Refuses a sensor that does not fit: Drake would name the ports, but not what is wrong.
+
+    Raises:
+        WiringError: The sensor measures another number of forces, or no law uses it.
+    """
+    if sensor is None:
+        return
+    own, size = plant.dae, sensor.GetInputPort("force").size()
+    if size != own.num_constraints:
+        names = ", ".join(signal.name for signal in own.constraint_input_signals) or "none"
+        raise WiringError(
+            f"the sensor measures {size} forces, the plant '{own.name}' has "
+            f"{own.num_constraints} ({names}); make it as ForceSensor({own.num_constraints}, "
+            "...)"
+        )
+    if not controller.HasInputPort("measured_force"):
+        raise WiringError("the law takes no measured force; make it with measured_force=True")
+
+
+def add_drives(
+    builder: DiagramBuilder,
+    controller: Controller,
+    sampling: Sampling | None,
+    control_limits: ArrayLike | None,
+) -> tuple[OutputPort, ControlLimits | None]:
+    """Adds what stands between controller and plant, and returns the control that arrives."""
+    control, limits = controller.GetOutputPort("control"), None
+    if sampling is not None:
+        hold = builder.AddSystem(ControlHold(control.size(), sampling))
+        builder.Connect(control, hold.get_input_port())
+        control = hold.get_output_port()
+    if control_limits is not None:
+        limits = builder.AddSystem(ControlLimits(control_limits))
+        if limits.limits.size != control.size():
+            raise WiringError(
+                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
+                "controls"
+            )
+        builder.Connect(control, limits.get_input_port())
+        control = limits.GetOutputPort("control")
+    return control, limits
+
+
+def add_watch(
+    builder: DiagramBuilder,
+    plant: Plant,
+    reference: ReferenceGenerator,
+    law: TrackingLaw,
+    tolerances: Tolerances,
+) -> None:
+    """Adds what ends a run whose errors are too large.
+
+    Raises:
+        WiringError: There is no such output.
+    """
+    dae = plant.dae
+    sizes = law.layout.reference_size, dae.num_states
+    # Of a continuous plant often enough for what is recent.
+    period = plant.time_step or tolerances.window / 20.0
+    lowest = law.layout.lowest
+    try:
+        made = ToleranceWatch(
+            tolerances, dae.output_signals, dae.force_signals, lowest, sizes, period
+        )
+    except ModelError as error:
+        raise WiringError(str(error)) from None
+    watch = builder.AddSystem(made)
+    builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
+    for name in ("controlled_output", "constraint_force", "state"):
+        builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))
+
+
+def add_hold(
+    builder: DiagramBuilder, controller: Controller, sources: Sequence[OutputPort]
+) -> None:
+    """Lets the integrals of a controller stand still while a signal is not 0.
+
+    Args:
+        builder: The builder of the diagram.
+        controller: The controller.
+        sources: The signals: of one entry for all integrals, or of one for each.
+    """
+    if not (sources and controller.HasInputPort("hold")):
+        return
+    count = controller.GetInputPort("hold").size()
+    total = builder.AddSystem(Adder(len(sources), count))
+    for index, source in enumerate(sources):
+        if source.size() != count:
+            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
+            builder.Connect(source, spread.get_input_port())
+            source = spread.get_output_port()
+        builder.Connect(source, total.get_input_port(index))
+    builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
+
+
+def open_holds(builder: DiagramBuilder, plant: Plant, law: TrackingLaw) -> list[OutputPort]:
+    """Ports for the `hold` of a controller: integrals of forces of open contacts stand still.
+
+    Args:
+        builder: The builder of the diagram, with the plant in it.
+        plant: The plant.
+        law: The law, whose integrals they are.
+    """
+    inputs = law.measured_force.inputs if law.measured_force else {}
+    found = np.zeros((len(law.integral.outputs), len(plant.contacts)))
+    for row, output in enumerate(law.integral.outputs):
+        for column, normal in enumerate(plant.normals):
+            found[row, column] = inputs.get(output) == normal
+    if not found.any():
+        return []
+    system = AffineSystem(D=-found, y0=found.sum(axis=1))
+    hold = builder.AddSystem(system)
+    hold.set_name("open_contacts")
+    builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
+    return [hold.get_output_port()]
+
+
+def log_steps(builder: DiagramBuilder, port: OutputPort, plant: Plant) -> VectorLogSink:
+    """Logs once per step.
+
+    Of a discrete plant it is by the clock: after the last step of a run its state is that of an
+    instant that the run has not reached.
+    """
+    if plant.time_step:
+        return LogVectorOutput(port, builder, {TriggerType.kPeriodic}, plant.time_step)
+    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
+
+
+def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
+    """The sampling of the hold: a discrete plant takes what was held one step of its own before."""
+    step = plant.time_step
+    if step and sampling.delay < step * (1.0 - 1e-9):
+        raise WiringError(
+            f"the plant steps by {step:g} s and takes the control that was held before, so that a "
+            f"sampling's delay is {step:g} s or more, got {sampling.delay:g} s. A law without "
+            "delay at each step of the plant needs no sampling"
+        )
+    return replace(sampling, delay=max(sampling.delay - step, 0.0))

@@ -1,0 +1,153 @@
+"""What a scenario simulates its robot as: a family, each of whose members makes a plant."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from numpy.typing import ArrayLike
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant as DrakePlant
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import positive
+from drake_dae.dae.structure.structure import Structure
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.forms.keys import at
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
+from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+from drake_dae.systems.plants.contact.pushes import Push
+from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.robot_plant import RobotPlant
+from drake_dae.systems.plants.unilateral.contacts import coefficient
+from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """The robot that a plant is made of.
+
+    Attributes:
+        model, structure: The robot, and the structure of its system.
+        feedback: Whether its plant may take a law itself.
+        opens: The contact that a task opens and closes; empty without a task.
+        add_robot: Adds the robot with what the plant carries to a MultibodyPlant.
+        parameters: Parameter name -> what the plant has otherwise.
+        pushes: Forces on the plant that its law does not know.
+    """
+
+    model: RobotModel
+    structure: Structure
+    feedback: bool
+    opens: str
+    add_robot: Callable[[DrakePlant, SceneGraph], None]
+    parameters: Mapping[str, ArrayLike]
+    pushes: Sequence[Push]
+
+
+class ScenarioPlant(ABC):
+    """The contract of what stands under `plant` in a scenario.
+
+    1. `plant` makes the plant of a robot, which keeps the contract of `Plant`.
+    2. With `carries` it has payloads, pushes and other parameters in it when it is made. Without,
+       the scenario makes a model with these payloads and pushes, and sets the parameters in the
+       context.
+    3. `material` is how its contacts give way; None where they do not.
+    """
+
+    carries: ClassVar[bool] = False
+
+    @property
+    def material(self) -> ContactMaterial | None:
+        """How its contacts give way; None where they do not."""
+        return None
+
+    @abstractmethod
+    def plant(self, robot: Planted) -> Plant:
+        """The plant.
+
+        Raises:
+            ScenarioError: The robot cannot be simulated so; the message names the key.
+        """
+
+
+@dataclass(frozen=True)
+class IdealConstraints(ScenarioPlant):
+    """The plant is a `RobotPlant`: its constraints hold exactly."""
+
+    def plant(self, robot: Planted) -> Plant:
+        if robot.opens:  # In a task its contact opens, without a bounce.
+            return Unilateral({robot.opens: 0.0}).plant(robot)
+        return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Unilateral(ScenarioPlant):
+    """The plant is a `UnilateralRobotPlant`: its contacts open where they would pull, and impact.
+
+    The law is that of closed contacts, and reads the state alone: it goes on as it is. An open
+    contact does to it what a force does that is not there, so that phi'' = -A(x) lambda_d, lambda_d
+    being the force that is wanted: the robot comes back where it shall push, and stays away where
+    it would have to pull.
+
+    Attributes:
+        restitution: Constraint -> its coefficient of restitution, 0 (no bounce) to 1 (no loss), a
+            pure number. Other constraints stay closed. Left out, all that can only push open, and
+            do not bounce.
+        settling_time: Bouncing that would end within this time, in s, ends at once.
+
+    Raises:
+        ModelError: A number makes no sense.
+    """
+
+    restitution: dict[str, float] = field(default_factory=dict)
+    settling_time: float = 1e-3
+
+    def __post_init__(self) -> None:
+        positive("settling_time", self.settling_time)
+        for name, value in self.restitution.items():
+            coefficient(f"restitution.{name}", value)
+
+    def plant(self, robot: Planted) -> Plant:
+        with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
+            pushing = [one.name for one in robot.model.constraints if any(one.can_only_push)]
+            if not pushing:
+                raise ModelError(
+                    "the robot has no constraint that can only push, so that none opens"
+                )
+            return UnilateralRobotPlant(
+                robot.model,
+                self.restitution or dict.fromkeys(pushing, 0.0),
+                settling_time=self.settling_time,
+                structure=robot.structure,
+            )
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class MultibodyPlant(ContactMaterial, ScenarioPlant):
+    """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
+
+    The robot touches with a ball, and what it touches is as in its constraints. With points the
+    force is stiffness times depth; with hydroelastic patches the ball is rigid, and what it touches
+    has a pressure of modulus times depth / thickness.
+    """
+
+    carries: ClassVar[bool] = True
+
+    @property
+    def material(self) -> ContactMaterial:
+        return self
+
+    def plant(self, robot: Planted) -> Plant:
+        with at("plant or plant_parameters"):
+            return ContactPlant(
+                robot.model,
+                robot.add_robot,
+                self,
+                structure=robot.structure,
+                parameters=robot.parameters,
+                pushes=robot.pushes,
+            )

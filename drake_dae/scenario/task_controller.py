@@ -1,0 +1,85 @@
+"""The controller of a scenario with a task, and what such a scenario cannot have."""
+
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.systems.task.controller import TaskController
+from drake_dae.systems.task.open_contact import open_contact
+
+_SETTINGS = {
+    "exogenous": "exogenous",
+    "saturation": "control_limits",
+    "observer": "observer",
+    "encoders": "encoders",
+    "tolerances": "tolerances",
+    "plant_payloads": "plant_exogenous",
+    "plant_pushes": "plant_exogenous",
+}
+"""Key of a scenario -> what it becomes among the settings of a loop."""
+
+
+def check_task(scenario: Scenario) -> None:
+    """Refuses what a task has no use for.
+
+    Raises:
+        ScenarioError: A key does not fit a task, or start.positions are missing.
+    """
+    refused = {"references": "a task has the references of its phases; leave them out"}
+    refused |= {key: TaskController.refused[name] for key, name in _SETTINGS.items()}
+    found = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
+    if scenario.start.errors:
+        found.append(("start.errors", "a task begins at start.positions; leave them out"))
+    if not scenario.start.positions:
+        found.append(("start.positions", "needed: where the task begins, joint by joint"))
+    if found:
+        raise ScenarioError(*found)
+
+
+def task_controller(
+    scenario: Scenario, model: RobotModel, law: TrackingLaw, period: float
+) -> TaskController:
+    """The controller of a scenario with a task.
+
+    Args:
+        scenario: The scenario.
+        model: Its robot.
+        law: The law in contact.
+        period: The time between its samples in s; 0 for none.
+
+    Raises:
+        ScenarioError: Something does not fit; the message names its key.
+    """
+    task = scenario.task
+    assert task is not None
+    assert scenario.gains is not None  # advised.
+    (force,) = [signal.name for signal in opening_contact(scenario, model).force_signals]
+    with at("task"):
+        free_system = open_contact(model.dae, force)
+    with at("task.gains" if task.gains else "gains"):
+        free_law = TrackingLaw(free_system, (task.gains or scenario.gains).design())
+    with at("task"):
+        return TaskController(task.made(), law, free_law, sample_period=period)
+
+
+def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
+    """The constraint that opens and closes."""
+    assert scenario.task is not None
+    fitting = {one.name: one for one in model.constraints if one.can_only_push == (True,)}
+    name = scenario.task.contact
+    with at("task.contact"):
+        if name:
+            if name in fitting:
+                return fitting[name]
+            raise ModelError(
+                f"'{name}' is no constraint with one force that can only push; such are "
+                f"{', '.join(fitting) or 'none'}"
+            )
+        if len(fitting) != 1:
+            raise ModelError(
+                "needed, since the constraints with one force that can only push are "
+                f"{', '.join(fitting) or 'none'}"
+            )
+    return next(iter(fitting.values()))

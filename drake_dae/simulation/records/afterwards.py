@@ -1,0 +1,155 @@
+"""What a record has that was not logged: it follows from what was."""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from pydrake.systems.framework import Context, OutputPort, System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import DrakeDaeError, WiringError
+from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.systems.blocks.along import function_along
+from drake_dae.systems.control.contract import Controller
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.plants.contract import Plant
+
+
+class Estimate(Protocol):
+    """What gives a controller its state in place of the plant."""
+
+    @property
+    def output(self) -> OutputPort:
+        """The state that the controller gets."""
+
+
+class Loop(Protocol):
+    """A diagram with named parts, as a `ClosedLoop`; see there."""
+
+    @property
+    def plant(self) -> Plant:
+        """What was simulated."""
+
+    @property
+    def controller(self) -> Controller:
+        """What computed its control."""
+
+    @property
+    def generator(self) -> ReferenceGenerator | None:
+        """What gave the references, or None."""
+
+    @property
+    def signals(self) -> Mapping[str, Sequence[Signal]]:
+        """Names and units of each signal that was logged, or is computed here."""
+
+    @property
+    def exogenous(self) -> ReferenceGenerator | None:
+        """What gave the exogenous signals of the law, or None."""
+
+    @property
+    def plant_exogenous(self) -> ReferenceGenerator | None:
+        """What gave those of the plant, or None."""
+
+    @property
+    def encoders(self) -> Estimate | None:
+        """What measured the state for the law, or None."""
+
+
+def completed(logged: Record, loop: Loop, context: Context) -> Record:
+    """A record with what follows from what was logged of a loop.
+
+    Args:
+        logged: What was logged.
+        loop: The loop, whose plant has `functions`.
+        context: The context of its diagram after the run.
+
+    Raises:
+        WiringError: An input port of plant or controller has a fixed value in this context, of
+            which nobody knows since when.
+    """
+    _refuse_fixed_ports(loop, context)
+    plant = loop.plant
+    times, values = logged.time, {name: logged[name] for name in logged.signals}
+    known = {**values, "parameters": _parameters_along(loop, plant, context, times)}
+    if loop.plant_exogenous is not None:
+        values["exogenous"] = loop.plant_exogenous.along(times)
+    if loop.generator is not None:
+        values["reference"] = loop.generator.along(times)
+    if "control" not in known:
+        given = {**known, "reference": values["reference"]}
+        values["control"] = known["control"] = _control_along(loop, context, times, given)
+    values |= {port: plant.along(port, known) for port in plant.functions}
+    return Record(times, {n: Recorded(values[n], tuple(loop.signals[n])) for n in loop.signals})
+
+
+def _control_along(
+    loop: Loop, context: Context, times: FloatArray, given: dict[str, FloatArray]
+) -> FloatArray:
+    """The control of a law that acts at once: a function of what else is known."""
+    plant, controller, law = loop.plant, loop.controller, loop.controller.law
+    of_plant = given["parameters"]
+    gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
+    motion = plant.motion_under(law.function) if gains is not None else None
+    if gains is None:
+        gains = _parameters_along(loop, controller, context, times)
+    if law.measured_force and "measured_force" not in given:
+        # Without a sensor; a law that only integrates the force reads none here.
+        given["measured_force"] = (
+            plant.along("constraint_force", given)
+            if law.control_takes_force
+            else np.zeros((times.size, plant.dae.num_constraints))
+        )
+    given["parameters"] = gains
+    if motion is None or not motion.is_machine_code:
+        return function_along(law.function, given)
+
+    def alone(moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
+        """The control where the plant has no value with it."""
+        values = law.function.evaluate(*moment[:3])
+        return values if law.function.is_valid else None
+
+    # Machine code that is there, in place of some for the law alone.
+    return function_along(motion, {**given, "law": gains, "plant": of_plant}, alone)
+
+
+def _parameters_along(
+    loop: Loop, block: Plant | Controller, context: Context, times: FloatArray
+) -> FloatArray:
+    """The parameters of a block at each time, those that move as they did."""
+    values = block.parameters_along(block.GetMyContextFromRoot(context), times)
+    moving = loop.plant_exogenous if block is loop.plant else loop.exogenous
+    if moving is not None:
+        values[:, block.exogenous_places] = moving.along(times)
+    return values
+
+
+def _refuse_fixed_ports(loop: Loop, context: Context) -> None:
+    plant, taker = loop.plant, loop.controller
+    own = taker.GetMyContextFromRoot(context)
+    source = plant.GetOutputPort("state") if loop.encoders is None else loop.encoders.output
+    wires = {"estimated_state": source}
+    if loop.generator is not None:
+        wires["reference"] = loop.generator.GetOutputPort("reference")
+    for name, giver in wires.items():
+        port = taker.GetInputPort(name)
+        if not port.HasValue(own):
+            continue  # The law knows its references, and is fed back.
+        try:
+            given = giver.Eval(giver.get_system().GetMyContextFromRoot(context))
+        except DrakeDaeError:
+            continue  # Where a run failed.
+        if not np.array_equal(given, port.Eval(own), equal_nan=True):
+            raise _fixed(name, taker)
+    if plant.HasInputPort("feedback"):
+        at_plant, port = plant.GetMyContextFromRoot(context), plant.GetInputPort("control")
+        if plant.GetInputPort("feedback").HasValue(at_plant) and port.HasValue(at_plant):
+            raise _fixed("control", plant)
+
+
+def _fixed(port: str, block: System) -> WiringError:
+    return WiringError(
+        f"the port '{port}' of {block.get_name()} has a fixed value in this context, so that its "
+        "control does not follow from the state; wire plant and controller in a diagram of your "
+        "own, with a LogVectorOutput"
+    )
