@@ -13,6 +13,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.compiler.trace import Call, Expressions, needed_systems
 from drake_dae.compiler.wires import Wires
+from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
@@ -60,6 +61,7 @@ class CompiledDiagram:
 
     Attributes:
         wires: The diagram and its wires.
+        context: A context in which inputs without a wire have values.
         outputs: The names of the output ports of the diagram that are computed.
         states, held, parameters, noise: Where the columns of each block stand.
         fixed: The input ports without a wire whose values are parameters: (system, name, part).
@@ -68,10 +70,10 @@ class CompiledDiagram:
         row: The same -> all outputs below each other, and such a number.
         rates: The updates, one function for each period and offset.
         blocks: The blocks by their systems, in the order of Drake's states.
-        twins: As of `compile_diagram`.
     """
 
     wires: Wires
+    context: Context
     outputs: tuple[str, ...]
     states: tuple[Place, ...]
     held: tuple[Place, ...]
@@ -82,7 +84,6 @@ class CompiledDiagram:
     row: ca.Function
     rates: tuple[Rate, ...]
     blocks: Mapping[System, Block]
-    twins: Mapping[System, System]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
 
@@ -139,15 +140,44 @@ class CompiledDiagram:
         return found
 
     @cached_property
+    def twins(self) -> Mapping[System, System]:
+        """Plant -> the controller whose law has the plant's system as its model."""
+        laws = {
+            id(block.model): system
+            for system, block in self.blocks.items()
+            if block.under is not None
+        }
+        return {
+            system: laws[id(block.model)]
+            for system, block in self.blocks.items()
+            if block.under is None and block.model is not None and id(block.model) in laws
+        }
+
+    def has_twins(self, parameters: FloatArray) -> bool:
+        """Whether plants and laws that have one model have the same numbers, too.
+
+        Args:
+            parameters: As `values` returns them.
+        """
+        parts = dict(self.parameters)
+        for plant, controller in self.twins.items():
+            own, of_law = parts[plant], parts[controller]
+            same = parameters[own] == parameters[of_law][: own.stop - own.start]
+            same[list(self.blocks[plant].moving)] = True
+            if not same.all():
+                return False
+        return bool(self.twins)
+
+    @cached_property
     def own_parameters(self) -> Mapping[System, ca.Function]:
         """System -> (time, state, held, parameters) -> its own, those that move as they are then.
 
-        Of those with a projection.
+        Of the blocks that are not content with any state.
         """
         return {
             system: self._function("parameters", [self._expressions.parameters(block)])
             for system, block in self.blocks.items()
-            if block.projection is not None
+            if block.check_start is not None
         }
 
     def newton(self, count: int) -> ca.Function:
@@ -173,6 +203,17 @@ class CompiledDiagram:
                 x, left_here = x + ca.DM(projection.scale) * change, ca.norm_2(change)
             state[part], left = x, ca.fmax(left, left_here) if left.nnz() else left_here
         return self._function("newton", [state, left])
+
+    @property
+    def signals(self) -> dict[str, tuple[Signal, ...]]:
+        """Name of an output -> names and units of its entries, as far as its block tells them."""
+        found = {}
+        for name in self.outputs:
+            system, index = self.wires.outputs[name]
+            port = system.get_output_port(index)
+            known = self.blocks[system].ports.get(port.get_name())
+            found[name] = known or tuple(Signal(f"{name}[{i}]") for i in range(port.size()))
+        return found
 
     @property
     def projects(self) -> bool:
@@ -216,21 +257,32 @@ def compile_diagram(
         ModelError: There is no such output, an input has neither a wire nor a value, blocks close
             an algebraic loop, or a block cannot be traced: its name and why.
     """
-    return compile_twins(diagram, outputs, context, {})
+    return _compiled(diagram, outputs, context, {})
 
 
-def compile_twins(
+def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
+    """A compiled diagram whose plants have the parameters of their laws; itself without such.
+
+    It has the same arguments, of which it ignores the plants' parameters, and fewer operations:
+    what plant and law both compute is computed once, and where the law says how, the plant's
+    derivative follows from what the law wants. See `CompiledDiagram.has_twins`.
+    """
+    twins = compiled.twins
+    if not twins:
+        return compiled
+    given = compiled.diagram, compiled.outputs, compiled.context, twins
+    plain, short = (_compiled(*given, is_short=is_short) for is_short in (False, True))
+    is_shorter = short.rate.n_instructions() < 0.9 * plain.rate.n_instructions()
+    return short if is_shorter else plain
+
+
+def _compiled(
     diagram: Diagram,
     outputs: Sequence[str] | None,
     context: Context | None,
     twins: Mapping[System, System],
+    is_short: bool = False,
 ) -> CompiledDiagram:
-    """`compile_diagram`, where some plants are the model of their law with the same numbers.
-
-    Args:
-        diagram, outputs, context: As of `compile_diagram`.
-        twins: Plant -> its controller. The plant has no parameters of its own then.
-    """
     wires = Wires.of(diagram)
     _refuse(wires)
     if outputs is None:
@@ -238,7 +290,8 @@ def compile_twins(
     for name in outputs:
         if name not in wires.outputs:
             raise ModelError(unknown_name("output port of the diagram", name, wires.outputs))
-    expressions = Expressions(wires, context or diagram.CreateDefaultContext(), twins)
+    context = context or diagram.CreateDefaultContext()
+    expressions = Expressions(wires, context, twins, is_short)
     chosen = [wires.outputs[name] for name in outputs]
     needed_systems(expressions, chosen)
     blocks = {each: expressions.used[each] for each in wires.systems if each in expressions.used}
@@ -259,6 +312,7 @@ def compile_twins(
     row = expressions.checked(lambda: [expressions.port(port) for port in chosen])
     return CompiledDiagram(
         wires,
+        context,
         tuple(outputs),
         tuple(places["state"]),
         tuple(places["held"]),
@@ -269,7 +323,6 @@ def compile_twins(
         _function("row", given, row),
         tuple(_rates(expressions, blocks, places["held"], [*given, columns["noise"]])),
         blocks,
-        dict(twins),
         expressions,
         columns,
     )

@@ -54,7 +54,10 @@ class Expressions:
     Args:
         wires: The wires.
         context: A context of the diagram, which says where inputs without a wire have a value.
-        twins: Plant -> controller whose law has it as its model, with the same numbers.
+        twins: Plant -> the controller whose law has it as its model, with the same numbers. Both
+            then have the parameters of the controller.
+        is_short: Whether the derivative of such a plant follows from what its law wants, where the
+            law says how and nothing stands between.
 
     Attributes:
         time: The time in s.
@@ -68,7 +71,11 @@ class Expressions:
     """
 
     def __init__(
-        self, wires: Wires, context: Context, twins: Mapping[System, System] | None = None
+        self,
+        wires: Wires,
+        context: Context,
+        twins: Mapping[System, System] | None = None,
+        is_short: bool = False,
     ) -> None:
         self.time = ca.SX.sym("time")
         self.calls: list[Call] = []
@@ -79,6 +86,9 @@ class Expressions:
         self._open: list[tuple[System, Computation]] = []
         self._needed: list[dict[int, Call]] = []
         self._owners: dict[System, dict[str, Computation]] = {}
+        self._under: dict[System, tuple[Block, Computation]] = {}
+        for plant, controller in self._twins.items() if is_short else ():
+            self._shorten(plant, self.block(controller))
 
     def block(self, system: System) -> Block:
         """What a system computes."""
@@ -109,11 +119,8 @@ class Expressions:
                 "what it leads to runs in Drake's Simulator alone"
             )
         owner = block
-        if DERIVATIVE in computation.outputs and system in self._twins:
-            controller = self.block(self._twins[system])
-            under = controller.under(system) if controller.under is not None else None
-            if under is not None:
-                owner, computation = controller, under
+        if DERIVATIVE in computation.outputs and system in self._under:
+            owner, computation = self._under[system]
         found = self.call(owner, computation)
         return found.results[computation.outputs.index(name)]
 
@@ -202,9 +209,8 @@ class Expressions:
         system = block.system
         twin = self._twins.get(system)
         size = self._size(system, PARAMETERS)
-        if twin is None:
-            found = self.symbol(system, PARAMETERS, size)
-        else:
+        found = self.symbol(system, PARAMETERS, size)
+        if twin is not None:
             found = self.symbol(twin, PARAMETERS, self._size(twin, PARAMETERS))[:size]
         if block.moving and system.HasInputPort("exogenous"):
             port = system.GetInputPort("exogenous")
@@ -215,6 +221,25 @@ class Expressions:
                 found = ca.SX(found)
                 found[list(block.moving)] = self.input(block, "exogenous")
         return found
+
+    def _shorten(self, plant: System, controller: Block) -> None:
+        """Lets a plant's derivative follow from what its law wants, where it acts as it is."""
+        if not plant.HasInputPort("control"):
+            return
+        port = plant.GetInputPort("control")
+        source = self._wires.sources.get((plant, int(port.get_index())))
+        acts = controller.system, int(controller.system.GetOutputPort("control").get_index())
+        is_direct = source == acts
+        if source is None and not port.HasValue(plant.GetMyContextFromRoot(self._context)):
+            is_direct = self._law_behind(plant) is controller.system
+        under = controller.under() if is_direct and controller.under is not None else None
+        if under is not None:
+            self._under[plant] = controller, under
+
+    @property
+    def is_shortened(self) -> bool:
+        """Whether the derivative of a plant follows from what its law wants."""
+        return bool(self._under)
 
     def symbol(self, system: System, name: str, size: int) -> ca.SX:
         """The symbols of a block's own column."""

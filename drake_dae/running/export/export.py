@@ -21,7 +21,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.samples import Call, samples, tests
 from drake_dae.running.export.text import braced, comment, string
-from drake_dae.trace.compiled import generate
+from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 
 TEMPLATES = Path(__file__).parent / "c99"
@@ -76,7 +76,7 @@ def export_code(loop: ClosedLoop, context: Context, name: str, folder: str | Pat
     vectors = _vectors(law, structure, plant_parameters, law_parameters)
     calls = _calls(law, structure)
     generated = generate(
-        *(_renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
+        *(renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
     )
     words = {
         "title": comment(f"{structure.system.name} ({name})"),
@@ -188,12 +188,6 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
         "residual": Call(residual, residual.input_names, residual.output_names),
         "newton_step": Call(step, step.input_names, step.output_names),
     }
-
-
-def _renamed(function: ca.Function, name: str) -> ca.Function:
-    """The same function under a name of C."""
-    inputs = function.sx_in()
-    return ca.Function(name, inputs, function.call(inputs), {"cse": False})
 
 
 def _declared(prefix: str, name: str, vector: _Vector) -> str:

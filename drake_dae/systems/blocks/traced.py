@@ -1,6 +1,6 @@
 """What a block computes, as traced functions: the seam between a Drake diagram and its compiler."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -8,6 +8,7 @@ import casadi as ca
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
 from drake_dae.trace.functions import TracedFunction
 
 TIME, STATE, HELD, PARAMETERS, NOISE = "$time", "$state", "$held", "$parameters", "$noise"
@@ -89,27 +90,35 @@ class Block:
         system: The system.
         computations: All of its outputs that can be traced, and the derivative of its state.
         updates: Its updates of the discrete state.
+        check_start: (state, parameters) -> None; raises where no run may start. For a block with
+            state; None where any state will do.
         projection: How its state stays on a manifold, if it does.
         scale: The sizes of its continuous states, shape (n,); ones if None.
         unwired: Name of an input port -> what stands there without a wire and without a value.
         moving: The entries of its parameters that come through an input port "exogenous".
         draws: Whether its update takes new random numbers.
-        under: For a controller: the plant -> a computation of this block's sources that gives the
-            plant's derivative and what else its computation with DERIVATIVE gives, in fewer
-            operations where the plant is the model of the law; None if there is none.
+        model: What its first parameters are those of, such as a DaeSystem; None for nothing that
+            another block has.
+        under: For a controller: a computation of this block's sources that gives what the
+            computation with DERIVATIVE of its plant gives, in fewer operations, where plant and
+            law have the same model and numbers and nothing stands between; None if there is none.
         signals: Name of an argument -> names and units of its entries, for messages.
+        ports: Name of an output port -> names and units of its entries, as far as they are known.
     """
 
     system: System
     computations: tuple[Computation, ...]
     updates: tuple[Update, ...] = ()
+    check_start: Callable[[FloatArray, FloatArray], None] | None = None
     projection: Projection | None = None
     scale: FloatArray | None = None
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
     draws: bool = False
-    under: Callable[[System], Computation | None] | None = None
-    signals: Mapping[str, object] = field(default_factory=dict)
+    model: object = None
+    under: Callable[[], Computation | None] | None = None
+    signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
+    ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
 
 
 @runtime_checkable

@@ -14,7 +14,6 @@ from pydrake.systems.framework import (
     DependencyTicket,
     EventStatus,
     State,
-    System,
 )
 
 from drake_dae.arguments import checked
@@ -308,8 +307,14 @@ class TrackingController(ParameterizedSystem):
             updates,
             unwired=unwired,
             moving=tuple(self.exogenous_places),
+            model=self.dae,
             under=partial(self._motion_under, sources),
             signals=self._signals,
+            ports={
+                "control": tuple(self.dae.control_signals),
+                "tracking_error": tuple(self.dae.output_signals),
+                "integral": tuple(law.integral.signals),
+            },
         )
 
     def _traced_integrals(
@@ -350,10 +355,8 @@ class TrackingController(ParameterizedSystem):
             return (acts, rates, told), (Update(summed, self.sample_period, 0.0, True),)
         return (acts, rates, told, summed), ()
 
-    def _motion_under(self, sources: tuple[str, ...], plant: System) -> Computation | None:
+    def _motion_under(self, sources: tuple[str, ...]) -> Computation | None:
         """x' and v of a plant that is the law's own model, from what the law wants."""
-        if getattr(plant, "dae", None) is not self.dae:
-            return None
         motion = self.law.trace_motion()
         if motion is None:
             return None

@@ -426,7 +426,12 @@ class DaePlant(ParameterizedSystem):
 
     def traced(self) -> Block:
         return traced_plant(
-            self, self.structure, self.projects, self.exogenous_places, self._signals
+            self,
+            self.structure,
+            self.projects,
+            self.check_start,
+            self.exogenous_places,
+            self._signals,
         )
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:

@@ -1,10 +1,11 @@
 """What the plant of a DaeSystem computes, as traced functions.                  (1)-(3), (25)"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import casadi as ca
 from pydrake.systems.framework import System
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.systems.blocks.traced import (
@@ -21,6 +22,7 @@ def traced_plant(
     plant: System,
     structure: ConstraintStructure,
     projects: bool,
+    check_start: Callable[[FloatArray, FloatArray], None],
     moving: Sequence[int],
     signals: Mapping[str, Sequence[Signal]],
 ) -> Block:
@@ -30,6 +32,7 @@ def traced_plant(
         plant: The plant.
         structure: Its structure.
         projects: Whether its state is projected onto N*.
+        check_start: Refuses a start, by the state and all parameters.
         moving: Which parameters come through its port "exogenous".
         signals: Names and units of what its functions take, for messages.
     """
@@ -72,8 +75,16 @@ def traced_plant(
     return Block(
         plant,
         tuple(found),
+        check_start=check_start,
         projection=projection,
         scale=dae.scale,
         moving=tuple(moving),
+        model=dae,
+        ports={
+            "state": tuple(dae.state_signals),
+            "constraint_force": tuple(dae.force_signals),
+            "constraint_residual": tuple(manifold.residual_signals),
+            "controlled_output": tuple(dae.output_signals),
+        },
         signals=signals,
     )
