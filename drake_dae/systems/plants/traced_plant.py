@@ -57,8 +57,10 @@ def traced_plant(
     shown = {"force": dae.forces(acting), "output": dae.l + ca.mtimes(dae.m, acting)}
     names = {"force": "constraint_force", "output": "controlled_output"}
     if not structure.elimination.n_star.nnz():
+        # m beta u cancels: what is left is as with any control.
+        alpha = ca.substitute(force, derivatives.control, 0 * derivatives.control)
         output = dae.trace(
-            "controlled output", {"value": dae.l + ca.mtimes(dae.m, force)}, {}, *regular
+            "controlled output", {"value": dae.l + ca.mtimes(dae.m, alpha)}, {}, *regular
         )
         found.append(Computation.of(output, by_state, ("controlled_output",)))
         del shown["output"]
