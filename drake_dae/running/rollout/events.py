@@ -33,28 +33,23 @@ def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
         compiled: The diagram.
         times: When rows are written, in s: an update at the time of a row makes no step of its own.
     """
-    found: list[tuple[float, int]] = []
+    due: dict[float, int] = {}
     for number, rate in enumerate(compiled.rates):
         first = int(np.ceil((times[0] - rate.offset) / rate.period - SAME))
         last = int(np.floor((times[-1] - rate.offset) / rate.period + SAME))
-        moments = rate.offset + rate.period * np.arange(max(first, 0), last + 1.0)
-        near = np.clip(np.searchsorted(times, moments), 1, times.size - 1)
-        for candidate in (times[near - 1], times[near]):
-            is_near = np.abs(candidate - moments) <= SAME * rate.period
-            moments[is_near] = candidate[is_near]
-        found += [(moment, 1 << number) for moment in moments.tolist()]
-    found.sort()
+        for k in range(max(first, 0), last + 1):
+            moment = rate.offset + k * rate.period
+            due[moment] = due.get(moment, 0) | 1 << number
+    # As in Drake, two updates are of one instant if their times are the same to the last bit; those
+    # of times that differ by round-off follow each other.
+    moments = np.array(sorted(due), dtype=float)
+    bits = np.array([due[moment] for moment in moments.tolist()], dtype=np.int64)
     shortest = min((rate.period for rate in compiled.rates), default=0.0)
-    merged: list[list[float | int]] = []
-    for moment, bit in found:
-        if merged and moment - merged[-1][0] <= SAME * shortest:
-            merged[-1][1] = int(merged[-1][1]) | bit
-        else:
-            merged.append([moment, bit])
-    return Events(
-        np.array([moment for moment, _ in merged], dtype=float),
-        np.array([bits for _, bits in merged], dtype=np.int64),
-    )
+    near = np.clip(np.searchsorted(times, moments), 1, times.size - 1)
+    for candidate in (times[near - 1], times[near]):
+        is_near = np.abs(candidate - moments) <= SAME * shortest
+        moments[is_near] = candidate[is_near]
+    return Events(moments, bits)
 
 
 def noise_of(
@@ -85,12 +80,11 @@ def _drawn(
     source: System, start: float, times: FloatArray, period: float, seed: int | None
 ) -> FloatArray:
     """What a source shows at the start, and after each of its updates."""
-    own = source.Clone()
-    context = own.CreateDefaultContext()
+    context = source.CreateDefaultContext()
     context.SetTime(start)
     if seed is not None:
-        own.SetRandomContext(context, RandomGenerator(seed))
-    simulator, port = Simulator(own, context), own.get_output_port()
+        source.SetRandomContext(context, RandomGenerator(seed))
+    simulator, port = Simulator(source, context), source.get_output_port()
     values = [port.Eval(context).copy()]
     for moment in times:
         simulator.AdvanceTo(moment + 0.5 * period)
