@@ -23,6 +23,7 @@ from drake_dae.systems.blocks.traced import (
     STATE,
     Block,
     Computation,
+    not_traced,
 )
 
 ARGUMENTS = ("time", "state", "held", "parameters")
@@ -118,6 +119,20 @@ class CompiledDiagram:
             groups = range(own.num_discrete_state_groups())
             held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
         return state, held
+
+    def begun(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> FloatArray:
+        """What is held when a run begins: what is not a number yet, as its block says."""
+        found = held.copy()
+        for system, part in self.held:
+            initial = self.blocks[system].initial
+            if initial is not None and np.isnan(found[part]).any():
+                call = self._expressions.call(self.blocks[system], initial)
+                value = call.results[initial.outputs.index(HELD)]
+                function = self._function("initial", [value])
+                found[part] = function(time, state, held, parameters).full()[:, 0]
+        return found
 
     def values(self, context: Context) -> FloatArray:
         """The parameters in a context of the diagram, shape (m,).
@@ -329,13 +344,11 @@ def _compiled(
 
 
 def _refuse(wires: Wires) -> None:
-    """Refuses what ends a run, which no function of the time does."""
+    """Refuses what ends a run by its own will, which no function of the time does."""
     for system in wires.systems:
-        if getattr(system, "ends_runs", False):
-            raise ModelError(
-                f"'{system.get_name()}' ends a run where its errors are too large, which Drake's "
-                "Simulator alone does"
-            )
+        what = getattr(system, "ends_runs", None)
+        if what is not None:
+            raise not_traced(what)
 
 
 def _is_vector(port: tuple[System, int]) -> bool:

@@ -5,6 +5,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.symbolic import Expression, Variable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus, PortDataType, System
@@ -22,6 +23,7 @@ from drake_dae.systems.blocks.traced import (
     Block,
     Computation,
     Update,
+    not_traced,
 )
 
 
@@ -36,6 +38,8 @@ def primitive(system: System) -> Block:
     """
     if isinstance(system, RandomSource):
         return _random_source(system)
+    if isinstance(system, MultibodyPlant):
+        raise not_traced("Drake's own MultibodyPlant, with its contact,")
     name = f"'{system.get_name()}' ({type(system).__name__})"
     try:
         converted = system.ToSymbolic()
@@ -44,7 +48,13 @@ def primitive(system: System) -> Block:
             f"{name} cannot be traced: it has no traced functions and does not convert to "
             "symbolic expressions, so that it runs in Drake's Simulator alone"
         ) from None
-    return _Converted(system, converted, name).block()
+    try:
+        return _Converted(system, converted, name).block()
+    except RuntimeError as error:  # What Drake cannot compute with expressions.
+        reason = str(error).splitlines()[0]
+        raise ModelError(
+            f"{name} cannot be traced, so that it runs in Drake's Simulator alone: {reason}"
+        ) from None
 
 
 def _random_source(source: RandomSource) -> Block:

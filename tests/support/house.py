@@ -25,6 +25,7 @@ FLOORS = (
     ("dae",),
     ("analysis", "symbolic", "robots"),
     ("systems",),
+    ("compiler",),
     ("simulation",),
     ("pictures",),
     ("diagrams",),

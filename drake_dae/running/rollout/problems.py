@@ -37,7 +37,9 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     """
     program = program_of(loop)
     state, held = program.compiled.start(context)
-    return np.concatenate([state, held[program.kept_places]]), program.compiled.values(context)
+    values = program.compiled.values(context)
+    held = program.compiled.begun(context.get_time(), state, held, values)
+    return np.concatenate([state, held[program.kept_places]]), values
 
 
 def checked_times(times: ArrayLike) -> FloatArray:

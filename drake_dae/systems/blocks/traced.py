@@ -9,6 +9,7 @@ from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 
 TIME, STATE, HELD, PARAMETERS, NOISE = "$time", "$state", "$held", "$parameters", "$noise"
@@ -90,6 +91,8 @@ class Block:
         system: The system.
         computations: All of its outputs that can be traced, and the derivative of its state.
         updates: Its updates of the discrete state.
+        initial: What it holds when a run begins, where that is not a number; it has HELD among its
+            outputs, and does not read it. None where it is a number.
         check_start: (state, parameters) -> None; raises where no run may start. For a block with
             state; None where any state will do.
         projection: How its state stays on a manifold, if it does.
@@ -109,6 +112,7 @@ class Block:
     system: System
     computations: tuple[Computation, ...]
     updates: tuple[Update, ...] = ()
+    initial: Computation | None = None
     check_start: Callable[[FloatArray, FloatArray], None] | None = None
     projection: Projection | None = None
     scale: FloatArray | None = None
@@ -119,6 +123,17 @@ class Block:
     under: Callable[[], Computation | None] | None = None
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
     ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
+
+
+def not_traced(what: str) -> ModelError:
+    """The error of a block of ours that Drake's Simulator alone runs.
+
+    Args:
+        what: What it is, in the user's words.
+    """
+    return ModelError(
+        f"{what} cannot be traced: a rollout does not know it; run the loop by simulate"
+    )
 
 
 @runtime_checkable

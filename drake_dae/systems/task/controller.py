@@ -12,6 +12,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.task.open_contact import output_of_force
 from drake_dae.systems.task.planner import CONTACT, FREE
@@ -218,6 +219,9 @@ class TaskController(Diagram):
         known = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
         at_supervisor = self.GetMutableSubsystemContext(self.supervisor, context)
         at_supervisor.get_mutable_numeric_parameter(0).SetFromVector(known)
+
+    def traced(self) -> Block:
+        raise not_traced("a task")
 
 
 def _check_laws(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:

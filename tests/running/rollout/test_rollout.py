@@ -422,3 +422,39 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
     # The last row of Drake's log is projected, as that of the rollout.
     assert np.abs(expected["constraint_residual"]).max() > 1e-6
     np.testing.assert_allclose(found.record["state"], expected["state"], rtol=0.0, atol=1e-13)
+
+
+@both
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["sampling={period: 0.002}"],
+        ["sampling={period: 0.004, delay: 0.001}"],
+        ["sampling={period: 0.002, delay: 0.005}"],
+        ["sampling={period: 0.003, delay: 0.003}", "saturation=true"],
+        [
+            "sampling={period: 0.002}",
+            "force=!MeasuredForce {sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
+            "integral=[tool.z]",
+            "gains=!Poles {all: [-4, -5, -6]}",
+        ],
+    ],
+)
+def test_sampled_laws_are_those_of_drake(settings, compiled):
+    """To 1e-11 of the largest value: their controls jump, and forces with them."""
+    chosen = scenario("two_link_wall", "duration=0.2", *settings, *fixed())
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.2, chosen.integrator)
+    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    (found,) = rollout(
+        loop,
+        start,
+        parameters,
+        grid(0.2, 1e-3),
+        config=chosen.integrator,
+        compiled=compiled,
+        seeds=seeds,
+    )
+    assert found.failure is None
+    assert_equal_records(found.record, wanted, 1e-11)
