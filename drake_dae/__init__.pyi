@@ -3,6 +3,7 @@
 from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
+from .compiler.compile import compile_diagram as compile_diagram
 from .dae.beyond.contact_gains import ContactGains as ContactGains
 from .dae.beyond.contact_gains import contact_gains as contact_gains
 from .dae.beyond.disturbance import with_disturbance as with_disturbance

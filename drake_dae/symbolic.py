@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from pydrake.symbolic import Expression, ExpressionKind, Variable
+from pydrake.symbolic import Expression, ExpressionKind, Formula, FormulaKind, Variable
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import numbers
@@ -38,6 +38,30 @@ _FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {
     ExpressionKind.Tanh: ca.tanh,
 }
 
+
+_STEPS: dict[ExpressionKind, Callable[..., ca.SX]] = {
+    ExpressionKind.Abs: ca.fabs,
+    ExpressionKind.Min: ca.fmin,
+    ExpressionKind.Max: ca.fmax,
+    ExpressionKind.Ceil: ca.ceil,
+    ExpressionKind.Floor: ca.floor,
+    ExpressionKind.IfThenElse: ca.if_else,
+}
+"""What has no derivatives everywhere, and can be computed all the same."""
+
+_RELATIONS: dict[FormulaKind, Callable[..., ca.SX]] = {
+    FormulaKind.True_: lambda: ca.SX(1),
+    FormulaKind.False_: lambda: ca.SX(0),
+    FormulaKind.Eq: ca.eq,
+    FormulaKind.Neq: ca.ne,
+    FormulaKind.Gt: ca.gt,
+    FormulaKind.Geq: ca.ge,
+    FormulaKind.Lt: ca.lt,
+    FormulaKind.Leq: ca.le,
+    FormulaKind.And: lambda *parts: reduce(ca.logic_and, parts),
+    FormulaKind.Or: lambda *parts: reduce(ca.logic_or, parts),
+    FormulaKind.Not: ca.logic_not,
+}
 
 _CONTINUOUS = Variable.Type.CONTINUOUS
 
@@ -122,12 +146,13 @@ def from_symbolic(
     )
 
 
-def to_casadi(expression: Any, symbols: Mapping[int, ca.SX]) -> ca.SX:
+def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True) -> ca.SX:
     """A scalar expression of `pydrake.symbolic`, or a number, as a CasADi expression.
 
     Args:
-        expression: The expression.
+        expression: The expression, or a Formula in it.
         symbols: Variable.get_id() -> what stands for it.
+        smooth: Whether it must have derivatives everywhere.
 
     Raises:
         ModelError: A variable has no symbol, or a function is not smooth or not known.
@@ -141,17 +166,18 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX]) -> ca.SX:
         return symbols[expression.get_id()]
     if isinstance(expression, Real):
         return ca.SX(float(numbers("it", expression)))
-    if not isinstance(expression, Expression):
+    if not isinstance(expression, Expression | Formula):
         raise ModelError(
             f"it is no expression of pydrake.symbolic, but {type(expression).__name__}"
         )
     kind = expression.get_kind()
-    if kind in _NOT_SMOOTH:
+    if smooth and kind in _NOT_SMOOTH:
         raise ModelError(
             f"{_NOT_SMOOTH[kind]} has no derivatives everywhere, and the theory differentiates; "
             "use a smooth function instead"
         )
-    if kind not in _FUNCTIONS:
+    known = _RELATIONS if isinstance(expression, Formula) else _FUNCTIONS | _STEPS
+    if kind not in known:
         raise ModelError(f"nothing is known of the function {expression}")
     _, parts = expression.Unapply()
-    return _FUNCTIONS[kind](*[to_casadi(part, symbols) for part in parts])
+    return known[kind](*[to_casadi(part, symbols, smooth) for part in parts])

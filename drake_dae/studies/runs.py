@@ -179,10 +179,10 @@ class Runner:
         except DrakeDaeError:
             return None
         if self._lasting is not None:
-            from drake_dae.running.rollout.rollout import functions_of
+            from drake_dae.running.rollout.program import program_of
 
             try:
-                functions_of(loop)
+                program_of(loop)
             except ModelError as error:
                 return ScenarioError(("", str(error)))
         return None

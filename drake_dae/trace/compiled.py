@@ -203,6 +203,12 @@ def generate(*functions: ca.Function) -> str:
     return str(generator.dump())
 
 
+def renamed(function: ca.Function, name: str) -> ca.Function:
+    """The same function under another name."""
+    inputs = function.sx_in()
+    return ca.Function(name, inputs, function.call(inputs), {"cse": False})
+
+
 class Compiler(NamedTuple):
     """A C compiler.
 

@@ -368,7 +368,7 @@ def test_a_scenario_changes_its_restitution_by_a_parameter_and_no_rollout_knows_
     assert_array_equal(loop.plant.get_parameter(own, "wall.restitution"), [0.25])
     with pytest.raises(ModelError, match="1 entry"):
         loop.plant.set_parameter(own, "wall.restitution", [0.5, 0.5])
-    with pytest.raises(ModelError, match="contacts that open"):
+    with pytest.raises(ModelError, match="whose contacts open and close cannot be traced"):
         rollout(loop, np.zeros(4), None, [0.0, 0.1])
 
 

@@ -24,6 +24,7 @@ LOOKS = {
     "diagrams": ("closed loops, wired with DiagramBuilder", "#9a4fb0"),
     "pictures": ("plots, animation, film, Meshcat", "#7d55c0"),
     "simulation": ("runs and records", "#6a5bc0"),
+    "compiler": ("diagrams as functions, one for each rate", "#5560c0"),
     "systems": ("Drake LeafSystems", "#4f62b8"),
     "robots": ("section 3: robots as DaeSystems", "#2b84b5"),
     "symbolic": ("from pydrake.symbolic", "#2a9d8f"),

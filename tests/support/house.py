@@ -27,6 +27,7 @@ FLOORS = (
     ("dae",),
     ("analysis", "symbolic", "robots"),
     ("systems",),
+    ("compiler",),
     ("simulation",),
     ("pictures",),
     ("diagrams",),

@@ -1,15 +1,13 @@
 """A closed loop's law, plant and projection as plain C99, for somebody's real-time loop."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -19,39 +17,31 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.export.samples import Call, samples, tests
-from drake_dae.running.export.text import braced, comment, string
-from drake_dae.trace.compiled import generate
+from drake_dae.running.export.parts import parts_of
+from drake_dae.running.export.samples import samples, tests
+from drake_dae.running.export.text import Call, Vector, braced, comment, string
+from drake_dae.running.export.whole import whole_calls, whole_vectors
+from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 
 TEMPLATES = Path(__file__).parent / "c99"
 
 
-@dataclass(frozen=True, eq=False)
-class _Vector:
-    """A vector of the C code.
-
-    Attributes:
-        what: What it is, in words.
-        signals: Names and units of its entries.
-        default: What it is where nobody says otherwise, shape (k,); None if there is no such thing.
-    """
-
-    what: str
-    signals: Sequence[Signal]
-    default: FloatArray | None = None
-
-
 @checked(ModelError)
-def export_code(loop: ClosedLoop, context: Context, name: str, folder: str | Path) -> list[Path]:
+def export_code(
+    loop: ClosedLoop | Diagram, context: Context, name: str, folder: str | Path
+) -> list[Path]:
     """Writes the law, the plant and the projection of a closed loop as C99 without dependencies.
+
+    Where all of its blocks can be traced, see `compile_diagram`, the loop as a whole as well: the
+    derivative of all states, all outputs, and what blocks hold between their samples.
 
     In the folder stand then: name.h with sizes, names and units; name.c; test_name.c, which
     compares them with values that Python computed; a Makefile, whose `make` compiles and runs that;
     and LICENSE.txt. Files of these names are overwritten.
 
     Args:
-        loop: The closed loop.
+        loop: The closed loop, or any diagram with one plant and one law.
         context: Its context at the start, whose state and parameters the test program has too.
         name: What the files are called, and, in letters that C takes, the functions.
         folder: Where to write; made if there is none.
@@ -60,10 +50,12 @@ def export_code(loop: ClosedLoop, context: Context, name: str, folder: str | Pat
         The files.
 
     Raises:
-        ModelError: No sample has values, so that nothing could be compared.
+        ModelError: No sample has values, so that nothing could be compared; or a diagram has not
+            one plant and one law, or cannot be traced.
         OSError: A file cannot be written.
     """
-    plant, controller = loop.plant, loop.controller
+    parts = parts_of(loop)
+    plant, controller, whole = parts.plant, parts.controller, parts.compiled
     law, structure = controller.law, plant.structure
     plant_parameters = plant.current_parameters(plant.GetMyContextFromRoot(context))
     law_parameters = controller.all_parameters(controller.GetMyContextFromRoot(context))
@@ -75,8 +67,11 @@ def export_code(loop: ClosedLoop, context: Context, name: str, folder: str | Pat
     file = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
     vectors = _vectors(law, structure, plant_parameters, law_parameters)
     calls = _calls(law, structure)
+    if whole is not None:
+        vectors |= whole_vectors(whole, whole.values(context))
+        calls |= whole_calls(whole)
     generated = generate(
-        *(_renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
+        *(renamed(call.function.function, f"{prefix}_traced_{key}") for key, call in calls.items())
     )
     words = {
         "title": comment(f"{structure.system.name} ({name})"),
@@ -93,7 +88,12 @@ def export_code(loop: ClosedLoop, context: Context, name: str, folder: str | Pat
         "calls": "".join(_called(prefix, *item) for item in calls.items()),
         "residual": calls["residual"].signature,
         "residuals": str(max(1, len(structure.manifold.residual_signals))),
-        **tests(prefix, calls, samples(loop, context, calls)),
+        "whole": "".join(
+            f"int {prefix}_{key}({call.signature});\n"
+            for key, call in calls.items()
+            if key.startswith("loop_")
+        ),
+        **tests(prefix, calls, samples(parts, context, calls)),
     }
     names = {
         "system.h": f"{file}.h",
@@ -115,7 +115,7 @@ def _vectors(
     structure: ConstraintStructure,
     plant_parameters: FloatArray,
     law_parameters: FloatArray,
-) -> dict[str, _Vector]:
+) -> dict[str, Vector]:
     """All vectors of the C code, by their names there."""
     system = structure.system
     moves = "; what moves comes here, too, with its derivatives" if system.exogenous else ""
@@ -125,16 +125,16 @@ def _vectors(
         for i in np.flatnonzero(law.gains.matrix[:, j])
     ]
     vectors = {
-        "state": _Vector("x, the state", system.state_signals),
-        "control": _Vector("u, the control", system.control_signals),
-        "reference": _Vector("R, the references with their derivatives", law.reference_signals),
-        "measured_force": _Vector("v as it is measured", system.constraint_input_signals),
-        "tracking_error": _Vector("e = z - r (29)", system.output_signals),
-        "constraint_force": _Vector("v, the constraint inputs", system.constraint_input_signals),
-        "constraint_residual": _Vector("zero on N*", structure.manifold.residual_signals),
-        "controlled_output": _Vector("z, the controlled outputs", system.output_signals),
-        "parameters": _Vector(f"of the plant{moves}", _parameters(system), plant_parameters),
-        "law_parameters": _Vector(
+        "state": Vector("x, the state", system.state_signals),
+        "control": Vector("u, the control", system.control_signals),
+        "reference": Vector("R, the references with their derivatives", law.reference_signals),
+        "measured_force": Vector("v as it is measured", system.constraint_input_signals),
+        "tracking_error": Vector("e = z - r (29)", system.output_signals),
+        "constraint_force": Vector("v, the constraint inputs", system.constraint_input_signals),
+        "constraint_residual": Vector("zero on N*", structure.manifold.residual_signals),
+        "controlled_output": Vector("z, the controlled outputs", system.output_signals),
+        "parameters": Vector(f"of the plant{moves}", _parameters(system), plant_parameters),
+        "law_parameters": Vector(
             "of the law's model, and then the gains",
             [*_parameters(law.system), *gains],
             law_parameters,
@@ -143,9 +143,9 @@ def _vectors(
     if not law.measured_force:
         del vectors["measured_force"]
     if law.integral.outputs:
-        vectors["integral"] = _Vector("the integrals of errors", law.integral.signals)
+        vectors["integral"] = Vector("the integrals of errors", law.integral.signals)
         rates = [Signal(f"d/dt {s.name}", s.unit.removesuffix(" s")) for s in law.integral.signals]
-        vectors["integral_rate"] = _Vector("their derivatives by the time", rates)
+        vectors["integral_rate"] = Vector("their derivatives by the time", rates)
     return vectors
 
 
@@ -190,13 +190,7 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
     }
 
 
-def _renamed(function: ca.Function, name: str) -> ca.Function:
-    """The same function under a name of C."""
-    inputs = function.sx_in()
-    return ca.Function(name, inputs, function.call(inputs), {"cse": False})
-
-
-def _declared(prefix: str, name: str, vector: _Vector) -> str:
+def _declared(prefix: str, name: str, vector: Vector) -> str:
     """What the header says of a vector."""
     size = f"{prefix}_{name}_SIZE".upper()
     width = max([len(comment(signal.name)) for signal in vector.signals], default=0)
@@ -213,7 +207,7 @@ def _declared(prefix: str, name: str, vector: _Vector) -> str:
     return "\n".join([*lines, "", ""])
 
 
-def _defined(prefix: str, name: str, vector: _Vector) -> str:
+def _defined(prefix: str, name: str, vector: Vector) -> str:
     """The names, units and defaults of a vector."""
     lines = []
     for what in ("name", "unit"):

@@ -7,33 +7,13 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.running.export.text import braced
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.running.export.parts import Parts
+from drake_dae.running.export.text import Call, braced
+from drake_dae.running.export.whole import whole_values
 
 SAMPLES = 10
 """How many inputs the test program has for each function."""
-
-
-@dataclass(frozen=True, eq=False)
-class Call:
-    """A function of the C code.
-
-    Attributes:
-        function: What it computes.
-        inputs, outputs: What its arguments are called in C, in the order of the function's.
-    """
-
-    function: TracedFunction
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-
-    @property
-    def signature(self) -> str:
-        """The arguments as C declares them."""
-        inputs = [f"const double *{name}" for name in self.inputs]
-        return ", ".join([*inputs, *(f"double *{name}" for name in self.outputs)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +24,18 @@ class Sample:
     outputs: Mapping[str, FloatArray]
 
 
-def samples(
-    loop: ClosedLoop, context: Context, calls: Mapping[str, Call]
-) -> dict[str, list[Sample]]:
+def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[str, list[Sample]]:
     """Inputs and outputs of all functions: at the start, and at states near and on N*.
 
     Raises:
         ModelError: No sample of a function has values.
     """
-    plant, manifold = loop.plant, loop.plant.structure.manifold
+    plant, controller, manifold = parts.plant, parts.controller, parts.plant.structure.manifold
+    reference, whole = parts.reference(context), parts.compiled
     random = np.random.default_rng(0)
     own = plant.GetMyContextFromRoot(context)
     start, given = plant.state(own), plant.current_parameters(own)
-    model = loop.controller.all_parameters(loop.controller.GetMyContextFromRoot(context))
+    model = controller.all_parameters(controller.GetMyContextFromRoot(context))
     states = [start, *plant.structure.states][:SAMPLES]
     found: dict[str, list[Sample]] = {name: [] for name in (*calls, "project")}
     for index, state in enumerate(states):
@@ -65,13 +44,17 @@ def samples(
         values = {
             "state": state,
             "other": states[0],
-            "reference": loop.reference.reference(time),
+            "reference": reference(time),
             "measured_force": random.normal(size=plant.dae.num_constraints),
-            "integral": random.normal(size=len(loop.controller.law.integral.outputs)),
+            "integral": random.normal(size=len(controller.law.integral.outputs)),
             "parameters": given,
             "law_parameters": model,
             "control": np.zeros(plant.dae.num_controls),
+            "time": np.array([time]),
         }
+        if whole is not None:
+            values |= whole_values(whole, whole.start(context), state)
+            values["loop_parameters"] = whole.values(context)
         for name, call in calls.items():
             # The residual on N* is but round-off.
             values["state"] = near if name == "residual" else state

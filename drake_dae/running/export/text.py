@@ -1,7 +1,47 @@
-"""What Python writes in C: lists, strings and comments."""
+"""What Python writes in C: vectors, calls, lists, strings and comments."""
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.trace.functions import TracedFunction
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """A vector of the C code.
+
+    Attributes:
+        what: What it is, in words.
+        signals: Names and units of its entries.
+        default: What it is where nobody says otherwise, shape (k,); None if there is no such thing.
+    """
+
+    what: str
+    signals: Sequence[Signal]
+    default: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A function of the C code.
+
+    Attributes:
+        function: What it computes.
+        inputs, outputs: What its arguments are called in C, in the order of the function's.
+    """
+
+    function: TracedFunction
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+    @property
+    def signature(self) -> str:
+        """The arguments as C declares them."""
+        inputs = [f"const double *{name}" for name in self.inputs]
+        return ", ".join([*inputs, *(f"double *{name}" for name in self.outputs)])
 
 
 def braced(items: Sequence[str]) -> str:

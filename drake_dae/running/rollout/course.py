@@ -54,13 +54,13 @@ class Rows(NamedTuple):
     Attributes:
         times: Their times in s, shape (k,).
         states: The states, shape (k, n).
-        hold: What the sensor holds in all of them.
+        held: What is held in all of them.
         between: Whether an interpolant gave them, so that they are not on N*.
     """
 
     times: FloatArray
     states: FloatArray
-    hold: FloatArray
+    held: FloatArray
     between: bool
 
     def without_last(self) -> Self:
@@ -76,7 +76,7 @@ class Course:
     problem: Problem
     time: float
     state: FloatArray
-    hold: FloatArray
+    held: FloatArray
     rows: list[Rows] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
     event: int = 0
@@ -89,7 +89,7 @@ class Course:
 
     def rate(self, time: float, state: FloatArray) -> FloatArray:
         """The derivative; nan where it has no value, and the earliest such trial is kept."""
-        values = self.fused.rate(time, state, self.hold, self.problem.plant, self.problem.law)
+        values = self.fused.rate(time, state, self.held, self.problem.parameters)
         if np.isnan(values[0]) and time < self.trial_time and np.isfinite(state).all():
             self.trial_time, self.trial = time, state.copy()
         return values
@@ -103,16 +103,16 @@ class Course:
 
     def projected(self, time: float, state: FloatArray) -> FloatArray:
         """A state on N*."""
-        if not self.fused.functions.loop.plant.projects:
+        if not self.fused.program.compiled.projects:
             return state
-        states, left = self.fused.projections(np.array([time]), state[None], self.problem.plant)
+        given = np.array([time]), state[None], self.held[None], self.problem.parameters
+        states, left = self.fused.projections(*given)
         if left[0] <= REACHED:
             return states[0]
         try:
-            found = self.problem.project(time, state)
+            return self.problem.project(time, state)
         except InconsistentStateError:
             raise Ended(Ending.OFF_MANIFOLD) from None
-        return np.concatenate([found, state[found.size :]])
 
     def note_stages(self, rate: FloatArray, size: float) -> None:
         """Evaluates the stages of a step of DOP853 one by one, to keep the trial that fails."""
@@ -127,15 +127,23 @@ class Course:
         Args:
             is_on: Whether the state is on N* already.
         """
+        before, state = self.event, self.state
         if not is_on:
             self.state = self.projected(self.time, self.state)
-        problem, before = self.problem, self.event
+        problem = self.problem
         while self.event < problem.events.size and problem.events[self.event] <= self.time:
-            noise = problem.noise[self.event]
-            self.hold = self.fused.sample(
-                self.time, self.state, self.hold, noise, problem.plant, problem.law
-            )
-            if not np.isfinite(self.hold).all():
+            # Unrestricted updates see what was before the projection, which is one of them.
+            for seen, is_unrestricted in ((state, True), (self.state, False)):
+                self.held = self.fused.update(
+                    self.time,
+                    seen,
+                    self.held,
+                    problem.parameters,
+                    problem.noise[self.event],
+                    int(problem.due[self.event]),
+                    is_unrestricted,
+                )
+            if not np.isfinite(self.held).all():
                 raise Ended(Ending.INVALID)
             self.event += 1
         return self.event > before
@@ -152,21 +160,21 @@ class Course:
 
     def write(self, time: float, state: FloatArray) -> None:
         """Keeps a row of the record."""
-        self.rows.append(Rows(np.array([time]), state[None], self.hold, False))
+        self.rows.append(Rows(np.array([time]), state[None], self.held, False))
 
     def write_between(self, step: "Step", times: FloatArray) -> None:
         """Keeps rows that lie within a step, for its interpolant to be computed with others."""
         found = np.zeros((times.size, self.state.size))
         rates = np.concatenate([step.stages, step.rate[None]])
         ends = self.time, step.size, self.state, step.reached
-        self.spans.append(Span(*ends, rates, self.hold, times, found))
-        self.rows.append(Rows(times, found, self.hold, True))
+        self.spans.append(Span(*ends, rates, self.held, times, found))
+        self.rows.append(Rows(times, found, self.held, True))
         if len(self.spans) == BLOCK:
             self.fill()
 
     def fill(self) -> None:
         """Computes the rows within steps."""
-        fill(self.spans, self.fused.rates, self.problem.plant, self.problem.law)
+        fill(self.spans, self.fused.rates, self.problem.parameters)
         self.spans.clear()
 
     def boundary(self) -> float:
@@ -180,15 +188,17 @@ class Course:
         counts = [len(rows.times) for rows in self.rows]
         times = np.concatenate([rows.times for rows in self.rows])
         states = np.concatenate([rows.states for rows in self.rows])
-        holds = np.repeat([rows.hold for rows in self.rows], counts, axis=0)
+        held = np.repeat([rows.held for rows in self.rows], counts, axis=0)
         between = np.repeat([rows.between for rows in self.rows], counts)
-        if self.fused.functions.loop.plant.projects and between.any():
+        parameters = self.problem.parameters
+        if self.fused.program.compiled.projects and between.any():
             apart = np.flatnonzero(between)
-            found, left = self.fused.projections(times[apart], states[apart], self.problem.plant)
+            given = times[apart], states[apart], held[apart], parameters
+            found, left = self.fused.projections(*given)
             for index in np.flatnonzero(~(left <= REACHED)):
                 found[index] = self.projected(times[apart[index]], states[apart[index]])
             states[apart] = found
-        rows, valid = self.fused.rows(times, states, holds, self.problem.plant, self.problem.law)
+        rows, valid = self.fused.rows(times, states, held, parameters)
         count = int(np.argmin(np.append(valid, False)))
         if count < len(valid):
             ending = Ending.INVALID

@@ -17,7 +17,7 @@ class Span(NamedTuple):
         time, size: When it begins, and how long it is, in s.
         state, reached: The states at its ends, shape (n,).
         rates: The derivatives at its stages and at its end, shape (13, n).
-        hold: What the sensor holds.
+        held: What is held.
         times: The times in s, shape (k,).
         found: Where the states are written, shape (k, n).
     """
@@ -27,30 +27,30 @@ class Span(NamedTuple):
     state: FloatArray
     reached: FloatArray
     rates: FloatArray
-    hold: FloatArray
+    held: FloatArray
     times: FloatArray
     found: FloatArray
 
 
-def fill(spans: Sequence[Span], rate: Many, plant: FloatArray, law: FloatArray) -> None:
+def fill(spans: Sequence[Span], rate: Many, parameters: FloatArray) -> None:
     """Writes the states within steps, by the interpolant of seventh order as SciPy has it.
 
     Args:
         spans: The steps.
         rate: The derivative of the state, as a function of what all functions take.
-        plant, law: The parameters.
+        parameters: The parameters.
     """
     if not spans:
         return
     time, size = (np.array(each)[:, None] for each in list(zip(*spans, strict=True))[:2])
     state = np.array([span.state for span in spans])
-    hold = np.array([span.hold for span in spans])
+    held = np.array([span.held for span in spans])
     rates = np.zeros((16, *state.shape))
     rates[:13] = np.stack([span.rates for span in spans], axis=1)
     tables = zip(DOP853.A_EXTRA, DOP853.C_EXTRA, strict=True)
     for number, (row, part) in enumerate(tables, start=13):
         stage = state + size * np.tensordot(row[:number], rates[:number], 1)
-        rates[number] = rate(time + part * size, stage, hold, plant, law)[0]
+        rates[number] = rate(time + part * size, stage, held, parameters)[0]
     change = np.array([span.reached for span in spans]) - state
     parts = [
         change,

@@ -4,7 +4,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
-from drake_dae.running.rollout.functions import LoopFunctions
+from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run
 from drake_dae.systems.blocks.failures import (
     endless_steps,
@@ -13,24 +13,27 @@ from drake_dae.systems.blocks.failures import (
     simulation_error,
     spoilt_step,
 )
+from drake_dae.systems.blocks.traced import STATE, TIME
 from drake_dae.systems.blocks.trials import STEPS
 
+STATES = (STATE, "estimated_state")
+"""Where the argument of a computation comes from that says where the system is."""
 
-def failure_of(functions: LoopFunctions, problem: Problem, run: Run) -> SimulationError:
+
+def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
     """The exception that the same run of Drake's raises.
 
     Args:
-        functions: The closed loop.
+        program: The diagram.
         problem: What was run.
         run: What it came to.
     """
-    name, size = functions.loop.plant.get_name(), functions.loop.plant.dae.num_states
-    state = run.state[:size]
-    trial = _reason(functions, problem, run.trial_time, run.trial) if run.trial_time else None
+    name, state = program.name, run.state[program.plant]
+    trial = _reason(program, problem, run.trial_time, run.trial) if run.trial_time else None
     match run.ending:
         case Ending.OFF_MANIFOLD:
             try:
-                problem.project(run.time, state)
+                problem.project(run.time, run.state)
             except InconsistentStateError as error:
                 return off_manifold(run.time, state, error)
         case Ending.SLOW:
@@ -48,47 +51,35 @@ def failure_of(functions: LoopFunctions, problem: Problem, run: Run) -> Simulati
                 run.time,
                 state,
             )
-    reason = _reason(functions, problem, run.time, run.state) or trial
+    reason = _reason(program, problem, run.time, run.state) or trial
     if reason is not None:
         return reason
     return NonFiniteError(f"{name}: a signal has no value at t = {run.time:.6g} s", run.time, state)
 
 
 def _reason(
-    functions: LoopFunctions, problem: Problem, time: float, state: FloatArray
+    program: Program, problem: Problem, time: float, state: FloatArray
 ) -> SimulationError | None:
     """What is wrong at a time and state; None if nothing is."""
-    loop, dae = functions.loop, functions.loop.plant.dae
     if not np.isfinite(state).all():
         return None
-    x = state[: dae.num_states]
-    moment = functions.signals.evaluate(np.array([time]))
-    if not functions.signals.is_finite:
-        return NonFiniteError(f"the reference is not finite at t = {time:g} s", time, moment[0])
-    reference, moving, of_law = (values.copy() for values in moment)
-    plant, law = problem.plant.copy(), problem.law.copy()
-    if loop.exogenous is not None:
-        plant[loop.plant.exogenous_places] = moving
-        law[loop.controller.exogenous_places] = of_law
-    measured = [functions.measured(state, problem.hold)] if loop.sensor is not None else []
-    control = np.zeros(dae.num_controls)
-    if functions.is_direct and not loop.controller.law.control_takes_force:
-        measured = [np.zeros(dae.num_constraints)]
-    elif functions.is_direct:
-        measured = [functions.plant(x, control, plant)[1]]
-    signals = {
-        "state": dae.state_signals,
-        "control": dae.control_signals,
-        "reference": loop.controller.law.reference_signals,
-        "measured_force": dae.constraint_input_signals,
-    }
-    integral = [functions.integral(state)] if functions.num_integrals else []
-    control = functions.law(x, reference, *measured, *integral, law)[0]
-    if not functions.law.is_valid:
-        return simulation_error(functions.law.failure(), time, x, signals)
-    if functions.limits is not None:
-        control = np.clip(control, -functions.limits, functions.limits)
-    functions.plant(x, control, plant)
-    if not functions.plant.is_valid:
-        return simulation_error(functions.plant.failure(), time, x, signals)
+    compiled = program.compiled
+    for call in compiled.calls:
+        function = call.computation.traced
+        if function is None:
+            continue
+        given = compiled.arguments_of(call)(time, state, problem.held, problem.parameters)
+        arguments = [
+            np.array(each)[:, 0] for each in (given if len(call.arguments) > 1 else [given])
+        ]
+        function.evaluate(*arguments)
+        if function.is_valid:
+            continue
+        if TIME in call.computation.sources:
+            return NonFiniteError(
+                f"the reference is not finite at t = {time:g} s", time, function.outputs[0].copy()
+            )
+        places = [i for i, name in enumerate(call.computation.sources) if name in STATES]
+        x = arguments[places[0]] if places else state
+        return simulation_error(function.failure(), time, x, call.block.signals)
     return None

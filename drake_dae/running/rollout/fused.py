@@ -1,4 +1,4 @@
-"""A closed loop as functions of CasADi's interpreter: its derivative, its steps, its record."""
+"""A diagram as functions of CasADi's interpreter: its derivative, its steps, its record."""
 
 from collections.abc import Sequence
 from math import isfinite
@@ -8,8 +8,9 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.running.rollout.functions import LoopFunctions
+from drake_dae.compiler.compile import ARGUMENTS
 from drake_dae.running.rollout.many import Many
+from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Tableau
 
 CHUNK = 64
@@ -47,44 +48,25 @@ class Called:
 
 
 class Fused:
-    """Plant, law, references and sensor as one function.
+    """The functions of a diagram, and steps of its state as functions.
 
-    All functions take the time, the state with that of the sensor and the law's integrals, what the
-    sensor holds (or its noise), and the parameters of plant and law.
+    All functions take the time, the state, what is held, and the parameters.
 
     Attributes:
-        functions: The closed loop.
+        program: The diagram.
         controlled: A step of DOP853, as `controlled_step` has it.
-        rates: The derivative of the state at many moments, and what `rate` has with it.
+        rates: The derivative of the state at many moments, and what is finite where it is of use.
     """
 
-    def __init__(self, functions: LoopFunctions) -> None:
-        self.functions = functions
-        loop, dae = functions.loop, functions.loop.plant.dae
-        size = functions.size
-        self._sizes = sizes = (
-            1,
-            size,
-            dae.num_constraints,
-            functions.plant.sizes[-1],
-            functions.law.sizes[-1],
-        )
-        names = ("time", "state", "hold", "plant", "law")
-        inputs = [ca.SX.sym(name, count) for name, count in zip(names, sizes, strict=True)]
-        time, state, hold, plant, law = inputs
-        reference, moving, of_law, *checks = functions.signals.function(time)
-        if loop.exogenous is not None:
-            plant, law = ca.SX(plant), ca.SX(law)
-            plant[loop.plant.exogenous_places] = moving
-            law[loop.controller.exogenous_places] = of_law
-        options = {"cse": False}
-        rate, force, valid = functions.rate(state, reference, hold, plant, law)
-        self._rate = ca.Function("rate", inputs, [rate, force, valid + checks[-1]], options)
-        row, valid = functions.row(state, reference, hold, plant, law, moving)
-        row = ca.cse([row, valid + checks[-1]])
-        self._rows = Many(ca.Function("rows", inputs, row, options))
-        self._projection = self._project_function()
-        self._projections = Many(self._projection)
+    def __init__(self, program: Program) -> None:
+        self.program, compiled = program, program.compiled
+        self._sizes = [compiled.sizes[name] for name in ARGUMENTS]
+        self._rate, self._projection = compiled.rate, compiled.newton(2)
+        self._rows, self._projections = Many(compiled.row), Many(self._projection)
+        self._updates = [
+            (rate.is_unrestricted, list(rate.places), Called(rate.function))
+            for rate in compiled.rates
+        ]
         self._steps: dict[bytes, tuple[Called, Called]] = {}
         self._called = Called(self._rate)
         self.controlled = Called(self._controlled_step())
@@ -92,62 +74,59 @@ class Fused:
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
         """The derivative of the state, a fresh array; nan where it has no value."""
-        rate, _, valid = self._called(*arguments)
+        rate, valid = self._called(*arguments)
         values = rate.copy()
         if not isfinite(valid[0]):
             values[:] = np.nan
         return values
 
-    def sample(
+    def update(
         self,
         time: float,
         state: FloatArray,
-        hold: FloatArray,
+        held: FloatArray,
+        parameters: FloatArray,
         noise: FloatArray,
-        plant: FloatArray,
-        law: FloatArray,
+        due: int,
+        is_unrestricted: bool,
     ) -> FloatArray:
-        """What the sensor holds from now on; not finite where the force has no value."""
-        sensor = self.functions.loop.sensor
-        if sensor is None or not sensor.sample_period:
-            return noise
-        if self.functions.num_lags:
-            force = self.functions.felt(state)
-        else:
-            rate = self.rate(time, state, hold, plant, law)
-            force = self._called.results[1] + rate[0] * 0.0
-        return force + sensor.bias + sensor.noise_deviation * noise
+        """What is held after updates of one kind that are due; not finite where one has no value.
+
+        Args:
+            time, state, held, parameters: As for all functions.
+            noise: The random numbers of this moment.
+            due: Which rates are due, as bits.
+            is_unrestricted: The kind.
+        """
+        found = held.copy()
+        for number, (kind, places, function) in enumerate(self._updates):
+            if due >> number & 1 and kind == is_unrestricted:
+                values, valid = function(time, state, held, parameters, noise)
+                found[places] = values + 0.0 * valid
+        return found
 
     def rows(
-        self,
-        times: FloatArray,
-        states: FloatArray,
-        holds: FloatArray,
-        plant: FloatArray,
-        law: FloatArray,
+        self, times: FloatArray, states: FloatArray, held: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Rows of the record, and which of them have values.
 
         Args:
             times: Their times, shape (k,).
             states: The states, shape (k, n).
-            holds: What the sensor holds, shape (k, m).
-            plant, law: The parameters.
+            held: What is held, shape (k, m).
+            parameters: The parameters.
         """
-        rows, valid = self._rows(times[:, None], states, holds, plant, law)
+        rows, valid = self._rows(times[:, None], states, held, parameters)
         return rows, np.isfinite(valid[:, 0])
 
     def projections(
-        self, times: FloatArray, states: FloatArray, plant: FloatArray
+        self, times: FloatArray, states: FloatArray, held: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """States after two Newton steps to N*, shape (k, n), and the lengths of the last ones.
 
-        Args:
-            times: Their times, shape (k,).
-            states: The states, shape (k, n).
-            plant: The plant's parameters.
+        The arguments are those of `rows`.
         """
-        found, left = self._projections(times[:, None], states, plant)
+        found, left = self._projections(times[:, None], states, held, parameters)
         return found, left[:, 0]
 
     def steps(self, tableau: Tableau) -> tuple[Called, Called]:
@@ -171,15 +150,15 @@ class Fused:
         A function of state, time, step, what is held, and parameters; it returns the state, and
         below each other what is finite if all has values, and the length of the last Newton step.
         """
-        time, state, hold, plant, law = self._symbols()
+        time, state, held, parameters = self._symbols()
         step = ca.MX.sym("step")
-        symbols = [state, time, step, hold, plant, law]
-        state, left = self._projection(time, state, plant)
+        symbols = [state, time, step, held, parameters]
+        state, left = self._projection(time, state, held, parameters)
         rates: list[ca.MX] = []
         finite = ca.MX(0.0)
         for row, part in zip(tableau.a, tableau.c, strict=True):
             stage = state + step * _weighted(row, rates)
-            rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
+            rate, valid = self._rate(time + part * step, stage, held, parameters)
             rates.append(rate)
             finite += valid
         reached = state + step * _weighted(tableau.b, rates)
@@ -195,38 +174,23 @@ class Fused:
         finite if all stages have values, the length of the last Newton step, and what is finite if
         the rate has a value; and the rates of all stages side by side.
         """
-        symbols = time, state, hold, plant, law = self._symbols()
+        symbols = time, state, held, parameters = self._symbols()
         first, step = ca.MX.sym("first", self._sizes[1]), ca.MX.sym("step")
         absolute, relative = ca.MX.sym("absolute", self._sizes[1]), ca.MX.sym("relative")
         rates, finite = [first], ca.MX(0.0)
         for row, part in zip(DOP853.A[1:], DOP853.C[1:], strict=True):
             stage = state + step * _weighted(row, rates)
-            rate, _, valid = self._rate(time + part * step, stage, hold, plant, law)
+            rate, valid = self._rate(time + part * step, stage, held, parameters)
             rates.append(rate)
             finite += valid
         reached = state + step * _weighted(DOP853.B, rates)
         unit = absolute + ca.fmax(ca.fabs(state), ca.fabs(reached)) * relative
         errors = [ca.sumsqr(_weighted(e, rates) / unit) for e in (DOP853.E5, DOP853.E3)]
-        found, left = self._projection(time + step, reached, plant)
-        last, _, valid = self._rate(time + step, found, hold, plant, law)
+        found, left = self._projection(time + step, reached, held, parameters)
+        last, valid = self._rate(time + step, found, held, parameters)
         checks = ca.vertcat(*errors, finite, left, valid)
         symbols = [*symbols, first, step, absolute, relative]
         return ca.Function("controlled", symbols, [found, last, checks, ca.horzcat(*rates)])
-
-    def _project_function(self) -> ca.Function:
-        """(t, state, the plant's parameters) -> the state on N*, as `projection` has it."""
-        functions, loop = self.functions, self.functions.loop
-        sizes = [1, functions.size, functions.plant.sizes[-1]]
-        symbols = [ca.SX.sym("x", size) for size in sizes]
-        time, state, plant = symbols
-        x, left = state[: loop.plant.dae.num_states], ca.SX(0.0)
-        if loop.plant.projects:
-            own = ca.SX(plant)
-            if loop.exogenous is not None:
-                own[loop.plant.exogenous_places] = functions.signals.function(time)[1]
-            x, left = functions.projection(2)(x, own)
-        found = ca.densify(ca.vertcat(x, state[loop.plant.dae.num_states :]))
-        return ca.Function("projection", symbols, [found, ca.densify(left)], {"cse": False})
 
 
 def _weighted(weights: FloatArray, rates: Sequence[ca.MX]) -> ca.MX:

@@ -32,7 +32,7 @@ def runner(fused: Fused, settings: Settings) -> Callable[[Problem], Run]:
     def run(problem: Problem) -> Run:
         start = float(problem.times[0])
         course = Course(
-            fused, problem, start, problem.state, problem.hold, before=start, mark=start
+            fused, problem, start, problem.state, problem.held, before=start, mark=start
         )
         try:
             if steps is None:
@@ -95,9 +95,8 @@ def _controlled(
         reached, last, checks, stages = course.fused.controlled(
             course.time,
             course.state,
-            course.hold,
-            problem.plant,
-            problem.law,
+            course.held,
+            problem.parameters,
             rate,
             size,
             settings.absolute,
@@ -188,7 +187,7 @@ class _Steps:
         if len(block) < CHUNK:
             step, block = self._one, block[:1]
         starts, ends, is_row = block.T
-        given = (starts[:, None], (ends - starts)[:, None], course.hold, problem.plant, problem.law)
+        given = (starts[:, None], (ends - starts)[:, None], course.held, problem.parameters)
         states, checks = (
             values.copy().reshape(len(block), -1) for values in step(course.state, *given)
         )
@@ -198,7 +197,7 @@ class _Steps:
         for end, state in zip(ends[:count].tolist(), states, strict=False):
             course.accept(end, state)
         chosen = np.flatnonzero(is_row[:count])
-        course.rows.append(Rows(ends[chosen], states[chosen], course.hold, False))
+        course.rows.append(Rows(ends[chosen], states[chosen], course.held, False))
         if count == len(block):
             return count
         self._advance_slowly(course, *block[count])

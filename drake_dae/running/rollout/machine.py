@@ -1,23 +1,26 @@
-"""A closed loop as one library of machine code, which steps it without Python in between."""
+"""A diagram as one library of machine code, which steps it without Python in between."""
 
 import ctypes
 from pathlib import Path
 from string import Template
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.compile import Rate
 from drake_dae.errors import InconsistentStateError
-from drake_dae.running.rollout.functions import LoopFunctions
+from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
-from drake_dae.trace.compiled import Compiled, generate, library, without_branches
+from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
 
 SOURCE = Path(__file__).parent / "stepper.c"
 
 Library = ctypes.CDLL
+
+_PROJECTION, _ALL = 2, 7
+"""What is pending before a step, as stepper.c has it."""
 
 BUDGET = 20_000
 """So many steps are taken before Python looks for Ctrl-C: at most some tenths of a second."""
@@ -36,56 +39,50 @@ class _Run(ctypes.Structure):
     )
 
 
-def load(functions: LoopFunctions, compiled: Compiled, make: bool) -> Library | None:
-    """The library of a closed loop; None if there is none.
+def load(program: Program, compiled: Compiled, make: bool) -> Library | None:
+    """The library of a diagram; None if there is none.
 
     Args:
-        functions: The closed loop.
+        program: The diagram.
         compiled: The choice, True or "auto".
         make: Whether to make it where the cache has none.
 
     Warns:
         MachineCodeWarning: It should be made and cannot be.
     """
-    path = library(_source(functions), functions.num_operations, compiled, make)
+    path = library(_source(program), program.num_operations, compiled, make)
     return None if path is None else ctypes.CDLL(str(path))
 
 
-def run(code: Library, functions: LoopFunctions, problem: Problem, settings: Settings) -> Run:
-    """Runs a closed loop until its end, or to where it cannot go on by machine code alone.
+def run(code: Library, program: Program, problem: Problem, settings: Settings) -> Run:
+    """Runs a diagram until its end, or to where it cannot go on by machine code alone.
 
     Args:
         code: What `load` returned.
-        functions: The closed loop.
+        program: The diagram.
         problem: What to run.
         settings: How to step.
     """
-    own = _Run(time=problem.times[0], start=problem.times[0], mark=problem.times[0], pending=1)
-    state, hold, trial = (
-        problem.state.copy(),
-        problem.hold.copy(),
-        np.full_like(problem.state, np.nan),
-    )
-    width = sum(map(len, functions.columns.values()))
-    rows = np.empty((problem.times.size, width))
-    arrays = [problem.plant, problem.law, trial]
+    own = _Run(time=problem.times[0], start=problem.times[0], mark=problem.times[0], pending=_ALL)
+    state, held = problem.state.copy(), problem.held.copy()
+    trial = np.full_like(problem.state, np.nan)
+    rows = np.empty((problem.times.size, program.width))
     step, tables = code.run_controlled, [settings.longest, settings.absolute, settings.relative]
     if settings.tableau is not None:
         a, b, c = settings.tableau
         step, tables = code.run_fixed, [settings.longest, b.size, a, b, c]
-    given = [state, hold, *arrays, problem.times.size, problem.times, rows]
-    given += [problem.events.size, problem.events, problem.noise, *tables]
+    given = [state, held, problem.parameters, trial, problem.times.size, problem.times, rows]
+    given += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
     arguments = [_argument(value) for value in given]
     ending = Ending.PAUSED
     while ending is Ending.PAUSED and not settings.stop():
         ending = Ending(step(ctypes.byref(own), *arguments, _argument(BUDGET)))
         if ending is Ending.OFF_MANIFOLD:
             try:
-                found = problem.project(own.time, state)
+                state[:] = problem.project(own.time, state)
             except InconsistentStateError:
                 break
-            state[: found.size] = found
-            own.pending = 2
+            own.pending &= ~_PROJECTION
             ending = Ending.PAUSED
     return Run(
         rows[: own.row],
@@ -106,38 +103,20 @@ def _argument(value: Any) -> Any:
     return ctypes.c_double(value) if isinstance(value, float) else ctypes.c_longlong(value)
 
 
-def _source(functions: LoopFunctions) -> str:
-    loop = functions.loop
-    plant, sensor = loop.plant, loop.sensor
-    dae = plant.dae
-    calls = functions.generated
-    columns = functions.columns
-    moving = [len(block.exogenous_places) for block in (plant, loop.controller)]
-    if loop.exogenous is None:
-        moving = [0, 0]
+def _source(program: Program) -> str:
+    compiled, calls = program.compiled, program.functions
     sizes: dict[str, int] = {
-        "NUM_STATES": dae.num_states,
-        "NUM_LAGS": functions.num_lags,
-        "SIZE": functions.size,
-        "NUM_FORCES": dae.num_constraints,
-        "NUM_REFERENCES": len(columns["reference"]),
-        "NUM_PLANT_MOVING": moving[0],
-        "NUM_LAW_MOVING": moving[1],
-        "NUM_PLANT": functions.plant.sizes[-1],
-        "NUM_LAW": functions.law.sizes[-1],
-        "WIDTH": sum(map(len, columns.values())),
-        "SAMPLES": int(bool(sensor and sensor.sample_period)),
-        "PROJECTS": int(plant.projects),
+        "SIZE": program.size,
+        "HELD": compiled.sizes["held"],
+        "NOISE": compiled.sizes["noise"],
+        "WIDTH": program.width,
+        "PROJECTS": int(compiled.projects),
     }
     for name, function in calls.items():
         # At least as many as the initializers in stepper.c.
-        sizes[f"{name.upper()}_ARG"] = function.sz_arg()
-        sizes[f"{name.upper()}_RES"] = max(5, function.sz_res())
-    zeros = np.zeros(dae.num_constraints)
-    places = [plant.exogenous_places, loop.controller.exogenous_places]
+        sizes[f"{name.upper()}_ARG"] = max(5, function.sz_arg())
+        sizes[f"{name.upper()}_RES"] = max(2, function.sz_res())
     tables = {
-        "bias": sensor.bias if sensor else zeros,
-        "deviation": sensor.noise_deviation if sensor else zeros,
         "dop_a": DOP853.A,
         "dop_b": DOP853.B,
         "dop_c": DOP853.C,
@@ -148,17 +127,32 @@ def _source(functions: LoopFunctions) -> str:
         "dop_c_more": DOP853.C_EXTRA,
     }
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
-    for name, chosen, count in zip(("plant", "law"), places, moving, strict=True):
-        listed = ", ".join(map(str, [*chosen[:count], 0]))
-        lines.append(f"static const int {name}_places[] = {{{listed}}};")
+    for number, rate in enumerate(compiled.rates):
+        listed = ", ".join(map(str, [*rate.places, 0]))
+        lines.append(f"static const int places_{number}[] = {{{listed}}};")
     lines += [_table(name, np.asarray(values)) for name, values in tables.items()]
     words = {
         "generated": without_branches(
-            generate(*(_renamed(each, f"dae_{name}") for name, each in calls.items()))
+            generate(*(renamed(each, f"dae_{name}") for name, each in calls.items()))
         ),
         "constants": "\n".join([*lines, ""]),
+        "updates": "\n".join(_updated(*item) for item in enumerate(compiled.rates)),
     }
     return Template(SOURCE.read_text(encoding="utf-8")).substitute(words)
+
+
+def _updated(number: int, rate: Rate) -> str:
+    """How stepper.c computes an update that is due."""
+    count = len(rate.places)
+    return f"""  if (due >> {number} & 1 && unrestricted == {int(rate.is_unrestricted)}) {{
+    double values[{count + 1}], valid;
+    const double *arg[UPDATE_{number}_ARG] = {{&time, x, held, g->parameters, noise}};
+    double *res[UPDATE_{number}_RES] = {{values, &valid}};
+    int i;
+    dae_update_{number}(arg, res, 0, 0, 0);
+    good &= isfinite(valid) != 0;
+    for (i = 0; i < {count}; i++) fresh[places_{number}[i]] = values[i];
+  }}"""
 
 
 def _table(name: str, values: FloatArray) -> str:
@@ -168,9 +162,3 @@ def _table(name: str, values: FloatArray) -> str:
         )
     rows = ",\n".join(f"{{{', '.join(map(repr, row))}}}" for row in values.tolist())
     return f"static const double {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}}};"
-
-
-def _renamed(function: ca.Function, name: str) -> ca.Function:
-    """The same function under a name of C."""
-    inputs = function.sx_in()
-    return ca.Function(name, inputs, function.call(inputs), {"cse": False})

@@ -1,47 +1,45 @@
 """What a rollout runs, from the arguments that it was given."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from threading import Lock
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers
+from drake_dae.compiler.compile import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.functions import LoopFunctions
+from drake_dae.running.rollout.events import events_of, noise_of
+from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Problem
-from drake_dae.running.rollout.samples import Samples
-from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.systems.blocks.traced import Block
 
 
 @checked(ModelError)
-def start_values(loop: ClosedLoop, context: Context) -> tuple[FloatArray, FloatArray]:
-    """Start and parameters of a closed loop as `rollout` takes them.
+def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArray, FloatArray]:
+    """Start and parameters of a closed loop, or of any diagram, as `rollout` takes them.
 
     Args:
-        loop: The closed loop.
+        loop: The closed loop or the diagram.
         context: Its context.
 
     Returns:
-        The state x, then of a force sensor its state, if it has a lag, the integrals of the law,
-        and what the sensor holds, if it samples, shape (n,); and the parameters of the plant, then
-        the model's of the law and its gains, shape (m,).
+        The continuous states of all blocks in the order of Drake's, and then what blocks hold, such
+        as a sensor that samples, shape (n,); and their numeric parameters, of a closed loop those
+        of the plant, then the model's of the law and its gains, shape (m,).
+
+    Raises:
+        ModelError: Something in it cannot be traced; its name and why.
     """
-    plant, sensor = loop.plant, loop.sensor
-    own, law = (block.GetMyContextFromRoot(context) for block in (plant, loop.controller))
-    felt = sensor.GetMyContextFromRoot(context) if sensor is not None else None
-    parts = [plant.state(own)]
-    for each in (felt, law):
-        if each is not None:
-            parts.append(each.get_continuous_state_vector().CopyToVector())
-    if felt is not None and felt.num_discrete_state_groups():
-        parts.append(felt.get_discrete_state(0).value())
-    values = [block.get_numeric_parameter(0).value() for block in (own, law)]
-    return np.concatenate(parts), np.concatenate(values)
+    program = program_of(loop)
+    state, held = program.compiled.start(context)
+    values = program.compiled.values(context)
+    held = program.compiled.begun(context.get_time(), state, held, values)
+    return np.concatenate([state, held[program.kept_places]]), values
 
 
 def checked_times(times: ArrayLike) -> FloatArray:
@@ -71,7 +69,7 @@ def _table(what: str, given: ArrayLike, size: int, hint: str) -> FloatArray:
 
 
 def problems_of(
-    functions: LoopFunctions,
+    program: Program,
     starts: ArrayLike,
     parameters: ArrayLike | None,
     times: FloatArray,
@@ -83,14 +81,13 @@ def problems_of(
         ModelError: They have wrong shapes.
         InconsistentStateError: A start is not on N*.
     """
-    loop = functions.loop
-    samples = Samples.of(loop, times)
-    size, split = functions.size, functions.plant.sizes[-1]
+    compiled, size = program.compiled, program.size
+    events = events_of(compiled, times)
     if parameters is None:
-        parameters = start_values(loop, loop.diagram.CreateDefaultContext())[1]
+        parameters = compiled.values(compiled.context)
     hint = "see start_values"
-    states = _table("starts", starts, size + samples.holds * samples.size, hint)
-    given = _table("parameters", parameters, split + functions.law.sizes[-1], hint)
+    states = _table("starts", starts, size + program.kept_places.size, hint)
+    given = _table("parameters", parameters, compiled.sizes["parameters"], hint)
     count = len(states)
     if len(given) not in (1, count):
         raise ModelError(f"{len(given)} rows of parameters for {count} starts")
@@ -101,26 +98,45 @@ def problems_of(
         raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
     problems, lock = [], Lock()
     for index, start in enumerate(states):
-        row = given[min(index, len(given) - 1)]
-        plant, law = row[:split].copy(), row[split:].copy()
-        current = functions.plant_parameters(plant)
-        loop.plant.check_start(start[: loop.plant.dae.num_states], current(times[0]))
-        noise = samples.noise(None if seeds is None else seeds[index])
-        hold = start[size:].copy() if samples.holds else noise[0].copy()
-        project = partial(_project, loop.plant, current, lock)
-        problems.append(
-            Problem(times, start[:size], hold, plant, law, samples.events, noise[1:], project)
-        )
+        row = given[min(index, len(given) - 1)].copy()
+        noise = noise_of(compiled, events, times[0], None if seeds is None else seeds[index])
+        held = np.zeros(compiled.sizes["held"])
+        held[program.kept_places] = start[size:]
+        drawn = dict(compiled.noise)
+        for system, part in compiled.held:
+            if system in drawn:
+                held[part] = noise[0, drawn[system]]
+        for part, now, block in _plants(compiled, times[0], start[:size], held, row):
+            if block.check_start is not None:
+                block.check_start(start[part], now)
+        project = partial(_project, compiled, lock, held, row)
+        problems.append(Problem(times, start[:size], held, row, *events, noise[1:], project))
     return problems
 
 
+def _plants(
+    compiled: CompiledDiagram, time: float, state: FloatArray, held: FloatArray, row: FloatArray
+) -> list[tuple[slice, FloatArray, Block]]:
+    """The blocks with a manifold: where the state of each stands, and its parameters now."""
+    places = dict(compiled.states)
+    return [
+        (places[system], function(time, state, held, row).full()[:, 0], compiled.blocks[system])
+        for system, function in compiled.own_parameters.items()
+    ]
+
+
 def _project(
-    plant: DaePlant,
-    parameters: Callable[[float], FloatArray],
+    compiled: CompiledDiagram,
     lock: Lock,
+    held: FloatArray,
+    row: FloatArray,
     time: float,
     state: FloatArray,
 ) -> FloatArray:
-    """The state on N* next to one, that of a sensor left out; by one thread at a time."""
+    """The state on N* next to one; by one thread at a time."""
+    found = state.copy()
     with lock:
-        return plant.structure.manifold.project(state[: plant.dae.num_states], parameters(time))
+        for part, now, block in _plants(compiled, time, state, held, row):
+            if block.projection is not None:
+                found[part] = block.projection.project(state[part], now)
+    return found

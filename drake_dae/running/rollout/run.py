@@ -111,20 +111,21 @@ class Problem:
 
     Attributes:
         times: When rows of the record are written, in s, from the start to the end, shape (k,).
-        state: x, then the state of the sensor if it has a lag, and the integrals of the law.
-        hold: What the sensor holds, or its noise, shape (m,).
-        plant, law: What their functions take as parameters.
-        events: When the sensor samples, or its noise changes, in s.
-        noise: The noise of each of these, shape (len(events), m).
-        project: (time, x) -> the state on N*; raises InconsistentStateError.
+        state: The continuous state at the start.
+        held: What blocks hold at the start, random numbers included.
+        parameters: All parameters.
+        events: When there are updates, in s.
+        due: Which rates are due at each of these, as bits.
+        noise: The random numbers of each of these, shape (len(events), number of entries).
+        project: (time, state) -> the state on N*; raises InconsistentStateError.
     """
 
     times: FloatArray
     state: FloatArray
-    hold: FloatArray
-    plant: FloatArray
-    law: FloatArray
+    held: FloatArray
+    parameters: FloatArray
     events: FloatArray
+    due: np.ndarray
     noise: FloatArray
     project: Callable[[float, FloatArray], FloatArray]
 

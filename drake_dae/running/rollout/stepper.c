@@ -1,4 +1,4 @@
-/* The closed loop over time: what CasADi generated comes first, then the constants of this loop. */
+/* A diagram over time: what CasADi generated comes first, then the constants of this diagram. */
 
 #ifdef __FAST_MATH__
 #error "not with -ffast-math: nan would pass for a number"
@@ -29,17 +29,16 @@ typedef struct {
   long long steps;         /* that were accepted */
   long long number, index; /* of fixed steps in this row, and which comes next */
   long long failures;      /* of trials since the accepted state */
-  long long pending;       /* 1 where projection and samples are to come, 2 where samples are */
+  long long pending;       /* what is to come before the next step, as below */
 } Run;
 
-/* What is computed at a moment; parameters that move are written over. */
+/* Unrestricted updates, the projection, discrete updates: in this order. */
+enum { UNRESTRICTED = 1, PROJECTION = 2, DISCRETE = 4, ALL = 7 };
+
+/* What does not change within a step. */
 typedef struct {
-  double plant[NUM_PLANT + 1], law[NUM_LAW + 1];
-  double reference[NUM_REFERENCES + 1], moving[NUM_PLANT_MOVING + 1];
-  double force[NUM_FORCES + 1];
-  const double *hold;
-  double time; /* at which references and what moves are; not a number before the first */
-} Moment;
+  const double *held, *parameters;
+} Given;
 
 static int is_finite(const double *vector, int size) {
   int i;
@@ -49,81 +48,77 @@ static int is_finite(const double *vector, int size) {
   return 1;
 }
 
-/* References, and the parameters that move. */
-static int set_time(double time, Moment *m) {
-  double moving[NUM_LAW_MOVING + 1], checks[3];
-  const double *arg[SIGNALS_ARG] = {&time};
-  double *res[SIGNALS_RES] = {m->reference, m->moving, moving, checks, checks + 1};
-  int i;
-  if (time == m->time) return 1;
-  dae_signals(arg, res, 0, 0, 0);
-  for (i = 0; i < NUM_PLANT_MOVING; i++) m->plant[plant_places[i]] = m->moving[i];
-  for (i = 0; i < NUM_LAW_MOVING; i++) m->law[law_places[i]] = moving[i];
-  m->time = isfinite(checks[1]) ? time : NAN;
-  return isfinite(checks[1]) != 0;
-}
-
 /* The derivative of the state; where it has no value all of it is nan. */
-static int rates(double time, const double *x, Moment *m, double *rate) {
+static int rates(double time, const double *x, const Given *g, double *rate) {
   double valid;
-  const double *arg[RATE_ARG] = {x, m->reference, m->hold, m->plant, m->law};
-  double *res[RATE_RES] = {rate, m->force, &valid};
-  int i, good = set_time(time, m);
+  const double *arg[RATE_ARG] = {&time, x, g->held, g->parameters};
+  double *res[RATE_RES] = {rate, &valid};
+  int i, good;
   dae_rate(arg, res, 0, 0, 0);
-  good &= isfinite(valid) != 0;
+  good = isfinite(valid) != 0;
   for (i = 0; !good && i < SIZE; i++) rate[i] = NAN;
   return good;
 }
 
 /* One row of the record. */
-static int write(double time, const double *x, Moment *m, double *row) {
+static int write(double time, const double *x, const Given *g, double *row) {
   double valid;
-  int good = set_time(time, m);
-  const double *arg[ROW_ARG] = {x, m->reference, m->hold, m->plant, m->law, m->moving};
+  const double *arg[ROW_ARG] = {&time, x, g->held, g->parameters};
   double *res[ROW_RES] = {row, &valid};
   dae_row(arg, res, 0, 0, 0);
-  return good & (isfinite(valid) != 0);
+  return isfinite(valid) != 0;
 }
 
 /* The state on N*, by Newton steps; 0 where Python has to decide. */
-static int project(double time, double *x, Moment *m) {
-  double at[NUM_STATES], found[NUM_STATES], left;
-  const double *arg[NEWTON_ARG] = {at, m->plant};
+static int project(double time, double *x, const Given *g) {
+  double at[SIZE + 1], found[SIZE + 1], left;
+  const double *arg[NEWTON_ARG] = {&time, at, g->held, g->parameters};
   double *res[NEWTON_RES] = {found, &left};
   int attempt;
   if (!PROJECTS) return 1;
-  if (NUM_PLANT_MOVING) set_time(time, m);
-  memcpy(at, x, sizeof(at));
+  memcpy(at, x, SIZE * sizeof(double));
   for (attempt = 0; attempt < 8; attempt++) {
     dae_newton(arg, res, 0, 0, 0);
     if (left <= REACHED) {
-      memcpy(x, found, sizeof(found));
+      memcpy(x, found, SIZE * sizeof(double));
       return 1;
     }
     if (attempt && !(left <= NEAR)) return 0;
-    memcpy(at, found, sizeof(at));
+    memcpy(at, found, SIZE * sizeof(double));
   }
   return 0;
 }
 
-/* What happens at the start of a step: the projection, then a sample. */
-static int update(Run *run, double *x, double *hold, Moment *m, const double *events,
-                  long long num_events, const double *noise) {
-  if (!run->pending) return DONE;
-  if (run->pending == 1 && !project(run->time, x, m)) return OFF_MANIFOLD;
-  while (run->event < num_events && events[run->event] <= run->time) {
-    double rate[SIZE + 1], held[NUM_FORCES + 1];
-    int i;
-    if (SAMPLES && !rates(run->time, x, m, rate)) return INVALID;
-    for (i = 0; i < NUM_FORCES; i++) {
-      double now = noise[run->event * NUM_FORCES + i];
-      held[i] = (NUM_LAGS ? x[NUM_STATES + i] : m->force[i]) + bias[i] + deviation[i] * now;
-      if (!SAMPLES) held[i] = now;
+/* The updates of one kind that are due, all at once. */
+static int apply(double time, const double *x, double *held, const Given *g, const double *noise,
+                 long long due, int unrestricted) {
+  double fresh[HELD + 1];
+  int good = 1;
+  (void)time, (void)x, (void)g, (void)noise, (void)due, (void)unrestricted;
+  memcpy(fresh, held, HELD * sizeof(double));
+$updates
+  memcpy(held, fresh, HELD * sizeof(double));
+  return good;
+}
+
+/* What happens at the start of a step: the projection, and the updates that are due. */
+static int update(Run *run, double *x, double *held, const Given *g, long long num_events,
+                  const double *events, const long long *due, const double *noise) {
+  while (run->pending) {
+    int now = run->event < num_events && events[run->event] <= run->time;
+    const double *drawn = noise + run->event * NOISE;
+    if (run->pending & UNRESTRICTED) {
+      if (now && !apply(run->time, x, held, g, drawn, due[run->event], 1)) return INVALID;
+      run->pending &= ~UNRESTRICTED;
     }
-    memcpy(hold, held, NUM_FORCES * sizeof(double));
-    run->event++;
+    if (run->pending & PROJECTION) {
+      if (!project(run->time, x, g)) return OFF_MANIFOLD;
+      run->pending &= ~PROJECTION;
+    }
+    if (now && !apply(run->time, x, held, g, drawn, due[run->event], 0)) return INVALID;
+    run->pending = now ? UNRESTRICTED | DISCRETE : 0;
+    run->event += now;
   }
-  run->pending = 0;
   return DONE;
 }
 
@@ -132,7 +127,7 @@ static int accept(Run *run, double time, double *x, const double *reached) {
   memcpy(x, reached, SIZE * sizeof(double));
   run->time = time;
   run->failures = 0;
-  run->pending = 1;
+  run->pending = ALL;
   if (++run->steps % 1000 == 0) {
     run->before = run->mark;
     run->mark = time;
@@ -162,38 +157,36 @@ static void weigh(double step, int count, const double *b, const double *x, doub
 
 /* The state and the rate at a stage of an explicit Runge-Kutta method. */
 static void stage(Run *run, double time, double step, int count, const double *a, double c,
-                  const double *x, Moment *m, double (*k)[SIZE], double *trial) {
+                  const double *x, const Given *g, double (*k)[SIZE], double *trial) {
   double at[SIZE];
   weigh(step, count, a, x, k, at);
-  if (!rates(time + c * step, at, m, k[count])) note(run, time + c * step, at, trial);
+  if (!rates(time + c * step, at, g, k[count])) note(run, time + c * step, at, trial);
 }
 
 /* Fixed steps, whose number divides what lies between two times of the record or of a sample. */
 __attribute__((visibility("default"))) int run_fixed(
-    Run *run, double *x, double *hold, const double *plant_parameters, const double *law_parameters,
-    double *trial, long long num_rows, const double *times, double *rows, long long num_events,
-    const double *events, const double *noise, double longest, int stages, const double *a,
+    Run *run, double *x, double *held, const double *parameters, double *trial, long long num_rows,
+    const double *times, double *rows, long long num_events, const double *events,
+    const long long *due, const double *noise, double longest, int stages, const double *a,
     const double *b, const double *c, long long budget) {
-  Moment m;
+  Given g;
   double k[16][SIZE], reached[SIZE];
   int s, status;
-  memcpy(m.plant, plant_parameters, NUM_PLANT * sizeof(double));
-  memcpy(m.law, law_parameters, NUM_LAW * sizeof(double));
-  m.hold = hold;
-  m.time = NAN;
+  g.held = held;
+  g.parameters = parameters;
   for (;;) {
     double end, step;
     if (run->row < num_rows && run->time >= times[run->row]) {
       if (run->row == num_rows - 1) {
-        status = update(run, x, hold, &m, events, num_events, noise);
+        status = update(run, x, held, &g, num_events, events, due, noise);
         if (status != DONE) return status;
       }
-      if (!write(run->time, x, &m, rows + run->row * WIDTH)) return INVALID;
+      if (!write(run->time, x, &g, rows + run->row * WIDTH)) return INVALID;
       run->row++;
     }
     if (run->row == num_rows) return DONE;
     if (budget-- == 0) return PAUSED;
-    status = update(run, x, hold, &m, events, num_events, noise);
+    status = update(run, x, held, &g, num_events, events, due, noise);
     if (status != DONE) return status;
     end = times[run->row];
     if (run->event < num_events && events[run->event] < end) end = events[run->event];
@@ -207,8 +200,8 @@ __attribute__((visibility("default"))) int run_fixed(
       end = run->from + (end - run->from) * ((double)run->index / (double)run->number);
     }
     step = end - run->time;
-    if (!rates(run->time, x, &m, k[0])) return INVALID;
-    for (s = 1; s < stages; s++) stage(run, run->time, step, s, a + s * stages, c[s], x, &m, k, trial);
+    if (!rates(run->time, x, &g, k[0])) return INVALID;
+    for (s = 1; s < stages; s++) stage(run, run->time, step, s, a + s * stages, c[s], x, &g, k, trial);
     weigh(step, stages, b, x, k, reached);
     run->next = end;
     if (!is_finite(reached, SIZE)) return SPOILT;
@@ -226,14 +219,14 @@ static double weighted(const double *vector, const double *unit) {
 
 /* A first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4). */
 static double first_step(Run *run, const double *x, const double *rate, const double *absolute,
-                         double relative, double longest, Moment *m) {
+                         double relative, double longest, const Given *g) {
   double unit[SIZE], other[SIZE], change[SIZE], d0, d1, d2, h0, h1;
   int i;
   for (i = 0; i < SIZE; i++) unit[i] = absolute[i] + fabs(x[i]) * relative;
   d0 = weighted(x, unit), d1 = weighted(rate, unit);
   h0 = fmin(d0 < 1e-5 || d1 < 1e-5 ? 1e-6 : 0.01 * d0 / d1, longest);
   for (i = 0; i < SIZE; i++) other[i] = x[i] + h0 * rate[i];
-  if (!rates(run->time + h0, other, m, change)) return fmin(h0, longest);
+  if (!rates(run->time + h0, other, g, change)) return fmin(h0, longest);
   for (i = 0; i < SIZE; i++) change[i] -= rate[i];
   d2 = weighted(change, unit) / h0;
   h1 = d1 <= 1e-15 && d2 <= 1e-15 ? fmax(1e-6, h0 * 1e-3) : pow(0.01 / fmax(d1, d2), 1.0 / 8.0);
@@ -261,23 +254,21 @@ static double error_of(double step, const double *x, const double *reached, doub
 
 /* Error control by DOP853 as SciPy has it; rows between steps from its interpolant, on N*. */
 __attribute__((visibility("default"))) int run_controlled(
-    Run *run, double *x, double *hold, const double *plant_parameters, const double *law_parameters,
-    double *trial, long long num_rows, const double *times, double *rows, long long num_events,
-    const double *events, const double *noise, double longest, const double *absolute,
+    Run *run, double *x, double *held, const double *parameters, double *trial, long long num_rows,
+    const double *times, double *rows, long long num_events, const double *events,
+    const long long *due, const double *noise, double longest, const double *absolute,
     double relative, long long budget) {
-  Moment m;
+  Given g;
   double k[16][SIZE], reached[SIZE], f[7][SIZE], between[SIZE];
   int i, j, s, status, valid, known = 0, is_on = 0;
-  memcpy(m.plant, plant_parameters, NUM_PLANT * sizeof(double));
-  memcpy(m.law, law_parameters, NUM_LAW * sizeof(double));
-  m.hold = hold;
-  m.time = NAN;
+  g.held = held;
+  g.parameters = parameters;
   while (run->row < num_rows && run->time >= times[run->row]) {
     if (run->row == num_rows - 1) {
-      status = update(run, x, hold, &m, events, num_events, noise);
+      status = update(run, x, held, &g, num_events, events, due, noise);
       if (status != DONE) return status;
     }
-    if (!write(run->time, x, &m, rows + run->row * WIDTH)) return INVALID;
+    if (!write(run->time, x, &g, rows + run->row * WIDTH)) return INVALID;
     run->row++;
   }
   for (;;) {
@@ -286,17 +277,17 @@ __attribute__((visibility("default"))) int run_controlled(
     int rejected = 0;
     if (run->row == num_rows) return DONE;
     if (budget-- == 0) return PAUSED;
-    status = update(run, x, hold, &m, events, num_events, noise);
+    status = update(run, x, held, &g, num_events, events, due, noise);
     if (status != DONE) return status;
     if (known && event == run->event) {
       memcpy(k[0], k[12], sizeof(k[0])); /* The rate where the last step ended. */
-    } else if (!rates(run->time, x, &m, k[0])) {
+    } else if (!rates(run->time, x, &g, k[0])) {
       return INVALID;
     }
     limit = times[num_rows - 1];
     if (run->event < num_events && events[run->event] < limit) limit = events[run->event];
     if (run->step == 0.0) {
-      run->step = first_step(run, x, k[0], absolute, relative, longest, &m);
+      run->step = first_step(run, x, k[0], absolute, relative, longest, &g);
     }
     size = fmin(run->step, longest);
     for (;;) {
@@ -304,14 +295,14 @@ __attribute__((visibility("default"))) int run_controlled(
       if (end >= limit - 1e-12 * fabs(limit)) end = limit;
       size = end - run->time;
       if (!(size > 1e-12 * fabs(run->time)) || run->failures >= 1000) return STUCK;
-      for (s = 1; s < 12; s++) stage(run, run->time, size, s, dop_a[s], dop_c[s], x, &m, k, trial);
+      for (s = 1; s < 12; s++) stage(run, run->time, size, s, dop_a[s], dop_c[s], x, &g, k, trial);
       weigh(size, 12, dop_b, x, k, reached);
       error = error_of(size, x, reached, k, absolute, relative);
       valid = isfinite(error) != 0;
       factor = error == 0.0 ? 10.0 : fmin(10.0, fmax(0.2, 0.9 * pow(error, -1.0 / 8.0)));
       if (valid && error < 1.0) {
-        is_on = project(end, reached, &m);
-        valid = rates(end, reached, &m, k[12]);
+        is_on = project(end, reached, &g);
+        valid = rates(end, reached, &g, k[12]);
         if (!valid) note(run, end, reached, trial);
       }
       if (valid && error < 1.0) {
@@ -325,7 +316,7 @@ __attribute__((visibility("default"))) int run_controlled(
     }
     if (times[run->row] <= limit) {
       for (s = 13; s < 16; s++) {
-        stage(run, run->time, size, s, dop_a_more[s - 13], dop_c_more[s - 13], x, &m, k, trial);
+        stage(run, run->time, size, s, dop_a_more[s - 13], dop_c_more[s - 13], x, &g, k, trial);
       }
       for (i = 0; i < SIZE; i++) {
         f[0][i] = reached[i] - x[i];
@@ -346,8 +337,8 @@ __attribute__((visibility("default"))) int run_controlled(
         for (j = 6; j >= 0; j--) between[i] = (between[i] + f[j][i]) * (j % 2 ? 1.0 - part : part);
         between[i] += x[i];
       }
-      project(time, between, &m);
-      if (!write(time, between, &m, rows + run->row * WIDTH)) {
+      project(time, between, &g);
+      if (!write(time, between, &g, rows + run->row * WIDTH)) {
         run->failures = 0;
         note(run, time, between, trial);
         return INVALID;
@@ -356,16 +347,16 @@ __attribute__((visibility("default"))) int run_controlled(
     }
     status = accept(run, limit, x, reached);
     if (status != DONE) return status;
-    if (is_on) run->pending = 2; /* It is on N* already. */
+    if (is_on) run->pending &= ~PROJECTION; /* It is on N* already. */
     known = is_on;
     if (run->row < num_rows && times[run->row] == limit) {
       if (run->row == num_rows - 1) {
-        status = update(run, x, hold, &m, events, num_events, noise);
+        status = update(run, x, held, &g, num_events, events, due, noise);
         if (status != DONE) return status;
       } else if (!is_on) {
         return OFF_MANIFOLD;
       }
-      if (!write(limit, x, &m, rows + run->row * WIDTH)) return INVALID;
+      if (!write(limit, x, &g, rows + run->row * WIDTH)) return INVALID;
       run->row++;
     }
   }

@@ -2,8 +2,9 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
@@ -28,6 +29,15 @@ from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.feedback import Feedback, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    HELD,
+    PARAMETERS,
+    STATE,
+    Block,
+    Computation,
+    Update,
+)
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -297,6 +307,84 @@ class TrackingController(ParameterizedSystem, Controller):
         if self.sample_period:
             return context.get_discrete_state(0).CopyToVector()
         return context.get_continuous_state_vector().CopyToVector()
+
+    def traced(self) -> Block:
+        law = self.law
+        memory = HELD if law.integral.outputs and self.sample_period else STATE
+        named = {"state": "estimated_state", "integral": memory, "parameters": PARAMETERS}
+        sources = tuple(named.get(name, name) for name in law.function.input_names)
+        shown = ("control", "tracking_error")
+        computations: tuple[Computation, ...]
+        updates: tuple[Update, ...] = ()
+        unwired = {}
+        if self._references is not None:
+            (unwired["reference"],) = self._references.traced().computations
+        if not law.integral.outputs:
+            computations = (Computation.of(law.function, sources, shown),)
+        else:
+            computations, updates = self._traced_integrals(sources, shown, memory)
+            none = ca.Function("none", [], [ca.SX.zeros(self._hold.size())])
+            unwired["hold"] = Computation(none, (), ("hold",))
+        return Block(
+            self,
+            computations,
+            updates,
+            unwired=unwired,
+            moving=tuple(self.exogenous_places),
+            model=self.dae,
+            under=partial(self._motion_under, sources),
+            signals=self._signals,
+            ports={
+                "control": tuple(self.dae.control_signals),
+                "tracking_error": tuple(self.dae.output_signals),
+                "integral": tuple(law.integral.signals),
+            },
+        )
+
+    def _traced_integrals(
+        self, sources: tuple[str, ...], shown: tuple[str, ...], memory: str
+    ) -> tuple[tuple[Computation, ...], tuple[Update, ...]]:
+        """What a law with integrals computes, and what it does with those at samples."""
+        law, function = self.law, self.law.function
+        acts = Computation.of(function, sources, shown)
+        if law.measured_force and not law.control_takes_force:
+            # Whatever the force is: so nothing depends on it in the same instant.
+            place = sources.index("measured_force")
+            inputs = [
+                ca.SX.sym(name, size)
+                for name, size in zip(function.input_names, function.sizes, strict=True)
+            ]
+            given = [*inputs]
+            given[place] = ca.SX.zeros(function.sizes[place])
+            without = ca.Function(
+                "control", [*inputs[:place], *inputs[place + 1 :]], function.function.call(given)
+            )
+            acts = Computation(without, (*sources[:place], *sources[place + 1 :]), shown, function)
+        rates = Computation.of(function, sources, ("", "", "integral_rate"))
+        count = self._hold.size()
+        rate, sigma, hold = (ca.SX.sym(name, count) for name in ("rate", "integral", "hold"))
+        moves = rate
+        limited = np.flatnonzero(np.isfinite(self._limits)).tolist()
+        if limited:
+            leaves = (ca.fabs(sigma) >= self._limits) * (rate * sigma > 0)
+            moves = ca.SX(moves)
+            moves[limited] = ca.if_else(leaves, 0, rate)[limited]
+        moves = ca.if_else(hold != 0, 0, moves)
+        after = sigma + self.sample_period * moves if self.sample_period else moves
+        inputs, of = [rate, sigma, hold], ("integral_rate", memory, "hold")
+        output = HELD if self.sample_period else DERIVATIVE
+        summed = Computation(ca.Function("integral", inputs, [after]), of, (output,))
+        told = Computation(ca.Function("integral", [sigma], [sigma]), (memory,), ("integral",))
+        if self.sample_period:
+            return (acts, rates, told), (Update(summed, self.sample_period, 0.0, True),)
+        return (acts, rates, told, summed), ()
+
+    def _motion_under(self, sources: tuple[str, ...]) -> Computation | None:
+        """x' and v of a plant that is the law's own model, from what the law wants."""
+        motion = self.law.trace_motion()
+        if motion is None:
+            return None
+        return Computation.of(motion, sources, (DERIVATIVE, "constraint_input"))
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function

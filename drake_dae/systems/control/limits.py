@@ -1,5 +1,6 @@
 """Drives that give no more than their limits."""
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -7,6 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import Block, Computation
 
 
 @checked(ModelError)
@@ -54,3 +56,12 @@ class ControlLimits(LeafSystem):
 
     def _calc_is_limited(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector([float(np.any(np.abs(self._port.Eval(context)) > self.limits))])
+
+    def traced(self) -> Block:
+        wanted = ca.SX.sym("wanted", self.limits.size)
+        given = ca.fmax(-self.limits, ca.fmin(self.limits, wanted))
+        is_limited = ca.mmax(ca.fabs(wanted) - self.limits) > 0
+        function = ca.Function("limits", [wanted], [given, wanted - given, is_limited])
+        return Block(
+            self, (Computation(function, ("control",), ("control", "excess", "is_limited")),)
+        )

@@ -17,6 +17,7 @@ from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.systems.control.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 
@@ -338,3 +339,6 @@ class DisturbanceObserver(ParameterizedSystem):
             f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has no "
             "derivative by the time"
         )
+
+    def traced(self) -> Block:
+        raise not_traced("an observer of disturbances")

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, System
@@ -13,11 +14,13 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.references import Reference, stack_references
 from drake_dae.dae.system.layout import Layout
-from drake_dae.errors import ReferenceSignalError
+from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.blocks.along import signal_along
 from drake_dae.systems.blocks.block import DifferentiableSystem
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import TIME, Block, Computation
+from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ReferenceSignalError)
@@ -222,6 +225,22 @@ class ReferenceGenerator(DifferentiableSystem):
 
     def _calc_reference(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self.function(context.get_time()))
+
+    def traced(self) -> Block:
+        time = ca.SX.sym("t")
+        rows, left = [ca.SX(0, 1)], list(self.degrees)
+        for reference in self.references:
+            own, left = left[: reference.size], left[reference.size :]
+            row = reference.expression(own, time)
+            if row is None:
+                raise ModelError(
+                    f"a {type(reference).__name__} is no expression of time, and a rollout needs "
+                    "one: take an ExpressionReference, PointToPointReference or "
+                    "SinusoidReference, or run the loop by simulate"
+                )
+            rows.append(row)
+        function = TracedFunction("reference", {"time": time}, {"R": ca.vertcat(*rows)})
+        return Block(self, (Computation.of(function, (TIME,), ("reference",)),))
 
     def _formulas(self) -> dict[str, Formula]:
         return {"reference": _ReferenceFormula(self.references, self.degrees)}

@@ -3,12 +3,14 @@
 from dataclasses import dataclass
 from math import ceil, floor, isfinite
 
+import casadi as ca
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
@@ -138,3 +140,28 @@ class ControlHold(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._rows(context)[0])
+
+    def traced(self) -> Block:
+        size = self._port.size()
+        waiting = self.sampling.whole_periods + (self.sampling.rest > 0.0)
+        rows, control = ca.SX.sym("held", (1 + waiting) * size), ca.SX.sym("control", size)
+
+        def computation(*parts: ca.SX) -> Computation:
+            function = ca.Function("held", [rows, control], [ca.vertcat(*parts)])
+            return Computation(function, (HELD, "control"), (HELD,))
+
+        now, later = rows[:size], rows[size:]
+        period, rest = self.sampling.period, self.sampling.rest
+        updates = [Update(computation(later, control), period, 0.0, True)]
+        if rest:
+            read = computation(now, later[size:], control)
+            act = ca.Function("act", [rows], [ca.vertcat(later[:size], later)])
+            updates = [
+                Update(read, period, 0.0, True),
+                Update(Computation(act, (HELD,), (HELD,)), period, rest, True),
+            ]
+        shown = Computation(ca.Function("shown", [rows], [now]), (HELD,), ("control",))
+        first = ca.Function("first", [control], [ca.repmat(control, 1 + waiting, 1)])
+        return Block(
+            self, (shown,), tuple(updates), initial=Computation(first, ("control",), (HELD,))
+        )

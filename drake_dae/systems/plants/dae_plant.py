@@ -41,8 +41,10 @@ from drake_dae.systems.blocks.failures import (
 from drake_dae.systems.blocks.feedback import Feedback, motion_under, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.traced_plant import traced_plant
 from drake_dae.trace.functions import TracedFunction
 
 _CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
@@ -419,6 +421,16 @@ class DaePlant(ParameterizedSystem, Plant):
             name: TracedFormula(function, signals=self._signals)
             for name, function in functions.items()
         }
+
+    def traced(self) -> Block:
+        return traced_plant(
+            self,
+            self.structure,
+            self.projects,
+            self.check_start,
+            self.exogenous_places,
+            self._signals,
+        )
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:
         output.SetFrom(context.get_continuous_state_vector())

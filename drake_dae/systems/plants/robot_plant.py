@@ -1,6 +1,7 @@
 """A RobotModel as a LeafSystem."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import casadi as ca
 from pydrake.systems.framework import Context
@@ -13,6 +14,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import PARAMETERS, STATE, Block, Computation
 from drake_dae.systems.plants.dae_plant import DaePlant
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.trace.functions import TracedFunction
@@ -95,3 +97,16 @@ class RobotPlant(DaePlant):
             if known is not None:
                 formulas[name] = TracedFormula(known)
         return formulas
+
+    def traced(self) -> Block:
+        block, ports, state = super().traced(), self._ports, self.dae.state
+        found = [
+            Computation(ca.Function("part", [state], [state[part]]), (STATE,), (name,))
+            for name, part in ports.parts.items()
+        ]
+        sources = (STATE, "constraint_force", PARAMETERS)
+        found.append(Computation.of(ports.wrench_function, sources, ("constraint_wrenches",)))
+        for name, known in (("loop_state", ports.loops), ("joint_torque", ports.joint_force)):
+            if known is not None:
+                found.append(Computation.of(known, (STATE, PARAMETERS), (name,)))
+        return replace(block, computations=(*block.computations, *found))

@@ -34,6 +34,7 @@ class RobotPorts:
         wrench_signals: Names and units of `constraint_wrenches`.
         wrenches, force: That port as expressions, and the symbols of lambda in it.
         loop_signals: Names and units of `loop_state` under that name; empty without it.
+        wrench_function: The same as a function of state, lambda and parameters.
         loops, joint_force: What the ports `loop_state` and `joint_torque` compute; None without.
     """
 
@@ -62,7 +63,9 @@ class RobotPorts:
         self.force = ca.SX.sym("force", bound.size)
         self.wrenches, self.wrench_signals = bound.wrenches(model.links.kinematics(), self.force)
         inputs = {"state": dae.state, "force": self.force, "parameters": dae.parameter_symbol}
-        self._wrenches = TracedFunction("constraint wrenches", inputs, {"value": self.wrenches})
+        self.wrench_function = TracedFunction(
+            "constraint wrenches", inputs, {"value": self.wrenches}
+        )
         size, calc = len(self.wrench_signals), weakly(self._calc_wrenches)
         plant.DeclareVectorOutputPort("constraint_wrenches", size, calc, by_force)
 
@@ -80,7 +83,7 @@ class RobotPorts:
 
     def _calc_wrenches(self, context: Context, output: BasicVector) -> None:
         force, state = self._force(context), _state(context)
-        output.SetFromVector(self._wrenches.evaluate(state, force, self._values(context))[0])
+        output.SetFromVector(self.wrench_function.evaluate(state, force, self._values(context))[0])
 
     def _calc_part(self, part: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(_state(context)[part])

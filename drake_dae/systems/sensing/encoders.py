@@ -10,6 +10,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import Block, not_traced
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
@@ -209,6 +210,9 @@ class StateSensor(LeafSystem):
             a = np.exp(-self.encoders.velocity_bandwidth * self.period)
             v = a * held[1 + count :] + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
         return np.concatenate([[sample], q, v])
+
+    def traced(self) -> Block:
+        raise not_traced("a state that encoders measure")
 
 
 def _each(name: str, given: ArrayLike, count: int) -> FloatArray:

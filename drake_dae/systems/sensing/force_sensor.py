@@ -11,6 +11,14 @@ from drake_dae.errors import ModelError, NonFiniteError
 from drake_dae.systems.blocks.block import DifferentiableSystem
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    HELD,
+    STATE,
+    Block,
+    Computation,
+    Update,
+)
 from drake_dae.systems.blocks.trials import StepWatch, state_tickets
 from drake_dae.trace.functions import TracedFunction
 
@@ -154,6 +162,28 @@ class ForceSensor(DifferentiableSystem):
             output.SetFromVector(context.get_discrete_state(self._held).value())
         else:
             output.SetFromVector(self._felt(context))
+
+    def traced(self) -> Block:
+        size = self._force_port.size()
+        force, felt, noise = (ca.SX.sym(name, size) for name in ("force", "felt", "noise"))
+        sources, inputs = [("force", STATE)[bool(self.time_constant)]], [force]
+        measured = force + self.bias
+        if self._noise_port is not None:
+            sources, inputs = [*sources, "noise"], [force, noise]
+            measured = measured + self.noise_deviation * noise
+        feel = ca.Function("measured_force", inputs, [measured])
+        computations, updates = [], []
+        if self.time_constant:
+            rate = ca.Function("rate", [force, felt], [(force - felt) / self.time_constant])
+            computations.append(Computation(rate, ("force", STATE), (DERIVATIVE,)))
+        if self.sample_period:
+            computations.append(
+                Computation(ca.Function("held", [felt], [felt]), (HELD,), ("measured_force",))
+            )
+            updates.append(Update(Computation(feel, tuple(sources), (HELD,)), self.sample_period))
+        else:
+            computations.append(Computation(feel, tuple(sources), ("measured_force",)))
+        return Block(self, tuple(computations), tuple(updates))
 
     def _formulas(self) -> dict[str, Formula]:
         if self.sample_period:

@@ -85,6 +85,8 @@ class ToleranceWatch(LeafSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    #: What a function of the time does not do: see `compile_diagram`.
+    ends_runs = "tolerances"
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.systems.control.contract import Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.plants.contract import Plant
@@ -315,6 +316,9 @@ class TaskController(Diagram, Controller):
         known = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
         at_supervisor = self.GetMutableSubsystemContext(self.supervisor, context)
         at_supervisor.get_mutable_numeric_parameter(0).SetFromVector(known)
+
+    def traced(self) -> Block:
+        raise not_traced("a task")
 
 
 def _check_laws(law: TrackingLaw, free_law: TrackingLaw) -> tuple[int, int]:

@@ -26,7 +26,14 @@ from problems.zero_systems import (
     zero_dynamics,
 )
 
-from drake_dae import ConstantReference, DaePlant, ExpressionReference, analyze, make_closed_loop
+from drake_dae import (
+    ConstantReference,
+    DaePlant,
+    ExpressionReference,
+    LoopSettings,
+    analyze,
+    make_closed_loop,
+)
 from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles

@@ -47,7 +47,7 @@ def test_recent_error_is_that_of_its_equation():
 
 def test_rollouts_refuse_to_watch():
     loop, context = build_scenario(scenario("two_link_wall", "tolerances={outputs: {tool.z: 1.0}}"))
-    with pytest.raises(ModelError, match="a rollout does not know tolerances"):
+    with pytest.raises(ModelError, match="tolerances cannot be traced: a rollout does not know it"):
         rollout(loop, *start_values(loop, context), [0.0, 0.1])
 
 

@@ -38,6 +38,9 @@ int ${prefix}_residual($residual);
    an integrator one or two. */
 int ${prefix}_project(double *state, const double *parameters);
 
+/* The loop as a whole, if all of its blocks could be traced: the derivative of its states, its
+   outputs, and what blocks hold from a sample on. */
+$whole
 #ifdef __cplusplus
 }
 #endif

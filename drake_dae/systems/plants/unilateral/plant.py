@@ -25,6 +25,7 @@ from drake_dae.errors import (
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.failures import off_manifold
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.systems.plants.unilateral.events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
 from drake_dae.systems.plants.unilateral.log import Log, clearance
@@ -264,6 +265,9 @@ class UnilateralRobotPlant(ModalPorts):
         state.get_mutable_discrete_state().set_value(numbers_of(after.closed))
         self._begin_step(context, after.state, values)
         return EventStatus.Succeeded()
+
+    def traced(self) -> Block:
+        raise not_traced("a plant whose contacts open and close")
 
 
 def _no_events() -> AbstractValue:

@@ -1,0 +1,183 @@
+"""Drake's own systems as traced blocks, by their conversion to symbolic expressions."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.symbolic import Expression, Variable
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, EventStatus, PortDataType, System
+from pydrake.systems.primitives import RandomSource
+
+from drake_dae.errors import ModelError
+from drake_dae.symbolic import to_casadi
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    HELD,
+    NOISE,
+    PARAMETERS,
+    STATE,
+    TIME,
+    Block,
+    Computation,
+    Update,
+    not_traced,
+)
+
+
+def primitive(system: System) -> Block:
+    """What a system of Drake's, or any that converts to symbolic expressions, computes.
+
+    Args:
+        system: A leaf system.
+
+    Raises:
+        ModelError: It does not convert, or has what no expression has.
+    """
+    if isinstance(system, RandomSource):
+        return _random_source(system)
+    if isinstance(system, MultibodyPlant):
+        raise not_traced("Drake's own MultibodyPlant, with its contact,")
+    name = f"'{system.get_name()}' ({type(system).__name__})"
+    try:
+        converted = system.ToSymbolic()
+    except RuntimeError:
+        raise ModelError(
+            f"{name} cannot be traced: it has no traced functions and does not convert to "
+            "symbolic expressions, so that it runs in Drake's Simulator alone"
+        ) from None
+    try:
+        return _Converted(system, converted, name).block()
+    except RuntimeError as error:  # What Drake cannot compute with expressions.
+        reason = str(error).splitlines()[0]
+        raise ModelError(
+            f"{name} cannot be traced, so that it runs in Drake's Simulator alone: {reason}"
+        ) from None
+
+
+def _random_source(source: RandomSource) -> Block:
+    """Random numbers that are held: new ones at each multiple of its period."""
+    size = source.get_output_port().size()
+    held, noise = ca.SX.sym("held", size), ca.SX.sym("noise", size)
+    shown = Computation(
+        ca.Function("shown", [held], [held]), (HELD,), (source.get_output_port().get_name(),)
+    )
+    draw = Computation(ca.Function("draw", [noise], [noise]), (NOISE,), (HELD,))
+    return Block(source, (shown,), (Update(draw, _period(source), 0.0, True),), draws=True)
+
+
+def _period(source: RandomSource) -> float:
+    """The time between two draws, in s: where a Simulator stops for the first one after t = 0."""
+    simulator, times = Simulator(source), list[float]()
+
+    def stop(context: Context) -> EventStatus:
+        times.append(context.get_time())
+        if len(times) < 3:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(source, "seen")
+
+    simulator.set_monitor(stop)
+    simulator.AdvanceTo(1e9)
+    return next(time for time in times if time > 0.0)
+
+
+class _Converted:
+    """A system on symbolic expressions, with variables for all that it reads.
+
+    Args:
+        system: The system.
+        converted: The same on Expressions.
+        name: What messages call it.
+    """
+
+    def __init__(self, system: System, converted: System, name: str) -> None:
+        self._system, self._converted, self._name = system, converted, name
+        self._context = context = converted.CreateDefaultContext()
+        own = system.CreateDefaultContext()
+        if own.num_abstract_states() or own.num_abstract_parameters():
+            raise ModelError(
+                f"{name} cannot be traced: it has an abstract state or parameter, so that it runs "
+                "in Drake's Simulator alone"
+            )
+        self._symbols: dict[int, ca.SX] = {}
+        self._columns: dict[str, ca.SX] = {}
+        time = self._variables(TIME, 1)
+        context.SetTime(time[0])
+        sizes = {
+            STATE: [own.num_continuous_states()],
+            HELD: [own.get_discrete_state(i).size() for i in range(_groups(own))],
+            PARAMETERS: [
+                own.get_numeric_parameter(i).size()
+                for i in range(own.num_numeric_parameter_groups())
+            ],
+        }
+        state, held, parameters = (
+            np.split(self._variables(source, sum(each)), np.cumsum(each)[:-1])
+            for source, each in sizes.items()
+        )
+        if sizes[STATE][0]:
+            context.SetContinuousState(state[0])
+        for index in range(len(sizes[HELD])):
+            context.SetDiscreteState(index, held[index])
+        for index in range(len(sizes[PARAMETERS])):
+            context.get_mutable_numeric_parameter(index).SetFromVector(parameters[index])
+        for index in range(system.num_input_ports()):
+            port = system.get_input_port(index)
+            if port.get_data_type() == PortDataType.kVectorValued:
+                given = self._variables(port.get_name(), port.size())
+                converted.get_input_port(index).FixValue(context, given)
+        self._has_state, self._has_held = bool(sizes[STATE][0]), bool(sum(sizes[HELD]))
+
+    def block(self) -> Block:
+        """What the system computes."""
+        system, converted, context = self._system, self._converted, self._context
+        computations = []
+        for index in range(system.num_output_ports()):
+            port = system.get_output_port(index)
+            if port.get_data_type() == PortDataType.kVectorValued:
+                values = np.atleast_1d(converted.get_output_port(index).Eval(context))
+                computations.append(self._computation(port.get_name(), values))
+        if self._has_state:
+            rates = converted.EvalTimeDerivatives(context).CopyToVector()
+            computations.append(self._computation(DERIVATIVE, rates))
+        updates = []
+        if self._has_held:
+            event = system.GetUniquePeriodicDiscreteUpdateAttribute()
+            if event is None:
+                raise ModelError(
+                    f"{self._name} cannot be traced: its discrete state has no update of one "
+                    "period, so that it runs in Drake's Simulator alone"
+                )
+            found = converted.EvalUniquePeriodicDiscreteUpdate(context)
+            following = np.concatenate(
+                [np.atleast_1d(found.value(i)) for i in range(found.num_groups())]
+            )
+            update = self._computation(HELD, following)
+            updates.append(Update(update, event.period_sec(), event.offset_sec()))
+        return Block(system, tuple(computations), tuple(updates))
+
+    def _variables(self, source: str, size: int) -> np.ndarray:
+        """Variables for a column, of which an expression of CasADi's has the same entries."""
+        column = ca.SX.sym(source.strip("$"), size)
+        variables = [Variable(f"{source}_{i}") for i in range(size)]
+        self._symbols |= {v.get_id(): column[i] for i, v in enumerate(variables)}
+        self._columns[source] = column
+        return np.array([Expression(variable) for variable in variables], dtype=object)
+
+    def _computation(self, output: str, values: Iterable[Any]) -> Computation:
+        try:
+            rows = [to_casadi(value, self._symbols, smooth=False) for value in values]
+        except ModelError as error:
+            raise ModelError(f"{self._name} cannot be traced: {error}") from None
+        value = ca.densify(ca.vertcat(ca.SX(0, 1), *rows))
+        # Of the columns those that it depends on: so no feedthrough is made up.
+        names = [n for n, column in self._columns.items() if ca.depends_on(value, column)]
+        function = ca.Function("computation", [self._columns[name] for name in names], [value])
+        return Computation(function, tuple(names), (output,))
+
+
+def _groups(context: Context) -> int:
+    found: int = context.num_discrete_state_groups()
+    return found

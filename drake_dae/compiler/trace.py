@@ -1,0 +1,296 @@
+"""The expressions of a diagram: each block's, with what its wires bring put in."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+from pydrake.systems.framework import Context, PortDataType, System
+
+from drake_dae.compiler.primitives import primitive
+from drake_dae.compiler.wires import Port, Wires
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    HELD,
+    NOISE,
+    PARAMETERS,
+    STATE,
+    TIME,
+    Block,
+    Computation,
+    Traced,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A computation with its arguments put in.
+
+    Attributes:
+        block: Whose it is.
+        computation: What is computed.
+        arguments: Its arguments as expressions.
+        results: Its results as expressions.
+        needed: The calls that the arguments need.
+    """
+
+    block: Block
+    computation: Computation
+    arguments: tuple[ca.SX, ...]
+    results: tuple[ca.SX, ...]
+    needed: tuple["Call", ...]
+
+    @property
+    def valid(self) -> ca.SX:
+        """What is finite if the results are of use."""
+        return self.results[-1] if self.computation.traced is not None else ca.SX(0)
+
+
+class Expressions:
+    """The expressions of a diagram, found as they are asked for.
+
+    A block that nothing asked for leads to is none of them, such as a logger.
+
+    Args:
+        wires: The wires.
+        context: A context of the diagram, which says where inputs without a wire have a value.
+        twins: Plant -> the controller whose law has it as its model, with the same numbers. Both
+            then have the parameters of the controller.
+        is_short: Whether the derivative of such a plant follows from what its law wants, where the
+            law says how and nothing stands between.
+
+    Attributes:
+        time: The time in s.
+        calls: All computations so far, each after those that it needs.
+        used: The blocks so far, by their systems.
+        symbols: (system, STATE, HELD, PARAMETERS, NOISE, or the name of an input port with a fixed
+            value) -> its symbols.
+
+    Raises:
+        ModelError: A block cannot be traced; its name and why.
+    """
+
+    def __init__(
+        self,
+        wires: Wires,
+        context: Context,
+        twins: Mapping[System, System] | None = None,
+        is_short: bool = False,
+    ) -> None:
+        self.time = ca.SX.sym("time")
+        self.calls: list[Call] = []
+        self.used: dict[System, Block] = {}
+        self.symbols: dict[tuple[System, str], ca.SX] = {}
+        self._wires, self._context, self._twins = wires, context, dict(twins or {})
+        self._found: dict[tuple[System, Computation], Call] = {}
+        self._open: list[tuple[System, Computation]] = []
+        self._needed: list[dict[int, Call]] = []
+        self._owners: dict[System, dict[str, Computation]] = {}
+        self._under: dict[System, tuple[Block, Computation]] = {}
+        for plant, controller in self._twins.items() if is_short else ():
+            self._shorten(plant, self.block(controller))
+
+    def block(self, system: System) -> Block:
+        """What a system computes."""
+        if system not in self.used:
+            found = system.traced() if isinstance(system, Traced) else primitive(system)
+            self.used[system] = found
+            self._owners[system] = {
+                name: one for one in found.computations for name in one.outputs if name
+            }
+        return self.used[system]
+
+    def port(self, port: Port) -> ca.SX:
+        """What an output port shows.
+
+        Raises:
+            ModelError: It cannot be traced, or depends on itself in the same instant.
+        """
+        system, index = port
+        return self.output(system, system.get_output_port(index).get_name())
+
+    def output(self, system: System, name: str) -> ca.SX:
+        """An output of a block, or its derivative; errors as of `port`."""
+        block = self.block(system)
+        computation = self._owners[system].get(name)
+        if computation is None:
+            raise ModelError(
+                f"the output port '{name}' of '{system.get_name()}' cannot be traced, so that "
+                "what it leads to runs in Drake's Simulator alone"
+            )
+        owner = block
+        if DERIVATIVE in computation.outputs and system in self._under:
+            owner, computation = self._under[system]
+        found = self.call(owner, computation)
+        return found.results[computation.outputs.index(name)]
+
+    def call(self, block: Block, computation: Computation) -> Call:
+        """A computation with its arguments put in; errors as of `port`."""
+        key = block.system, computation
+        if key in self._found:
+            self._note(self._found[key])
+            return self._found[key]
+        if key in self._open:
+            names = [each.get_name() for each, _ in self._open[self._open.index(key) :]]
+            raise ModelError(
+                f"the diagram has an algebraic loop: {' -> '.join([*names, names[0]])}; put a "
+                "block with state between, as a sensor or a filter"
+            )
+        self._open.append(key)
+        self._needed.append({})
+        arguments = [self.source(block, name) for name in computation.sources]
+        self._open.pop()
+        needed = tuple(self._needed.pop().values())
+        results = computation.function.call(arguments)
+        found = Call(block, computation, tuple(arguments), tuple(results), needed)
+        self._found[key] = found
+        self.calls.append(found)
+        self._note(found)
+        return found
+
+    def _note(self, found: Call) -> None:
+        """Keeps that what is being computed needs a call, and what that needs."""
+        if self._needed:
+            self._needed[-1] |= {id(one): one for one in (*found.needed, found)}
+
+    def checked(self, ask: Callable[[], Sequence[ca.SX]]) -> tuple[ca.SX, ca.SX]:
+        """Some expressions below each other, and what is finite if they are of use.
+
+        Args:
+            ask: What asks for them.
+        """
+        self._needed.append({})
+        value = ca.vertcat(ca.SX(0, 1), *ask())
+        needed = self._needed.pop().values()
+        valid = sum((call.valid for call in needed), ca.sum1(value) if value.numel() else ca.SX(0))
+        return value, valid
+
+    def source(self, block: Block, name: str) -> ca.SX:
+        """An argument of a computation of a block."""
+        system = block.system
+        if name == TIME:
+            return self.time
+        if name == PARAMETERS:
+            return self.parameters(block)
+        if name in (STATE, HELD, NOISE):
+            return self.symbol(system, name, self._size(system, name))
+        if system.HasInputPort(name):
+            return self.input(block, name)
+        return self.output(system, name)
+
+    def input(self, block: Block, name: str) -> ca.SX:
+        """What stands at an input port.
+
+        Raises:
+            ModelError: It has neither a wire nor a value.
+        """
+        system = block.system
+        port = system.GetInputPort(name)
+        source = self._wires.sources.get((system, int(port.get_index())))
+        if source is not None:
+            return self.port(source)
+        if port.HasValue(system.GetMyContextFromRoot(self._context)):
+            return self.symbol(system, name, port.size())
+        law = self._law_behind(system)
+        if law is not None and law.HasOutputPort(name):
+            return self.output(law, name)
+        if name in block.unwired:
+            found = self.call(block, block.unwired[name])
+            return found.results[0]
+        if not port.size():
+            return ca.SX(0, 1)
+        raise ModelError(
+            f"the input port '{name}' of '{system.get_name()}' has neither a wire nor a value; "
+            "connect it, or fix its value in the context"
+        )
+
+    def parameters(self, block: Block) -> ca.SX:
+        """The numeric parameters of a block, those that move as their wire says."""
+        system = block.system
+        twin = self._twins.get(system)
+        size = self._size(system, PARAMETERS)
+        found = self.symbol(system, PARAMETERS, size)
+        if twin is not None:
+            found = self.symbol(twin, PARAMETERS, self._size(twin, PARAMETERS))[:size]
+        if block.moving and system.HasInputPort("exogenous"):
+            port = system.GetInputPort("exogenous")
+            index = int(port.get_index())
+            if (system, index) in self._wires.sources or port.HasValue(
+                system.GetMyContextFromRoot(self._context)
+            ):
+                found = ca.SX(found)
+                found[list(block.moving)] = self.input(block, "exogenous")
+        return found
+
+    def _shorten(self, plant: System, controller: Block) -> None:
+        """Lets a plant's derivative follow from what its law wants, where it acts as it is."""
+        if not plant.HasInputPort("control"):
+            return
+        port = plant.GetInputPort("control")
+        source = self._wires.sources.get((plant, int(port.get_index())))
+        acts = controller.system, int(controller.system.GetOutputPort("control").get_index())
+        is_direct = source == acts
+        if source is None and not port.HasValue(plant.GetMyContextFromRoot(self._context)):
+            is_direct = self._law_behind(plant) is controller.system
+        under = controller.under() if is_direct and controller.under is not None else None
+        if under is not None:
+            self._under[plant] = controller, under
+
+    @property
+    def is_shortened(self) -> bool:
+        """Whether the derivative of a plant follows from what its law wants."""
+        return bool(self._under)
+
+    def symbol(self, system: System, name: str, size: int) -> ca.SX:
+        """The symbols of a block's own column."""
+        key = system, name
+        if key not in self.symbols:
+            self.symbols[key] = ca.SX.sym(f"{system.get_name()}_{name.strip('$')}", size)
+        return self.symbols[key]
+
+    def _law_behind(self, system: System) -> System | None:
+        """The block whose law comes through an abstract wire, in place of a value without one."""
+        for index in range(system.num_input_ports()):
+            if system.get_input_port(index).get_data_type() == PortDataType.kAbstractValued:
+                source = self._wires.sources.get((system, index))
+                if source is not None:
+                    return source[0]
+        return None
+
+    def _size(self, system: System, name: str) -> int:
+        """How many entries a block's own column has."""
+        context = system.GetMyContextFromRoot(self._context)
+        if name == STATE:
+            return int(context.num_continuous_states())
+        if name == PARAMETERS:
+            count = context.num_numeric_parameter_groups()
+            return sum(context.get_numeric_parameter(i).size() for i in range(count))
+        count = context.num_discrete_state_groups()
+        return sum(context.get_discrete_state(i).size() for i in range(count))
+
+
+def needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[System]:
+    """The systems that some output ports depend on, by way of states too, all of them traced.
+
+    Raises:
+        ModelError: One cannot be traced.
+    """
+    for port in outputs:
+        expressions.port(port)
+    done: list[System] = []
+    while len(done) < len(expressions.used):
+        for system, block in list(expressions.used.items()):
+            if system in done:
+                continue
+            done.append(system)
+            if _has_state(block):
+                expressions.output(system, DERIVATIVE)
+            for update in block.updates:
+                expressions.call(block, update.computation)
+            if block.initial is not None:
+                expressions.call(block, block.initial)
+    return done
+
+
+def _has_state(block: Block) -> bool:
+    return any(DERIVATIVE in one.outputs for one in block.computations)

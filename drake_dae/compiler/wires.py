@@ -1,0 +1,67 @@
+"""The wires of a diagram, those of the diagrams inside it included."""
+
+from dataclasses import dataclass
+
+from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, System
+
+Port = tuple[System, int]
+"""A leaf system and the index of one of its ports."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wires:
+    """The leaf systems of a diagram and what connects them.
+
+    Attributes:
+        diagram: The diagram.
+        systems: The leaf systems, in the order of Drake's states and parameters.
+        sources: Input port -> the output port that feeds it; an input without a wire is not there.
+        outputs: Name of an output port of the diagram -> the leaf's port.
+    """
+
+    diagram: Diagram
+    systems: tuple[System, ...]
+    sources: dict[Port, Port]
+    outputs: dict[str, Port]
+
+    @classmethod
+    def of(cls, diagram: Diagram) -> "Wires":
+        """The wires of a diagram."""
+        systems: list[System] = []
+        sources: dict[Port, Port] = {}
+        _collect(diagram, systems, sources)
+        outputs = {}
+        for index in range(diagram.num_output_ports()):
+            name = diagram.get_output_port(index).get_name()
+            outputs[name] = _output(diagram, index)
+        return cls(diagram, tuple(systems), sources, outputs)
+
+
+def _collect(diagram: Diagram, systems: list[System], sources: dict[Port, Port]) -> None:
+    for system in diagram.GetSystems():
+        if isinstance(system, Diagram):
+            _collect(system, systems, sources)
+        else:
+            systems.append(system)
+    for (taker, taken), (giver, given) in diagram.connection_map().items():
+        source = _output(giver, int(given))
+        for port in _inputs(taker, int(taken)):
+            sources[port] = source
+
+
+def _output(system: System, index: int) -> Port:
+    """The leaf's port behind an output port."""
+    while isinstance(system, Diagram):
+        system, inner = system.get_output_port_locator(OutputPortIndex(index))
+        index = int(inner)
+    return system, index
+
+
+def _inputs(system: System, index: int) -> list[Port]:
+    """The leaves' ports behind an input port."""
+    if not isinstance(system, Diagram):
+        return [(system, index)]
+    found = []
+    for inner, port in system.GetInputPortLocators(InputPortIndex(index)):
+        found += _inputs(inner, int(port))
+    return found

@@ -1,0 +1,72 @@
+"""What an export takes of a closed loop, or of any diagram with a plant and a law in it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, Diagram
+
+from drake_dae.arrays import FloatArray
+from drake_dae.compiler.compile import CompiledDiagram, compile_diagram
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.running.rollout.program import program_of
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """A diagram with one plant and one law.
+
+    Attributes:
+        plant, controller: The blocks.
+        diagram: The diagram.
+        compiled: Its functions; None where something in it cannot be traced.
+        reason: Why not, in one sentence; "" if it can.
+    """
+
+    plant: Any
+    controller: Any
+    diagram: Diagram
+    compiled: CompiledDiagram | None
+    reason: str = ""
+
+    def reference(self, context: Context) -> Callable[[float], FloatArray]:
+        """R(t) as the controller takes it, in a context of the diagram."""
+        own = self.diagram.CreateDefaultContext()
+        own.SetTimeStateAndParametersFrom(context)
+        own_of_controller = self.controller.GetMyContextFromRoot(own)
+        port = self.controller.GetInputPort("reference")
+
+        def reference(time: float) -> FloatArray:
+            own.SetTime(time)
+            if port.HasValue(own_of_controller):
+                return np.array(port.Eval(own_of_controller))
+            (value, *_) = self.controller.traced().unwired["reference"].function.call([time])
+            found: FloatArray = value.full()[:, 0]
+            return found
+
+        return reference
+
+
+def parts_of(loop: ClosedLoop | Diagram) -> Parts:
+    """The parts of a closed loop or of a diagram.
+
+    Raises:
+        ModelError: A diagram has no plant or no law, or more than one of them, or cannot be traced.
+    """
+    if not isinstance(loop, Diagram):
+        try:
+            return Parts(loop.plant, loop.controller, loop.diagram, program_of(loop).compiled)
+        except ModelError as error:
+            return Parts(loop.plant, loop.controller, loop.diagram, None, str(error))
+    compiled = compile_diagram(loop)
+    plants = [each for each, block in compiled.blocks.items() if block.check_start is not None]
+    laws = [each for each, block in compiled.blocks.items() if block.under is not None]
+    if len(plants) != 1 or len(laws) != 1:
+        raise ModelError(
+            f"an export is of one plant and one law; this diagram has {len(plants)} plants and "
+            f"{len(laws)} laws that lead to its output ports. Export the output ports of what it "
+            "should compute"
+        )
+    return Parts(plants[0], laws[0], loop, compiled)

@@ -1,0 +1,92 @@
+"""When a diagram's discrete states change, and the random numbers that they take then."""
+
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.common import RandomGenerator
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.compiler.compile import CompiledDiagram
+
+SAME = 1e-9
+"""Times that differ by less than this, in periods, are one."""
+
+
+class Events(NamedTuple):
+    """The updates of a run.
+
+    Attributes:
+        times: When there is one, in s, increasing, shape (k,).
+        due: Which rates of the diagram are due then, as bits, shape (k,).
+    """
+
+    times: FloatArray
+    due: np.ndarray
+
+
+def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
+    """The updates of a diagram.
+
+    Args:
+        compiled: The diagram.
+        times: When rows are written, in s: an update at the time of a row makes no step of its own.
+    """
+    due: dict[float, int] = {}
+    for number, rate in enumerate(compiled.rates):
+        first = int(np.ceil((times[0] - rate.offset) / rate.period - SAME))
+        last = int(np.floor((times[-1] - rate.offset) / rate.period + SAME))
+        for k in range(max(first, 0), last + 1):
+            moment = rate.offset + k * rate.period
+            due[moment] = due.get(moment, 0) | 1 << number
+    # As in Drake, two updates are of one instant if their times are the same to the last bit; those
+    # of times that differ by round-off follow each other.
+    moments = np.array(sorted(due), dtype=float)
+    bits = np.array([due[moment] for moment in moments.tolist()], dtype=np.int64)
+    shortest = min((rate.period for rate in compiled.rates), default=0.0)
+    near = np.clip(np.searchsorted(times, moments), 1, times.size - 1)
+    for candidate in (times[near - 1], times[near]):
+        is_near = np.abs(candidate - moments) <= SAME * shortest
+        moments[is_near] = candidate[is_near]
+    return Events(moments, bits)
+
+
+def noise_of(
+    compiled: CompiledDiagram, events: Events, start: float, seed: int | None
+) -> FloatArray:
+    """The random numbers at the start and from each update on, shape (k + 1, number of entries).
+
+    They are those of Drake's RandomSource.
+
+    Args:
+        compiled: The diagram.
+        events: Its updates.
+        start: When the run begins, in s.
+        seed: The seed; that of every run without one if None. A second source has another.
+    """
+    found = np.zeros((events.times.size + 1, compiled.sizes["noise"]))
+    for number, (source, part) in enumerate(compiled.noise):
+        (update,) = compiled.blocks[source].updates
+        key = update.period, update.offset, update.is_unrestricted
+        keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in compiled.rates]
+        own = np.flatnonzero(events.due & (1 << keys.index(key)))
+        chosen = None if seed is None else (seed + number * 2**31) % 2**32
+        found[[0, *(own + 1)], part] = _drawn(source, start, events.times[own], key[0], chosen)
+    return found
+
+
+def _drawn(
+    source: System, start: float, times: FloatArray, period: float, seed: int | None
+) -> FloatArray:
+    """What a source shows at the start, and after each of its updates."""
+    context = source.CreateDefaultContext()
+    context.SetTime(start)
+    if seed is not None:
+        source.SetRandomContext(context, RandomGenerator(seed))
+    simulator, port = Simulator(source, context), source.get_output_port()
+    values = [port.Eval(context).copy()]
+    for moment in times:
+        simulator.AdvanceTo(moment + 0.5 * period)
+        values.append(port.Eval(context).copy())
+    return np.array(values)

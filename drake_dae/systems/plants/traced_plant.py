@@ -1,0 +1,92 @@
+"""What the plant of a DaeSystem computes, as traced functions.                  (1)-(3), (25)"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import casadi as ca
+from pydrake.systems.framework import System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.signals import Signal
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    PARAMETERS,
+    STATE,
+    Block,
+    Computation,
+    Projection,
+)
+
+
+def traced_plant(
+    plant: System,
+    structure: ConstraintStructure,
+    projects: bool,
+    check_start: Callable[[FloatArray, FloatArray], None],
+    moving: Sequence[int],
+    signals: Mapping[str, Sequence[Signal]],
+) -> Block:
+    """The computations of a `DaePlant`: those of x' and v are one, where v needs the control.
+
+    Args:
+        plant: The plant.
+        structure: Its structure.
+        projects: Whether its state is projected onto N*.
+        check_start: Refuses a start, by the state and all parameters.
+        moving: Which parameters come through its port "exogenous".
+        signals: Names and units of what its functions take, for messages.
+    """
+    dae, derivatives = structure.system, structure.derivatives
+    rate, force = (
+        derivatives.expand(value) for value in (derivatives.rate, derivatives.constraint_input)
+    )
+    control = {"control": derivatives.control}
+    regular = structure.elimination.pivot, "A(x) of Assumption (2)"
+    by_state, by_control = (STATE, PARAMETERS), (STATE, "control", PARAMETERS)
+    found = []
+    if structure.elimination.beta.nnz():
+        both = dae.trace("plant", {"rate": rate, "force": force}, control, *regular)
+        found.append(Computation.of(both, by_control, (DERIVATIVE, "constraint_input")))
+    else:
+        motion = dae.trace("plant", {"rate": rate}, control, *regular)
+        held = dae.trace("plant", {"force": force}, {}, *regular)
+        found.append(Computation.of(motion, by_control, (DERIVATIVE,)))
+        found.append(Computation.of(held, by_state, ("constraint_input",)))
+    acting = ca.SX.sym("v", dae.num_constraints)
+    by_force = (STATE, "constraint_input", PARAMETERS)
+    shown = {"force": dae.forces(acting), "output": dae.l + ca.mtimes(dae.m, acting)}
+    names = {"force": "constraint_force", "output": "controlled_output"}
+    if not structure.elimination.n_star.nnz():
+        # m beta u cancels: what is left is as with any control.
+        alpha = ca.substitute(force, derivatives.control, 0 * derivatives.control)
+        output = dae.trace(
+            "controlled output", {"value": dae.l + ca.mtimes(dae.m, alpha)}, {}, *regular
+        )
+        found.append(Computation.of(output, by_state, ("controlled_output",)))
+        del shown["output"]
+    rest = dae.trace("signals", shown, {"force": acting})
+    found.append(Computation.of(rest, by_force, tuple(names[name] for name in shown)))
+    manifold = structure.manifold
+    residual = dae.trace("residual", {"value": manifold.residual_expression})
+    found.append(Computation.of(residual, by_state, ("constraint_residual",)))
+    same = ca.Function("state", [dae.state], [dae.state])
+    found.append(Computation(same, (STATE,), ("state",)))
+    projection = None
+    if projects:
+        projection = Projection(manifold.newton_step.function, dae.scale, manifold.project)
+    return Block(
+        plant,
+        tuple(found),
+        check_start=check_start,
+        projection=projection,
+        scale=dae.scale,
+        moving=tuple(moving),
+        model=dae,
+        ports={
+            "state": tuple(dae.state_signals),
+            "constraint_force": tuple(dae.force_signals),
+            "constraint_residual": tuple(manifold.residual_signals),
+            "controlled_output": tuple(dae.output_signals),
+        },
+        signals=signals,
+    )
