@@ -114,6 +114,7 @@ from .systems.control.controller import TrackingController as TrackingController
 from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.observer import DisturbanceObserver as DisturbanceObserver
 from .systems.control.observer_rates import Observing as Observing
+from .systems.control.phase_change import PhaseChange as PhaseChange
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
 from .systems.control.references import SystemReference as SystemReference
 from .systems.control.references import TrajectoryReference as TrajectoryReference
@@ -141,7 +142,6 @@ from .systems.task.phases import Move as Move
 from .systems.task.phases import Press as Press
 from .systems.task.phases import Release as Release
 from .systems.task.phases import Retreat as Retreat
-from .systems.task.progress import PhaseChange as PhaseChange
 from .systems.task.task import Task as Task
 
 __version__: str
