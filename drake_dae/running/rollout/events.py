@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compile import CompiledDiagram
+from drake_dae.compiler.compiled import CompiledDiagram
 
 SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
