@@ -123,12 +123,12 @@ from .systems.control.sampling import Sampling as Sampling
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.pushes import Push as Push
+from .systems.plants.contact_events import ContactChange as ContactChange
+from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
-from .systems.plants.unilateral.events import ContactChange as ContactChange
-from .systems.plants.unilateral.events import ContactEvent as ContactEvent
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
