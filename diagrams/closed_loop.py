@@ -20,10 +20,10 @@ from drake_dae.simulation.records.afterwards import completed
 from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.observer import DisturbanceObserver
+from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.task.progress import PhaseChange
 
 
 @checked(WiringError)

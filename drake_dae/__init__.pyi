@@ -114,6 +114,7 @@ from .systems.control.controller import TrackingController as TrackingController
 from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.observer import DisturbanceObserver as DisturbanceObserver
 from .systems.control.observer_rates import Observing as Observing
+from .systems.control.phase_change import PhaseChange as PhaseChange
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
 from .systems.control.references import SystemReference as SystemReference
 from .systems.control.references import TrajectoryReference as TrajectoryReference
@@ -122,12 +123,12 @@ from .systems.control.sampling import Sampling as Sampling
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.pushes import Push as Push
+from .systems.plants.contact_events import ContactChange as ContactChange
+from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
-from .systems.plants.unilateral.events import ContactChange as ContactChange
-from .systems.plants.unilateral.events import ContactEvent as ContactEvent
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
@@ -141,7 +142,6 @@ from .systems.task.phases import Move as Move
 from .systems.task.phases import Press as Press
 from .systems.task.phases import Release as Release
 from .systems.task.phases import Retreat as Retreat
-from .systems.task.progress import PhaseChange as PhaseChange
 from .systems.task.task import Task as Task
 
 __version__: str

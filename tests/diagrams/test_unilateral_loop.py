@@ -41,7 +41,7 @@ from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.simulation.open_contacts import contact_notes, open_spans
 from drake_dae.simulation.records.events import flashes
 from drake_dae.simulation.summary import Limits, summary
-from drake_dae.systems.plants.unilateral.events import ContactChange
+from drake_dae.systems.plants.contact_events import ContactChange
 
 MASS, BOUNCE = 2.0, 0.2
 PUSH, SWING, RATE = 6.0, 8.0, 2.0

@@ -169,7 +169,7 @@ def _calls(law: TrackingLaw, structure: ConstraintStructure) -> dict[str, Call]:
         {
             "rate": derivatives.expand(derivatives.rate),
             "constraint_force": force,
-            "controlled_output": system.l + ca.mtimes(system.m, force),
+            "controlled_output": system.outputs(force),
         },
         {"control": derivatives.control},
         structure.elimination.pivot,

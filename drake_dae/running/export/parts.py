@@ -8,7 +8,8 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compile import CompiledDiagram, compile_diagram
+from drake_dae.compiler.compile import compile_diagram
+from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.program import program_of

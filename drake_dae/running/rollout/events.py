@@ -9,7 +9,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compile import CompiledDiagram
+from drake_dae.compiler.compiled import CompiledDiagram
 
 Seed = int | Mapping[str, int]
 """What chooses the noise of a run: one number for all sources, or the name of each -> its own."""

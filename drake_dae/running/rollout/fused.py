@@ -8,7 +8,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compile import ARGUMENTS
+from drake_dae.compiler.compiled import ARGUMENTS
 from drake_dae.running.rollout.many import Many
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Tableau

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers
-from drake_dae.compiler.compile import CompiledDiagram
+from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.events import Seed, events_of, noise_of

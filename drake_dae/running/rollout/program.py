@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Diagram
 
-from drake_dae.compiler.compile import CompiledDiagram, compile_diagram, with_twins
+from drake_dae.compiler.compile import compile_diagram, with_twins
+from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.simulation.records.record import Record

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.systems.plants.unilateral.events import ContactChange, ContactEvent
+from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 
 FLASH = 0.3
 """How long an animation shows an impact, in s."""

@@ -19,7 +19,7 @@ from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
-from drake_dae.systems.plants.unilateral.events import ContactEvent
+from drake_dae.systems.plants.contact_events import ContactEvent
 
 
 @checked(ModelError)

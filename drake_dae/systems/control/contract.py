@@ -15,8 +15,8 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
+from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import NOWHERE, Plant
-from drake_dae.systems.task.progress import PhaseChange
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System

@@ -1,10 +1,8 @@
 """The tracking law as a LeafSystem."""
 
-import warnings
 from collections.abc import Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue
@@ -22,25 +20,17 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import ModelError, NonMinimumPhaseWarning
+from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.feedback import Feedback, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import (
-    DERIVATIVE,
-    HELD,
-    PARAMETERS,
-    STATE,
-    Block,
-    Computation,
-    Update,
-)
+from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.control.contract import Controller, Derived
+from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.control.traced_law import traced_law
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -116,7 +106,7 @@ class TrackingController(ParameterizedSystem, Controller):
             "measured_force": dae.constraint_input_signals,
         }
         super().__init__(dae, law.all_parameters(), signals, sees_steps=not feedback)
-        _warn_of_zero_dynamics(law, outputs)
+        warn_of_zero_dynamics(law, outputs)
         self.law = law
         self.set_name("tracking_controller")
         sizes = {"estimated_state": dae.num_states, "reference": law.layout.reference_size}
@@ -309,82 +299,12 @@ class TrackingController(ParameterizedSystem, Controller):
         return context.get_continuous_state_vector().CopyToVector()
 
     def traced(self) -> Block:
-        law = self.law
-        memory = HELD if law.integral.outputs and self.sample_period else STATE
-        named = {"state": "estimated_state", "integral": memory, "parameters": PARAMETERS}
-        sources = tuple(named.get(name, name) for name in law.function.input_names)
-        shown = ("control", "tracking_error")
-        computations: tuple[Computation, ...]
-        updates: tuple[Update, ...] = ()
-        unwired = {}
-        if self._references is not None:
-            (unwired["reference"],) = self._references.traced().computations
-        if not law.integral.outputs:
-            computations = (Computation.of(law.function, sources, shown),)
-        else:
-            computations, updates = self._traced_integrals(sources, shown, memory)
-            none = ca.Function("none", [], [ca.SX.zeros(self._hold.size())])
-            unwired["hold"] = Computation(none, (), ("hold",))
-        return Block(
-            self,
-            computations,
-            updates,
-            unwired=unwired,
-            moving=tuple(self.exogenous_places),
-            model=self.dae,
-            under=partial(self._motion_under, sources),
-            signals=self._signals,
-            ports={
-                "control": tuple(self.dae.control_signals),
-                "tracking_error": tuple(self.dae.output_signals),
-                "integral": tuple(law.integral.signals),
-            },
+        limits, period = np.zeros(0), 0.0
+        if self.law.integral.outputs:
+            limits, period = self._limits, self.sample_period
+        return traced_law(
+            self, self.law, self._references, limits, period, self.exogenous_places, self._signals
         )
-
-    def _traced_integrals(
-        self, sources: tuple[str, ...], shown: tuple[str, ...], memory: str
-    ) -> tuple[tuple[Computation, ...], tuple[Update, ...]]:
-        """What a law with integrals computes, and what it does with those at samples."""
-        law, function = self.law, self.law.function
-        acts = Computation.of(function, sources, shown)
-        if law.measured_force and not law.control_takes_force:
-            # Whatever the force is: so nothing depends on it in the same instant.
-            place = sources.index("measured_force")
-            inputs = [
-                ca.SX.sym(name, size)
-                for name, size in zip(function.input_names, function.sizes, strict=True)
-            ]
-            given = [*inputs]
-            given[place] = ca.SX.zeros(function.sizes[place])
-            without = ca.Function(
-                "control", [*inputs[:place], *inputs[place + 1 :]], function.function.call(given)
-            )
-            acts = Computation(without, (*sources[:place], *sources[place + 1 :]), shown, function)
-        rates = Computation.of(function, sources, ("", "", "integral_rate"))
-        count = self._hold.size()
-        rate, sigma, hold = (ca.SX.sym(name, count) for name in ("rate", "integral", "hold"))
-        moves = rate
-        limited = np.flatnonzero(np.isfinite(self._limits)).tolist()
-        if limited:
-            leaves = (ca.fabs(sigma) >= self._limits) * (rate * sigma > 0)
-            moves = ca.SX(moves)
-            moves[limited] = ca.if_else(leaves, 0, rate)[limited]
-        moves = ca.if_else(hold != 0, 0, moves)
-        after = sigma + self.sample_period * moves if self.sample_period else moves
-        inputs, of = [rate, sigma, hold], ("integral_rate", memory, "hold")
-        output = HELD if self.sample_period else DERIVATIVE
-        summed = Computation(ca.Function("integral", inputs, [after]), of, (output,))
-        told = Computation(ca.Function("integral", [sigma], [sigma]), (memory,), ("integral",))
-        if self.sample_period:
-            return (acts, rates, told), (Update(summed, self.sample_period, 0.0, True),)
-        return (acts, rates, told, summed), ()
-
-    def _motion_under(self, sources: tuple[str, ...]) -> Computation | None:
-        """x' and v of a plant that is the law's own model, from what the law wants."""
-        motion = self.law.trace_motion()
-        if motion is None:
-            return None
-        return Computation.of(motion, sources, (DERIVATIVE, "constraint_input"))
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function
@@ -420,17 +340,3 @@ def _integrating(kind: type[TrackingController]) -> type[TrackingController]:
         derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
 
     return type(kind.__name__, (kind,), {"__slots__": (), "DoCalcTimeDerivatives": rate})
-
-
-def _warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:
-    if not law.structure.zero_dynamics_dimension:
-        return
-    dynamics = ZeroDynamics(law.system, structure=law.structure)
-    stability = dynamics.stability(law.structure.states[0], outputs=outputs)
-    if stability.verdict is Verdict.UNSTABLE:
-        warnings.warn(
-            f"{law.system.name}: {stability.reason}. The outputs follow the reference "
-            "while other states, or the control, run off; choose other outputs",
-            NonMinimumPhaseWarning,
-            stacklevel=3,
-        )

@@ -16,7 +16,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.unilateral.events import ContactEvent
+from drake_dae.systems.plants.contact_events import ContactEvent
 from drake_dae.trace.functions import TracedFunction
 
 if TYPE_CHECKING:

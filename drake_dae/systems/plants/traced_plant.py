@@ -54,14 +54,12 @@ def traced_plant(
         found.append(Computation.of(held, by_state, ("constraint_input",)))
     acting = ca.SX.sym("v", dae.num_constraints)
     by_force = (STATE, "constraint_input", PARAMETERS)
-    shown = {"force": dae.forces(acting), "output": dae.l + ca.mtimes(dae.m, acting)}
+    shown = {"force": dae.forces(acting), "output": dae.outputs(acting)}
     names = {"force": "constraint_force", "output": "controlled_output"}
     if not structure.elimination.n_star.nnz():
         # m beta u cancels: what is left is as with any control.
         alpha = ca.substitute(force, derivatives.control, 0 * derivatives.control)
-        output = dae.trace(
-            "controlled output", {"value": dae.l + ca.mtimes(dae.m, alpha)}, {}, *regular
-        )
+        output = dae.trace("controlled output", {"value": dae.outputs(alpha)}, {}, *regular)
         found.append(Computation.of(output, by_state, ("controlled_output",)))
         del shown["output"]
     rest = dae.trace("signals", shown, {"force": acting})

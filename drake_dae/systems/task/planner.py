@@ -11,8 +11,9 @@ from drake_dae.dae.references import ConstantReference, stack_references
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
+from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.phases import Moment
-from drake_dae.systems.task.progress import DONE, HELD, PhaseChange, Segment
+from drake_dae.systems.task.progress import DONE, HELD, Segment
 from drake_dae.systems.task.task import Task
 
 FREE, CONTACT = 0, 1

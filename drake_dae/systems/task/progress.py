@@ -6,48 +6,14 @@ from math import inf
 
 import numpy as np
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import Indices, Layout
-from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.feedback import Immutable
+from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.fade import fade
 
 DONE, HELD = "done", "held"
 """What the record calls the time after the last phase, and after a reaction that ends the task."""
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class PhaseChange:
-    """One entry of the record of a task: a phase begins.
-
-    Attributes:
-        time: When, in s.
-        phase: The phase that begins, "Approach" for example; "done" after the last one, "held"
-            after a reaction that ends the task.
-        place: Where it stands in the task, from 0; the number of phases when done or held.
-        in_contact: Whether the law with the contact acts from then on.
-        reason: Why the phase before ended.
-        force: The measured force of the contact then, in N.
-        distance: The distance by the law's model then, in m.
-        distance_rate: Its derivative, in m/s.
-    """
-
-    time: float
-    phase: str
-    place: int
-    in_contact: bool
-    reason: str
-    force: float
-    distance: float
-    distance_rate: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.time:.6g} s: {self.phase}, {self.reason}; {self.force:.4g} N, "
-            f"{self.distance:.4g} m, {self.distance_rate:.3g} m/s"
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.systems.plants.unilateral.events import ContactEvent
+from drake_dae.systems.plants.contact_events import ContactEvent
 from drake_dae.systems.plants.unilateral.resets import TOUCHING
 
 MARGIN = 1e-13

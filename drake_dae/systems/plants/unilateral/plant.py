@@ -26,7 +26,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.failures import off_manifold
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, not_traced
-from drake_dae.systems.plants.unilateral.events import ContactChange, ContactEvent
+from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
 from drake_dae.systems.plants.unilateral.log import Log, clearance
 from drake_dae.systems.plants.unilateral.modes import Closed, closed_of, numbers_of

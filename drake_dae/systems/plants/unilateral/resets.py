@@ -8,8 +8,8 @@ import numpy as np
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.contacts import Jam
 from drake_dae.errors import SimulationError
+from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.contacts import Terms, UnilateralContacts
-from drake_dae.systems.plants.unilateral.events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.frictional import impact
 from drake_dae.systems.plants.unilateral.impacts import (
     MOST,

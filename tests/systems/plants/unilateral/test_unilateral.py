@@ -20,7 +20,7 @@ from scipy.integrate import quad
 
 from drake_dae import CoincidentPoints, RobotModel, UnilateralRobotPlant
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
-from drake_dae.systems.plants.unilateral.events import ContactChange
+from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.plants.unilateral.log import Log, clearance
 
 

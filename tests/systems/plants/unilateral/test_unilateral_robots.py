@@ -26,7 +26,7 @@ from drake_dae import (
     SinusoidReference,
     UnilateralRobotPlant,
 )
-from drake_dae.systems.plants.unilateral.events import ContactChange
+from drake_dae.systems.plants.contact_events import ContactChange
 
 WALL = -0.5
 

@@ -1,0 +1,247 @@
+"""What a compiled diagram holds: its columns, its functions, and how values stand in them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import Context, Diagram, System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.compiler.trace import Call, Expressions
+from drake_dae.compiler.wires import Wires
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.traced import (
+    HELD,
+    Block,
+)
+
+ARGUMENTS = ("time", "state", "held", "parameters")
+"""What the functions of a diagram take; an update takes new random numbers, "noise", as well."""
+
+
+class Place(NamedTuple):
+    """Where a column of a block stands among those of the diagram."""
+
+    system: System
+    part: slice
+
+
+@dataclass(frozen=True, eq=False)
+class Rate:
+    """Updates of discrete states at t_k = offset + k period.
+
+    Attributes:
+        period, offset: In s.
+        is_unrestricted: As of an `Update`.
+        function: (time, state, held, parameters, noise) -> new values of some held entries, and a
+            number that is finite if they are of use.
+        places: Which entries these are.
+    """
+
+    period: float
+    offset: float
+    is_unrestricted: bool
+    function: ca.Function
+    places: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledDiagram:
+    """A diagram as functions of the time, its state, what it holds, and its parameters.
+
+    Attributes:
+        wires: The diagram and its wires.
+        context: A context in which inputs without a wire have values.
+        outputs: The names of the output ports of the diagram that are computed.
+        states, held, parameters, noise: Where the columns of each block stand.
+        fixed: The input ports without a wire whose values are parameters: (system, name, part).
+        rate: (time, state, held, parameters) -> the derivative of the state, and a number that is
+            finite if it is of use.
+        row: The same -> all outputs below each other, and such a number.
+        rates: The updates, one function for each period and offset.
+        blocks: The blocks by their systems, in the order of Drake's states.
+    """
+
+    wires: Wires
+    context: Context
+    outputs: tuple[str, ...]
+    states: tuple[Place, ...]
+    held: tuple[Place, ...]
+    parameters: tuple[Place, ...]
+    fixed: tuple[tuple[System, str, slice], ...]
+    noise: tuple[Place, ...]
+    rate: ca.Function
+    row: ca.Function
+    rates: tuple[Rate, ...]
+    blocks: Mapping[System, Block]
+    _expressions: Expressions = field(repr=False)
+    _columns: Mapping[str, ca.SX] = field(repr=False)
+
+    @property
+    def diagram(self) -> Diagram:
+        """The diagram."""
+        return self.wires.diagram
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """How many entries each argument of the functions has."""
+        return {name: int(column.numel()) for name, column in self._columns.items()}
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """The sizes of the states, shape (n,)."""
+        found = np.ones(self.sizes["state"])
+        for system, part in self.states:
+            scale = self.blocks[system].scale
+            if scale is not None:
+                found[part] = scale
+        return found
+
+    def start(self, context: Context) -> tuple[FloatArray, FloatArray]:
+        """The state and what is held in a context of the diagram, shapes (n,) and (k,)."""
+        state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
+        for system, part in self.states:
+            own = system.GetMyContextFromRoot(context)
+            state[part] = own.get_continuous_state_vector().CopyToVector()
+        for system, part in self.held:
+            own = system.GetMyContextFromRoot(context)
+            groups = range(own.num_discrete_state_groups())
+            held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
+        return state, held
+
+    def begun(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> FloatArray:
+        """What is held when a run begins: what is not a number yet, as its block says."""
+        found = held.copy()
+        for system, part in self.held:
+            initial = self.blocks[system].initial
+            if initial is not None and np.isnan(found[part]).any():
+                call = self._expressions.call(self.blocks[system], initial)
+                value = call.results[initial.outputs.index(HELD)]
+                function = self._function("initial", [value])
+                found[part] = function(time, state, held, parameters).full()[:, 0]
+        return found
+
+    def values(self, context: Context) -> FloatArray:
+        """The parameters in a context of the diagram, shape (m,).
+
+        Raises:
+            ModelError: An input port without a wire has no value in this context.
+        """
+        found = np.zeros(self.sizes["parameters"])
+        for system, part in self.parameters:
+            own = system.GetMyContextFromRoot(context)
+            groups = range(own.num_numeric_parameter_groups())
+            found[part] = np.concatenate([own.get_numeric_parameter(i).value() for i in groups])
+        for system, name, part in self.fixed:
+            own, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)
+            if not port.HasValue(own):
+                raise ModelError(
+                    f"the input port '{name}' of '{system.get_name()}' has no value in this context"
+                )
+            found[part] = port.Eval(own)
+        return found
+
+    @cached_property
+    def twins(self) -> Mapping[System, System]:
+        """Plant -> the controller whose law has the plant's system as its model."""
+        laws = {
+            id(block.model): system
+            for system, block in self.blocks.items()
+            if block.under is not None
+        }
+        return {
+            system: laws[id(block.model)]
+            for system, block in self.blocks.items()
+            if block.under is None and block.model is not None and id(block.model) in laws
+        }
+
+    def has_twins(self, parameters: FloatArray) -> bool:
+        """Whether plants and laws that have one model have the same numbers, too.
+
+        Args:
+            parameters: As `values` returns them.
+        """
+        parts = dict(self.parameters)
+        for plant, controller in self.twins.items():
+            own, of_law = parts[plant], parts[controller]
+            same = parameters[own] == parameters[of_law][: own.stop - own.start]
+            same[list(self.blocks[plant].moving)] = True
+            if not same.all():
+                return False
+        return bool(self.twins)
+
+    @cached_property
+    def own_parameters(self) -> Mapping[System, ca.Function]:
+        """System -> (time, state, held, parameters) -> its own, those that move as they are then.
+
+        Of the blocks that are not content with any state.
+        """
+        return {
+            system: self._function("parameters", [self._expressions.parameters(block)])
+            for system, block in self.blocks.items()
+            if block.check_start is not None
+        }
+
+    def newton(self, count: int) -> ca.Function:
+        """(time, state, held, parameters) -> the state after Newton steps to its manifolds.
+
+        With the length of the last step, in states over their scale. Gradients of all are those at
+        the start.
+
+        Args:
+            count: How many steps.
+        """
+        state = ca.SX(self._columns["state"])
+        left = ca.SX(0.0)
+        for system, part in self.states:
+            projection = self.blocks[system].projection
+            if projection is None:
+                continue
+            parameters = self._expressions.parameters(self.blocks[system])
+            start = self._columns["state"][part]
+            x = start
+            for _ in range(count):
+                change = projection.newton(x, start, parameters)[0]
+                x, left_here = x + ca.DM(projection.scale) * change, ca.norm_2(change)
+            state[part], left = x, ca.fmax(left, left_here) if left.nnz() else left_here
+        return self._function("newton", [state, left])
+
+    @property
+    def signals(self) -> dict[str, tuple[Signal, ...]]:
+        """Name of an output -> names and units of its entries, as far as its block tells them."""
+        found = {}
+        for name in self.outputs:
+            system, index = self.wires.outputs[name]
+            port = system.get_output_port(index)
+            known = self.blocks[system].ports.get(port.get_name())
+            found[name] = known or tuple(Signal(f"{name}[{i}]") for i in range(port.size()))
+        return found
+
+    @property
+    def projects(self) -> bool:
+        """Whether a block has a manifold that its state is brought to."""
+        return any(block.projection is not None for block in self.blocks.values())
+
+    @property
+    def calls(self) -> Sequence[Call]:
+        """All that is computed, each after what it needs."""
+        return self._expressions.calls
+
+    def arguments_of(self, call: Call) -> ca.Function:
+        """(time, state, held, parameters) -> the arguments of a computation."""
+        return self._function("arguments", list(call.arguments))
+
+    def _function(self, name: str, values: Sequence[ca.SX]) -> ca.Function:
+        return dense_function(name, [self._columns[each] for each in ARGUMENTS], values)
+
+
+def dense_function(name: str, given: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
+    """Expressions as a function with dense outputs and without what is common twice."""
+    dense = [ca.densify(value) for value in values]
+    return ca.Function(name, list(given), ca.cse(dense), {"cse": False})

@@ -1,0 +1,30 @@
+"""A warning where a law leaves states to unstable zero dynamics.                         (35)"""
+
+import warnings
+
+from numpy.typing import ArrayLike
+
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import NonMinimumPhaseWarning
+
+
+def warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:
+    """Warns whoever makes the block of a law whose zero dynamics (35) are unstable.
+
+    Args:
+        law: The law.
+        outputs: z at which they are judged, shape (p,); None for those at the nominal state.
+    """
+    if not law.structure.zero_dynamics_dimension:
+        return
+    dynamics = ZeroDynamics(law.system, structure=law.structure)
+    stability = dynamics.stability(law.structure.states[0], outputs=outputs)
+    if stability.verdict is Verdict.UNSTABLE:
+        warnings.warn(
+            f"{law.system.name}: {stability.reason}. The outputs follow the reference "
+            "while other states, or the control, run off; choose other outputs",
+            NonMinimumPhaseWarning,
+            stacklevel=3,
+        )

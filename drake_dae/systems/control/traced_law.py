@@ -1,0 +1,128 @@
+"""What the block of a tracking law computes, as traced functions.                       (28)"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.systems.blocks.traced import (
+    DERIVATIVE,
+    HELD,
+    PARAMETERS,
+    STATE,
+    Block,
+    Computation,
+    Update,
+)
+from drake_dae.systems.control.references import ReferenceGenerator
+
+
+def traced_law(
+    block: System,
+    law: TrackingLaw,
+    references: ReferenceGenerator | None,
+    limits: FloatArray,
+    sample_period: float,
+    moving: Sequence[int],
+    signals: Mapping[str, Sequence[Signal]],
+) -> Block:
+    """The computations of a `TrackingController`, and what it does with integrals at samples.
+
+    Args:
+        block: The controller.
+        law: Its law.
+        references: What R is where the port `reference` has no wire; None if it needs one.
+        limits: The largest |integral| of each error, shape (k,).
+        sample_period: When errors are summed, in s; 0 for integrals by the integrator.
+        moving: Which parameters come through its port "exogenous".
+        signals: Names and units of what its functions take, for messages.
+    """
+    memory = HELD if law.integral.outputs and sample_period else STATE
+    named = {"state": "estimated_state", "integral": memory, "parameters": PARAMETERS}
+    sources = tuple(named.get(name, name) for name in law.function.input_names)
+    shown = ("control", "tracking_error")
+    computations: tuple[Computation, ...]
+    updates: tuple[Update, ...] = ()
+    unwired = {}
+    if references is not None:
+        (unwired["reference"],) = references.traced().computations
+    if not law.integral.outputs:
+        computations = (Computation.of(law.function, sources, shown),)
+    else:
+        computations, updates = _traced_integrals(
+            law, limits, sample_period, sources, shown, memory
+        )
+        none = ca.Function("none", [], [ca.SX.zeros(limits.size)])
+        unwired["hold"] = Computation(none, (), ("hold",))
+    return Block(
+        block,
+        computations,
+        updates,
+        unwired=unwired,
+        moving=tuple(moving),
+        model=law.system,
+        under=partial(_motion_under, law, sources),
+        signals=signals,
+        ports={
+            "control": tuple(law.system.control_signals),
+            "tracking_error": tuple(law.system.output_signals),
+            "integral": tuple(law.integral.signals),
+        },
+    )
+
+
+def _traced_integrals(
+    law: TrackingLaw,
+    limits: FloatArray,
+    sample_period: float,
+    sources: tuple[str, ...],
+    shown: tuple[str, ...],
+    memory: str,
+) -> tuple[tuple[Computation, ...], tuple[Update, ...]]:
+    """What a law with integrals computes, and what it does with those at samples."""
+    function = law.function
+    acts = Computation.of(function, sources, shown)
+    if law.measured_force and not law.control_takes_force:
+        # Whatever the force is: so nothing depends on it in the same instant.
+        place = sources.index("measured_force")
+        inputs = [
+            ca.SX.sym(name, size)
+            for name, size in zip(function.input_names, function.sizes, strict=True)
+        ]
+        given = [*inputs]
+        given[place] = ca.SX.zeros(function.sizes[place])
+        without = ca.Function(
+            "control", [*inputs[:place], *inputs[place + 1 :]], function.function.call(given)
+        )
+        acts = Computation(without, (*sources[:place], *sources[place + 1 :]), shown, function)
+    rates = Computation.of(function, sources, ("", "", "integral_rate"))
+    count = limits.size
+    rate, sigma, hold = (ca.SX.sym(name, count) for name in ("rate", "integral", "hold"))
+    moves = rate
+    limited = np.flatnonzero(np.isfinite(limits)).tolist()
+    if limited:
+        leaves = (ca.fabs(sigma) >= limits) * (rate * sigma > 0)
+        moves = ca.SX(moves)
+        moves[limited] = ca.if_else(leaves, 0, rate)[limited]
+    moves = ca.if_else(hold != 0, 0, moves)
+    after = sigma + sample_period * moves if sample_period else moves
+    inputs, of = [rate, sigma, hold], ("integral_rate", memory, "hold")
+    output = HELD if sample_period else DERIVATIVE
+    summed = Computation(ca.Function("integral", inputs, [after]), of, (output,))
+    told = Computation(ca.Function("integral", [sigma], [sigma]), (memory,), ("integral",))
+    if sample_period:
+        return (acts, rates, told), (Update(summed, sample_period, 0.0, True),)
+    return (acts, rates, told, summed), ()
+
+
+def _motion_under(law: TrackingLaw, sources: tuple[str, ...]) -> Computation | None:
+    """x' and v of a plant that is the law's own model, from what the law wants."""
+    motion = law.trace_motion()
+    if motion is None:
+        return None
+    return Computation.of(motion, sources, (DERIVATIVE, "constraint_input"))
