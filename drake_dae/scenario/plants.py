@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import ClassVar
 
 from numpy.typing import ArrayLike
@@ -10,7 +11,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import positive
+from drake_dae.arrays import brief, positive
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
@@ -151,3 +152,38 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 parameters=robot.parameters,
                 pushes=robot.pushes,
             )
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class OwnPlant(ScenarioPlant):
+    """The plant is one of your own: a class that keeps the contract of `drake_dae.Plant`.
+
+    It is called with the robot and the structure of its system, as `maker(model, structure)`, and
+    returns the plant. Processes of a sweep find its module as Python does, by PYTHONPATH.
+
+    Attributes:
+        maker: The module and the class or function in it, as "my_plants:SpringyPlant".
+
+    Raises:
+        ModelError: The text names no module and class.
+    """
+
+    maker: str
+
+    def __post_init__(self) -> None:
+        module, _, name = self.maker.partition(":")
+        if not (module and name.isidentifier()):
+            raise ModelError(
+                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
+                f"'{brief(self.maker)}'"
+            )
+
+    def plant(self, robot: Planted) -> Plant:
+        module, _, name = self.maker.partition(":")
+        with at("plant.maker"):
+            try:
+                made: Plant = getattr(import_module(module), name)(robot.model, robot.structure)
+            except (ImportError, AttributeError) as error:
+                raise ModelError(f"'{self.maker}' cannot be loaded: {error}") from error
+            return made
