@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
@@ -15,6 +15,7 @@ from drake_dae.arrays import brief, positive
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.keys import at
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
@@ -187,3 +188,13 @@ class OwnPlant(ScenarioPlant):
             except (ImportError, AttributeError) as error:
                 raise ModelError(f"'{self.maker}' cannot be loaded: {error}") from error
             return made
+
+
+def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
+    """The member that plain data choose; the first one where they choose none of the family.
+
+    Args:
+        data: What stands under `plant`.
+    """
+    kinds = {f"!{kind.__name__}": kind for kind in ScenarioPlant.__subclasses__()}
+    return kinds.get(data.get(TAG, ""), IdealConstraints)
