@@ -26,6 +26,7 @@ from drake_dae import (
     make_closed_loop,
     poles,
     simulate,
+    start_meshcat,
     sweep,
 )
 from drake_dae.diagrams.parts import log_steps
@@ -220,14 +221,19 @@ def arm_law():
     return TrackingLaw(arm("two_link").model.dae, poles(-4.0), structure=arm("two_link").structure)
 
 
+@pytest.fixture(scope="module")
+def meshcat():
+    return start_meshcat()
+
+
 @pytest.mark.slow
-def test_every_member_goes_through_a_loop(plant):
-    """Wiring, a run, its record and its picture; the ideal ones follow theory.
+def test_every_member_goes_through_a_loop(plant, meshcat):
+    """Wiring, a run, its record, live view and picture; the ideal ones follow theory.
 
     From N* on, with steps of 1 ms, RK5 leaves less than 1e-8 of errors of 5 cm.
     """
     references = [ConstantReference(0.3), ConstantReference(20.0)]
-    loop = make_closed_loop(plant, arm_law(), references)
+    loop = make_closed_loop(plant, arm_law(), references, meshcat=meshcat)
     context = loop.diagram.CreateDefaultContext()
     q = arm("two_link").model.configuration([0.35], [1.2, -1.6])
     own = plant.GetMyMutableContextFromRoot(context)
@@ -241,6 +247,8 @@ def test_every_member_goes_through_a_loop(plant):
         np.testing.assert_allclose(
             record["tracking_error"], loop.predicted_error(record), atol=1e-8
         )
+    is_drawn = loop.diagram.HasSubsystemNamed("constraint_force_visualizer")
+    assert is_drawn is (plant.model is not None)
     if plant.model is not None:
         assert "<html" in make_animation(loop, record, context)
 
