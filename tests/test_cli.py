@@ -25,7 +25,7 @@ from drake_dae.diagrams.shipped import DEFAULT_SCENARIO, find_scenario, shipped_
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.simulation import view
 from drake_dae.simulation.plots import PATHS, PLOTS
-from drake_dae.simulation.run_folder import FILES
+from drake_dae.simulation.run_folder import FILES, PART
 
 QUICK = ["--set", "write.plots=false", "--set", "write.animation=false"]
 BARE = [*QUICK, "--set", "write.record=false"]
@@ -429,15 +429,20 @@ def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch,
 # Ctrl-C.
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
-    """The run would last a minute; it is interrupted after about half a second."""
+    """The run would last a minute; it is interrupted as soon as it has begun its record."""
     process = command(
         *("simulate", "two_link_wall", "--out", tmp_path / "run"),
         *("--set", "duration=60", "--set", "integrator.target_realtime_rate=1"),
     )
     assert process.stdout.readline().startswith("two_link_wall: built")
-    time.sleep(0.5)
+    limit = time.monotonic() + 60
+    while not (tmp_path / "run" / PART).exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < limit
+        time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=30)
     assert process.returncode == 130, err
@@ -445,7 +450,7 @@ def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
     assert "interrupted          the record ends there" in out
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == sorted(FILES)
     record = Record.load(tmp_path / "run" / "record.npz")
-    assert 0.1 < record.time[-1] < 10.0
+    assert 0.0 < record.time[-1] < 60.0
     tracks = animation((tmp_path / "run" / "animation.html").read_text())
     end = tracks["/contact/wall/force", "position"].times[-1]
     assert record.time[-1] <= end <= record.time[-1] + 1 / 32
@@ -549,11 +554,9 @@ def test_a_reader_that_has_enough():
 
 
 @pytest.mark.slow
-def test_meshcat_tells_where_and_runs_in_real_time(tmp_path, capsys):
+def test_meshcat_tells_where_and_asks_drake_for_real_time(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--meshcat", "--out", str(tmp_path), *QUICK]
-    began = time.perf_counter()
-    assert main([*arguments, "--set", "duration=0.5"]) == 0
-    assert time.perf_counter() - began > 0.5
+    assert main([*arguments, "--set", "duration=0.1"]) == 0
     captured = capsys.readouterr()
     assert re.search(r"^watch at http://localhost:\d+$", captured.out, re.MULTILINE)
     assert captured.err == ""
