@@ -231,7 +231,7 @@ def _examine(
             satisfied |= {4, 5}
             margin = find_margin(samples, matrix, structure.round_off, search)
             structure = replace(structure, control_margin=margin)
-            judge(margin, control_violation(system, structure.output_degrees, margin), 5)
+            judge(margin, control_violation(structure), 5)
             known |= {
                 "output_degrees": structure.output_degrees,
                 "independence": _independence(structure, samples),
