@@ -13,7 +13,6 @@ from drake_dae.dae.zero_dynamics.stability import (
     Stability,
     Verdict,
     judge,
-    linearized_eigenvalues,
 )
 from drake_dae.errors import InconsistentStateError
 
@@ -162,7 +161,7 @@ def judge_at_rest(
         parameters: Values of all parameters.
     """
     pinned, sizes = equilibria.pinned, equilibria.sizes
-    values, errors = linearized_eigenvalues(pinned, sizes, rest, goal, parameters)
+    values, errors, _ = equilibria.eigenvalues(goal, rest, parameters)
     place = f"at the equilibrium with {pinned.describe(goal)}"
     found = judge(values, errors, rest, place)
     if found.verdict is not Verdict.UNSTABLE:
