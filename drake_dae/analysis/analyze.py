@@ -138,6 +138,7 @@ def analyze(
         check_consistent(samples.manifold, given, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
     analysis = _examine(constrained, around, samples, where, search=states is None)
+    analysis = replace(analysis, region=chosen.region)
     if analysis.structure is None:
         return analysis
     dynamics = ZeroDynamics(system, structure=analysis.structure)

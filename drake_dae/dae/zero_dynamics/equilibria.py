@@ -144,7 +144,7 @@ class Equilibria:
         if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
             unrest = "it runs away from all states that are known"
         if converged and not unrest:
-            if isolation(pinned, state, start, reference, parameters):
+            if isolation(pinned, state, reference, parameters):
                 return state
             unrest = "the rates are small and do not vanish"
         raise InconsistentStateError(
@@ -188,7 +188,7 @@ class Equilibria:
         self, reference: FloatArray, rest: FloatArray, parameters: FloatArray
     ) -> tuple[ComplexArray, FloatArray, Isolation]:
         """The eigenvalues at an equilibrium, their errors, and how well it is known."""
-        known = isolation(self.pinned, rest, rest, reference, parameters)
+        known = isolation(self.pinned, rest, reference, parameters)
         known = known or Isolation(0, 0.0)
         found = linearized_eigenvalues(self.pinned, self.sizes, rest, reference, parameters)
         return found[0], known.errors(*found), known

@@ -29,6 +29,13 @@ GROWTH = 1e3
 RADII = tuple(0.5**k for k in range(30))
 """Radii at which that is looked for, relative to the scale of the states."""
 
+AFAR = 64.0
+"""Up to such a distance, or as far as the state is from zero, a rate that vanishes all along a
+direction still vanishes."""
+
+STRAIGHT = 0.1
+"""Which holds for states that the way back to Z(R) moves by less than this part of the distance."""
+
 
 @dataclass(frozen=True, eq=False)
 class Isolation:
@@ -54,7 +61,6 @@ class Isolation:
 def isolation(
     pinned: PinnedOutputs,
     state: FloatArray,
-    start: FloatArray,
     reference: FloatArray,
     parameters: FloatArray,
 ) -> Isolation | None:
@@ -63,7 +69,6 @@ def isolation(
     Args:
         pinned: Z(R).
         state: Where the search ends, shape (n,).
-        start: Where it begins, shape (n,).
         reference: R.
         parameters: Values of all parameters.
     """
@@ -75,7 +80,7 @@ def isolation(
         return Isolation(0, 0.0)
     radius = 0.0
     for i in weak:
-        found = rest.radius(i, start)
+        found = rest.radius(i)
         if found is None:
             return None
         radius = max(radius, found)
@@ -133,36 +138,43 @@ class _Rest:
         return True
 
     @np.errstate(all="ignore")
-    def radius(self, index: int, start: FloatArray) -> float | None:
+    def radius(self, index: int) -> float | None:
         """How far the equilibrium is in a direction in which it is not isolated.
 
-        Infinite where the rate vanishes all along, which a search does not run along; None where it
-        does not vanish at all.
+        Infinite where the rate vanishes all along, None where it vanishes nowhere. A function that
+        is analytic vanishes on a whole line if it does on a part of it; one that is only flat where
+        the state is, like exp(-x), is seen to grow farther away.
         """
-        seen = GROWTH * max(self._left[index], self._noise[index])
-        largest, found = 0.0, None
+        noise = max(self._noise[index], ROUNDED * self._usual(index))
+        seen = GROWTH * max(self._left[index], noise)
+        found = None
         for distance in RADII:
-            rates = [
-                self._left_at(self._pinned.project(self._beside(index, side), *self._at), index)
-                for side in (distance, -distance)
-            ]
-            if not max(rates) > seen:
+            # On both sides: what grows on one and falls on the other vanishes nowhere.
+            if not min(self._at_distance(index, distance)) > seen:
                 break
-            largest, found = max(largest, *rates), distance
-        if found is not None:
-            # What is at rest to round-off alone, where the function is flat, is at rest nowhere.
-            return found if largest > GROWTH * ROUNDED * self._usual(index) else None
-        ran = np.abs(self._v[index] @ ((self._state - start) / self._scale)[self._free])
-        flat = self._left[index] <= GROWTH * max(self._noise[index], ROUNDED * self._usual(index))
-        return np.inf if flat and ran <= 1.0 else None
+            found = distance
+        if found is not None or self._left[index] > GROWTH * noise:
+            return found
+        longest = max(AFAR, 2.0 * float(np.max(np.abs(self._state) / self._scale)))
+        distances = 2.0 ** np.arange(1, np.log2(longest) + 1)
+        far = (max(self._at_distance(index, float(distance))) for distance in distances)
+        return None if any(rate > seen for rate in far) else np.inf
 
-    def _left_at(self, projected: tuple[FloatArray, bool], index: int) -> float:
-        state, converged = projected
+    def _at_distance(self, index: int, distance: float) -> tuple[float, float]:
+        """How large the rate in a direction is on both sides along it; 0 where nothing is known."""
+        found = []
+        for side in (distance, -distance):
+            aside = self._beside(index, side)
+            state, converged = self._pinned.project(aside, *self._at)
+            moved = np.max(np.abs(state - aside) / self._scale)
+            is_near = converged and moved <= STRAIGHT * distance
+            found.append(self._left_at(state, index) if is_near else 0.0)
+        return found[0], found[1]
+
+    def _left_at(self, state: FloatArray, index: int) -> float:
         rate = self._rate(state)
-        known = converged and np.all(np.isfinite(rate))
-        return abs(float(self._u[:, index] @ rate)) if known else 0.0
+        return abs(float(self._u[:, index] @ rate)) if np.all(np.isfinite(rate)) else 0.0
 
     def _usual(self, index: int) -> float:
         """How large the rate in this direction is at the states of the structure."""
-        states = self._pinned.structure.states
-        return max(self._left_at((state, True), index) for state in states)
+        return max(self._left_at(state, index) for state in self._pinned.structure.states)
