@@ -21,7 +21,12 @@ HOUSE := $(PICTURES)/house.png
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo check test benchmark campaign unknowns friction peers house pictures clean lint
+# The oldest processor that OpenBLAS has code for, and NumPy without what it found in this one.
+# On other processors than x86 the first changes nothing.
+OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
+	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
+
+.PHONY: help demo check test processor benchmark campaign unknowns friction peers house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -29,6 +34,7 @@ help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
 	@echo 'make check       lint, types and the quick tests: the daily round, some two minutes'
 	@echo 'make test        lint, types and tests'
+	@echo 'make processor   quick tests of numbers, rounded as on another processor; some minutes'
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
@@ -52,6 +58,10 @@ check: lint
 
 test: lint
 	$(PYTEST) -m 'not thorough'
+
+processor: $(VENV)/installed-dev
+	$(OLD) $(PYTEST) -m 'not slow and not thorough' $(addprefix tests/, \
+		analysis dae literature robots systems trace test_symbolic.py)
 
 benchmark: $(VENV)/installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -q

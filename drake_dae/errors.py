@@ -126,6 +126,10 @@ class NonMinimumPhaseWarning(UserWarning):
     """A law for a system with unstable zero dynamics: outputs follow, but states run off."""
 
 
+class AdviceWarning(UserWarning):
+    """Gains that are advised outside of the range in which they are right."""
+
+
 class MachineCodeWarning(UserWarning):
     """Functions that run interpreted where machine code was asked for, or would have paid."""
 

@@ -1,6 +1,8 @@
 """What tests of all folders ask for by name; what they call stands in the modules beside."""
 
 import os
+import signal
+from collections.abc import Iterator
 
 import pytest
 from problems import PROBLEMS, Problem
@@ -13,6 +15,33 @@ def problem(request: pytest.FixtureRequest) -> Problem:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def empty_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """No test depends on the code that this user's cache has, nor leaves any there."""
+def same_surroundings(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """No test depends on who runs it, in which window, nor on the code that this user's cache has.
+
+    What these processes start inherits the same.
+    """
     os.environ["DRAKE_DAE_CACHE"] = str(tmp_path_factory.mktemp("cache") / "drake_dae")
+    # How wide a terminal is and whether it has colours, and what a user sets for all of Python.
+    for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "PYTHON_COLORS"):
+        os.environ.pop(name, None)
+    for name in ("PYTHONIOENCODING", "PYTHONOPTIMIZE", "PYTHONWARNINGS", "MPLBACKEND"):
+        os.environ.pop(name, None)
+    os.umask(0o022)
+
+
+@pytest.fixture
+def signals_of_a_shell() -> Iterator[None]:
+    """Signals as a command in a terminal has them.
+
+    A process under nohup ignores SIGHUP, one in the background of a script ignores SIGINT, and what
+    they start inherits that.
+    """
+    handlers = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler or signal.SIG_DFL)

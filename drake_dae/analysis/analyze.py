@@ -138,6 +138,7 @@ def analyze(
         check_consistent(samples.manifold, given, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
     analysis = _examine(constrained, around, samples, where, search=states is None)
+    analysis = replace(analysis, region=chosen.region)
     if analysis.structure is None:
         return analysis
     dynamics = ZeroDynamics(system, structure=analysis.structure)
@@ -231,7 +232,7 @@ def _examine(
             satisfied |= {4, 5}
             margin = find_margin(samples, matrix, structure.round_off, search)
             structure = replace(structure, control_margin=margin)
-            judge(margin, control_violation(system, structure.output_degrees, margin), 5)
+            judge(margin, control_violation(structure), 5)
             known |= {
                 "output_degrees": structure.output_degrees,
                 "independence": _independence(structure, samples),

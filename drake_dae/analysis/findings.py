@@ -7,6 +7,7 @@ from drake_dae.analysis.tables import named_values
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.states.contact_margin import ContactMargin
 from drake_dae.dae.states.margins import Margin
+from drake_dae.dae.states.region import Region
 from drake_dae.dae.structure.assumptions import Violation
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.structure.structure import Structure
@@ -67,6 +68,7 @@ class Findings:
     Attributes:
         system: The system.
         where: Which states were examined, in words.
+        region: The region that was asked for; None if none was.
         states: The states, consistent where the constraints have degrees, shape (samples, n).
         assumptions: Assumptions (1), ..., (5), in this order.
         constraint_degrees: r_1, ..., r_m.
@@ -102,6 +104,7 @@ class Findings:
     contact_margin_along: ContactMargin | None = None
     constraint_structure: ConstraintStructure | None = None
     structure: Structure | None = None
+    region: Region | None = None
 
     @property
     def output_order(self) -> tuple[int, ...] | None:
@@ -150,6 +153,27 @@ class Findings:
         return along
 
     @property
+    def unstable_inside(self) -> tuple[Stability, ...]:
+        """Unstable equilibria inside the region that was asked for, beside what is decisive."""
+        if self.region is None:
+            return ()
+        return tuple(
+            one
+            for one in self.equilibria
+            if one.verdict is Verdict.UNSTABLE
+            and one is not self.decisive
+            and one.state is not None
+            and self.region.holds(one.state)
+        )
+
+    @property
+    def zero_dynamics_finding(self) -> Finding:
+        """What is found of Assumption 2.2: what is decisive, or violated in the region."""
+        if self.unstable_inside:
+            return Finding.VIOLATED
+        return Finding.NOT_EXAMINED if self.decisive is None else OF_VERDICT[self.decisive.verdict]
+
+    @property
     def problems(self) -> tuple[str, ...]:
         """What is violated, one text each; empty if nothing is."""
         found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
@@ -176,6 +200,10 @@ class Findings:
         if decisive is not None and decisive.verdict is Verdict.UNSTABLE:
             place = "along the reference " if decisive is self.zero_dynamics_along else ""
             found.append(f"Assumption 2.2: {place}{decisive.reason}")
+        for one in self.unstable_inside:
+            if one.state is not None:
+                place = named_values(self.system.state_signals, one.state)
+                found.append(f"Assumption 2.2: inside the region, at rest at {place}: {one.reason}")
         if self.motion is not None and self.motion.ending is not None:
             found.append(str(self.motion.ending))
         return tuple(found)

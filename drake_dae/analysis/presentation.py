@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.analysis.contact_text import contact_margin_as_dict, contact_margin_in_words
-from drake_dae.analysis.findings import OF_VERDICT, Finding, Findings
+from drake_dae.analysis.findings import Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.states.margins import SINGULAR, Margin
 from drake_dae.dae.structure.structure import why_no_law
@@ -166,12 +166,10 @@ def _findings(findings: Findings) -> Table:
         ]
         for a in findings.assumptions
     ]
-    chains, zero = Finding.NOT_EXAMINED, Finding.NOT_EXAMINED
+    chains, zero = Finding.NOT_EXAMINED, findings.zero_dynamics_finding
     if findings.output_degrees is not None:
         singular = findings.independence is not None and findings.independence.is_singular
         chains = Finding.FAILS if singular else Finding.SATISFIED
-    if findings.decisive is not None:
-        zero = OF_VERDICT[findings.decisive.verdict]
     none = ": there are none" if findings.zero_dynamics_dimension == 0 else ""
     rows += [
         [

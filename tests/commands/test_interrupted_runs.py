@@ -38,9 +38,10 @@ def command(folder, extra):
     output = os.open(folder.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT)
     for descriptor in (1, 2):
         os.dup2(output, descriptor)
-    # As from a shell, whatever the tests were started by.
+    # The server that forks this process may have been started before a test set its signals.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     settings = [word for setting in SETTINGS + extra for word in ("--set", setting)]
     sys.exit(main(["simulate", "two_link_wall", "--out", str(folder), *settings]))
 
@@ -108,6 +109,7 @@ def check(sent, code, folder, undisturbed, complete=FILES):
     return count
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 @pytest.mark.filterwarnings("always")
 def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
@@ -127,6 +129,7 @@ def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
     assert sorted(path.name for path in folder.iterdir()) == sorted(WITHOUT_PICTURES)
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 @pytest.mark.thorough
 def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
@@ -136,6 +139,7 @@ def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
     assert len(set(counts)) > 3
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys):
     """Ctrl-C after some steps of the integrator: the record goes up to there."""
     accept = Course.accept

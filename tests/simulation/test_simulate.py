@@ -153,6 +153,7 @@ def test_after_each_step():
 # Interruption, by a real signal.
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.parametrize("number", ENDING_SIGNALS)
 def test_a_signal_ends_the_run_after_its_step(number):
     before = signal.getsignal(number)
@@ -188,6 +189,7 @@ def test_under_nohup_a_terminal_that_is_closed_ends_nothing():
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.parametrize("second", ENDING_SIGNALS)
 def test_a_second_signal_is_an_exception_and_the_log_is_kept(second):
     before = signal.getsignal(signal.SIGINT)

@@ -136,6 +136,7 @@ def test_killed_in_the_middle_it_continues_there_to_the_same_table(
     np.testing.assert_array_equal(errors, study.values("largest error of tool.z [m]"))
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_has_ended(tmp_path):
     folder = tmp_path / "study"
@@ -151,6 +152,7 @@ def test_ctrl_c_keeps_what_has_ended(tmp_path):
     assert 3 <= lines(folder / "runs.jsonl") < COUNT
 
 
+@pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     """As Drake's C++ may end one: it is killed in a run that lasts, against the clock, 20 s."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number
-from drake_dae.dae.tracking.constraint_damping import contact_damping
+from drake_dae.dae.tracking.constraint_damping import best_damping, unstable_from, warn_of
 from drake_dae.errors import ModelError
 
 _PHASE = 0.15
@@ -91,10 +91,17 @@ def contact_gains(
         delay: How many samples a control is late.
         velocity_noise: The deviation of measured velocities in rad/s; 0 for none.
 
+    The advice is right, and nothing is said, where the contact comes to rest with the damping and
+    the integral also if it is softer, or stiffer by a factor of two: with one sample of delay up to
+    w T = 0.6 at least, for the w = sqrt(A k) of the contact, see `contact_damping`.
+
+    Warns:
+        AdviceWarning: The contact is outside of the range in which the advice is right.
+
     Raises:
         ModelError: A number is not positive, or is negative.
     """
-    best = contact_damping(stiffness, mobility, sample_time, delay)
+    best = best_damping(stiffness, mobility, sample_time, delay)
     if not sample_time > 0.0:
         raise ModelError(f"sample_time must be positive, got {sample_time:g}")
     if not velocity_noise >= 0.0:
@@ -106,4 +113,8 @@ def contact_gains(
     damping = min(2.3 * rate, best)
     # Where samples cannot damp, the contact itself must: then the force is changed slowly.
     force_gain = 0.4 * (damping or rate / 2.0)
+    frequency = (stiffness * mobility) ** 0.5
+    lost = unstable_from(frequency, sample_time, delay, damping, force_gain)
+    advice = f"a damping of {damping:.4g} 1/s with an integral of {force_gain:.4g} 1/s"
+    warn_of(lost, stiffness, frequency * sample_time, advice)
     return ContactGains(1.5 * rate, force_gain, damping, 2.0 * rate, rate, rate / 2.0)

@@ -116,10 +116,12 @@ class Samples:
         return all(are_dependent(gradient * self.scale) for (gradient,) in gradients)
 
 
-def fields_at(system: DaeSystem, state: FloatArray) -> dict[str, FloatArray]:
-    """f, g, h, l and m of (1)-(3), with E = 1 and the default parameters, as matrices."""
+def fields_at(
+    system: DaeSystem, state: FloatArray, parameters: FloatArray | None = None
+) -> dict[str, FloatArray]:
+    """f, g, h, l and m of (1)-(3), with E = 1, as matrices; with the default parameters if None."""
     function = system.fields
-    values = function(state, system.parameter_values)
+    values = function(state, system.parameter_vector(parameters))
     return dict(zip(function.output_names, map(as_matrix, values), strict=True))
 
 

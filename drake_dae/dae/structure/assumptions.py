@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.states.family import Deciding
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.dependence import Combination
 from drake_dae.dae.system.signals import Signal
@@ -48,6 +49,12 @@ class Cause(Enum):
         "constraint, less the combination of others that its row follows from, has a higher "
         "relative degree. Write this difference in place of the constraint: N* stays the same"
     )
+    NUMBERS = (
+        "The structure must be the same for all numbers that the system may have. Give such a "
+        "parameter or signal another default, or say between which values it stays, by "
+        "`DaeSystem.with_bounds`; bounds of one value hold it at its default"
+    )
+    BOUNDS = "Give narrower bounds, which hold no such value"
     CONTROL_RANK = (
         "An output may repeat a constraint or another output; choose other outputs, keep away from "
         "this state, or see whether `dynamic_extension` finds integrators that help"
@@ -68,6 +75,7 @@ class Violation:
         singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
             if the rank is lost.
         combinations: The constraints that follow from others there, if the rank of A(x) is lost.
+        deciding: The parameters and signals that decide, where it is so at their defaults alone.
     """
 
     assumption: int
@@ -77,9 +85,18 @@ class Violation:
     state: FloatArray | None = None
     singular_value: float | None = None
     combinations: tuple[Combination, ...] = ()
+    deciding: Deciding | None = None
 
     def __str__(self) -> str:
-        return f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
+        text = f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
+        if self.deciding is None or self.cause in (Cause.NUMBERS, Cause.BOUNDS):
+            return text
+        acts = {
+            Cause.NO_FORCE: "a constraint input acts",
+            Cause.NO_CONTROL: "the control acts",
+        }
+        regular = f"{'A' if self.assumption <= 3 else 'B'}(x) is regular"
+        return f"{text}. This hangs on numbers: {acts.get(self.cause, regular)} {self.deciding}"
 
     def error(self) -> AssumptionError:
         """The exception to raise where the violation ends what was asked for."""
@@ -137,6 +154,21 @@ class Violation:
                 if value:
                     found.insert(0, f"smallest singular value {value} (rows and columns scaled)")
                 return f"A(x) loses rank{where}: {'; '.join(found)}"
+            case Cause.NUMBERS:
+                kind = "output" if self.assumption == 4 else "constraint"
+                inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
+                return (
+                    f"the relative degree of {kind} {names} hangs on numbers: the {inputs} on its "
+                    f"derivative {self.order} {self.deciding}"
+                )
+            case Cause.BOUNDS:
+                assert self.deciding is not None
+                matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
+                (number,), (bound,) = self.deciding.names, self.deciding.values
+                return (
+                    f"{matrix} loses rank within the bounds of '{number}', between its default "
+                    f"{self.deciding.defaults[0]:.6g} and {bound:.6g}"
+                )
             case Cause.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "

@@ -11,7 +11,8 @@ from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.margins import Margin, find_margin
+from drake_dae.dae.states.family import Family
+from drake_dae.dae.states.margins import SINGULAR, Margin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
@@ -21,6 +22,7 @@ from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminat
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
 
 @checked(ModelError)
@@ -237,7 +239,11 @@ def constraint_violation(found: ConstraintStructure) -> Violation | None:
     causes = ((1, Cause.CONSTRAINT_DEGREE), (2, Cause.CONSTRAINT_RANK))
     signals, margin = found.system.constraint_output_signals, found.constraint_margin
     violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
-    if violation is None or margin is None:
+    if margin is None:
+        return None
+    matrix = found.system.rubbing.without_friction(found.elimination.constraint_matrix)
+    violation = with_numbers(violation, 2, found.manifold, found.states, matrix)
+    if violation is None or violation.cause is Cause.BOUNDS:
         return violation
     if violation.cause is not Cause.CONSTRAINT_RANK:
         return _as_redundant(found.system, violation)
@@ -249,6 +255,53 @@ def constraint_violation(found: ConstraintStructure) -> Violation | None:
         cause = Cause.HIDDEN_DEGREE
     found_cause = replace(violation, cause=cause, combinations=dependence.combinations)
     return _as_redundant(found.system, found_cause)
+
+
+def with_numbers(
+    violation: Violation | None,
+    assumption: int,
+    manifold: Manifold,
+    states: FloatArray,
+    matrix: ca.SX,
+) -> Violation | None:
+    """What a matrix violates, once it is looked at with other parameters than the default ones.
+
+    Args:
+        violation: What its rank violates with these; None if nothing.
+        assumption: The number of the assumption that it is regular.
+        manifold: N*.
+        states: Consistent states, shape (samples, n).
+        matrix: The matrix.
+
+    Returns:
+        The violation with the numbers that decide, where it is regular with others; or that it is
+        singular within bounds that somebody gave.
+    """
+    system = manifold.system
+    bounded = any(p.bounds is not None for p in system.parameters)
+    if violation is None and not (bounded and matrix.is_square()):
+        return None
+    function = system.trace("rank", {"matrix": ca.densify(matrix)}, often=False)
+
+    @np.errstate(all="ignore")  # Not finite is not regular.
+    def determinant(state: FloatArray, parameters: FloatArray) -> float:
+        """1 or -1 as its sign, and 0 where the matrix is singular."""
+        value = function(state, parameters)[0].reshape(matrix.shape)
+        if not np.all(np.isfinite(value)):
+            return 0.0
+        rows, columns = equilibration(value)
+        scaled = value / rows[:, None] / columns
+        if smallest_singular_value(scaled) <= SINGULAR:
+            return 0.0
+        return float(np.linalg.slogdet(scaled)[0]) if matrix.is_square() else 1.0
+
+    family = Family(manifold, states)
+    if violation is None:
+        lost = family.lost(determinant)
+        return Violation(assumption, Cause.BOUNDS, (), deciding=lost) if lost else None
+    if any(determinant(state, system.parameter_values) for state in states):
+        return violation
+    return replace(violation, deciding=family.deciding(lambda x, p: determinant(x, p) != 0.0))
 
 
 def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
@@ -263,7 +316,16 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     if not combinations or not all(combination.others for combination in combinations):
         return violation
     names = tuple(signal.name for signal in system.constraint_output_signals)
-    return Violation(2, Cause.REDUNDANT, names, combinations=combinations)
+    return replace(
+        violation,
+        assumption=2,
+        cause=Cause.REDUNDANT,
+        names=names,
+        combinations=combinations,
+        order=None,
+        state=None,
+        singular_value=None,
+    )
 
 
 def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:

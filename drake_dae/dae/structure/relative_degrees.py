@@ -1,9 +1,13 @@
 """Relative degrees by Assumptions (1), (3) and (4), and the chains that they end.
 
 Whether an input acts on a derivative is decided by the structure of the expression first, then by
-its numbers at consistent states.
+its numbers at consistent states, with the default parameters and signals at rest; what is zero
+there must be zero with all other numbers.
 """
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -13,14 +17,19 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.states.family import VISIBLE, Deciding, Family
 from drake_dae.dae.states.region import Region
-from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.dae.structure.dependence import redundant_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
+from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
-from drake_dae.trace.round_off import Sized
+from drake_dae.trace.round_off import Sized, multiply
+
+_Row = Callable[[FloatArray, FloatArray], Sized]
+"""A row of numbers at a state, with values of all parameters."""
 
 MANY = 10
 """A function that is zero at this many random states is zero."""
@@ -48,7 +57,7 @@ def constraint_chains(
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]
-    undecided = list(range(system.num_constraints))
+    undecided, elsewhere = list(range(system.num_constraints)), _Elsewhere()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
@@ -57,10 +66,11 @@ def constraint_chains(
         force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
         control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
         reached = _reached(explicit.g, f, last, x)
-        still, stuck = [], []
+        numbers, still, stuck = _Rows(samples), [], []
         for row, i in enumerate(undecided):
             order = len(chains[i])
             if force_acts[row].all():
+                elsewhere.refuse(i)
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
@@ -68,6 +78,11 @@ def constraint_chains(
             if control_acts[row].any():
                 state = samples.states[int(np.argmax(control_acts[row]))]
                 raise Violation(3, Cause.EARLY_CONTROL, (names[i],), order, state).error()
+            for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
+                if rows[row, :].nnz():
+                    violation = Violation(assumption, Cause.NUMBERS, (names[i],), order)
+                    along = numbers.along(chains[i][-1], key)
+                    elsewhere.look(i, violation, numbers.family, along)
             still.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
@@ -80,7 +95,9 @@ def constraint_chains(
         if stuck:
             dependent = redundant_constraints(samples)
             those = tuple(names[i] for i in stuck)
-            raise Violation(2, Cause.NO_FORCE, those, combinations=dependent).error()
+            deciding = elsewhere.deciding(stuck)
+            violation = Violation(2, Cause.NO_FORCE, those, combinations=dependent)
+            raise replace(violation, deciding=deciding).error()
         for i in still:
             following = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
@@ -125,12 +142,14 @@ def output_chains(
     round_off, need_force = np.zeros((count, controls), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
+    elsewhere, numbers = _Elsewhere(), _Rows(samples, elimination)
     following, rows = elimination.l_star, elimination.n_star
     undecided = list(range(count))
     while True:
         acts, still = _acts(slopes), []
         for row, i in enumerate(undecided):
             if acts[row].all():
+                elsewhere.refuse(i)
                 drift[i] = following[row]
                 control_matrix[i, :] = rows[row, :]
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
@@ -140,6 +159,9 @@ def output_chains(
                 order = len(chains[i])
                 raise Violation(4, Cause.OUTPUT_DEGREE, (names[i],), order, state).error()
             else:
+                if not chains[i] and rows[row, :].nnz():
+                    violation = Violation(4, Cause.NUMBERS, (names[i],), 0)
+                    elsewhere.look(i, violation, numbers.family, numbers.feedthrough(i))
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -155,6 +177,9 @@ def output_chains(
         for row, i in enumerate(still):
             if acts[row].any():
                 continue
+            if rows[row, :].nnz():
+                violation = Violation(4, Cause.NUMBERS, (names[i],), len(chains[i]))
+                elsewhere.look(i, violation, numbers.family, numbers.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree; worth
             # a look where nothing acts although the structure says that it could.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -163,9 +188,10 @@ def output_chains(
                 or not reached[row]
                 or (rows[row, :].nnz() and samples.dependent(used))
             ):
-                stuck.append(names[i])
+                stuck.append(i)
         if stuck:
-            raise Violation(5, Cause.NO_CONTROL, tuple(stuck)).error()
+            those, deciding = tuple(names[i] for i in stuck), elsewhere.deciding(stuck)
+            raise Violation(5, Cause.NO_CONTROL, those, deciding=deciding).error()
         undecided = still
     return OutputChains(
         chains=tuple(tuple(chain) for chain in chains),
@@ -187,6 +213,106 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
         for fields, (gradient, matrix) in zip(samples.fields, factors, strict=True)
     ]
     return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
+
+
+class _Elsewhere:
+    """What is zero with the default parameters and not with other ones, by constraint or output."""
+
+    def __init__(self) -> None:
+        self._found: dict[int, Violation] = {}
+
+    def look(self, index: int, violation: Violation, family: Family, row: _Row) -> None:
+        """Looks whether a row that is zero with the default parameters is zero with others, too.
+
+        Args:
+            index: Which constraint or output the row belongs to; the first that is not zero counts.
+            violation: What it is if it is not.
+            family: Other parameters, and states that are consistent with them.
+            row: The row at a state, with values of all parameters.
+        """
+        if index in self._found:
+            return
+
+        @np.errstate(all="ignore")  # Not finite is no answer.
+        def acts(state: FloatArray, parameters: FloatArray) -> bool:
+            value, size = row(state, parameters)
+            return bool(np.any(np.abs(value) > VISIBLE * size))
+
+        deciding = family.deciding(acts)
+        if deciding:
+            self._found[index] = replace(violation, deciding=deciding)
+
+    def refuse(self, index: int) -> None:
+        """Refuses a constraint or output whose degree is another one with other parameters.
+
+        Raises:
+            AssumptionError: It is; with the numbers that decide.
+        """
+        if index in self._found:
+            raise self._found[index].error()
+
+    def deciding(self, indices: Sequence[int]) -> Deciding | None:
+        """The numbers that decide about some on which nothing acts with the default ones."""
+        found = (self._found[i].deciding for i in indices if i in self._found)
+        return next(found, None)
+
+
+class _Rows:
+    """How inputs act, at a state with values of all parameters.
+
+    Args:
+        samples: States with the default parameters, near which others are looked at.
+        elimination: Equations (9)-(14), for what the control does through the constraint inputs.
+    """
+
+    def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
+        self.family = Family(samples.manifold, samples.states)
+        self._system, self._scale = samples.system, samples.scale
+        self._elimination = elimination
+
+    def along(self, function: ca.SX, key: str) -> _Row:
+        """The derivative of a function along g, h or h*."""
+        system = self._system
+        gradient = ca.jacobian(function, system.state)
+        trace = system.trace("sample", {"gradient": gradient}, often=False)
+
+        def row(state: FloatArray, parameters: FloatArray) -> Sized:
+            if key == "h*":
+                field, _ = self._eliminated(state, parameters)
+            else:
+                value = fields_at(system, state, parameters)[key]
+                field = value, np.abs(value)
+            return multiply(trace(state, parameters)[0].reshape(1, -1), field, self._scale)
+
+        return row
+
+    def feedthrough(self, index: int) -> _Row:
+        """A row of n*."""
+
+        def row(state: FloatArray, parameters: FloatArray) -> Sized:
+            value, size = self._eliminated(state, parameters)[1]
+            return value[index], size[index]
+
+        return row
+
+    def _eliminated(self, state: FloatArray, parameters: FloatArray) -> tuple[Sized, Sized]:
+        """h* and n*."""
+        fields = fields_at(self._system, state, parameters)
+        gradient, matrix = map(as_matrix, self._factors(state, parameters))
+        try:
+            return eliminate_numbers(fields, gradient, matrix, self._scale)
+        except np.linalg.LinAlgError:
+            h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
+            return (h_star, h_star), (n_star * np.nan, n_star)
+
+    @cached_property
+    def _factors(self) -> TracedFunction:
+        assert self._elimination is not None
+        factors = {
+            "gradient": self._elimination.constraint_gradient,
+            "matrix": self._elimination.constraint_matrix,
+        }
+        return self._system.trace("sample", factors, often=False)
 
 
 def _acts(numbers: FloatArray) -> Booleans:

@@ -1,6 +1,5 @@
 """What kind of system it is: relative degrees, index, Assumptions (1)-(5) with their margins."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import casadi as ca
@@ -18,6 +17,7 @@ from drake_dae.dae.structure.constrained import (
     constraint_violation,
     examine_constraints,
     guesses,
+    with_numbers,
 )
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import Layout
@@ -214,8 +214,7 @@ def examine_structure(
     if violation:
         raise violation.error()
     structure = examine_outputs(constrained, samples)
-    degrees, margin = structure.output_degrees, structure.control_margin
-    return structure, control_violation(system, degrees, margin)
+    return structure, control_violation(structure)
 
 
 def why_no_law(system: DaeSystem) -> str:
@@ -298,9 +297,10 @@ def _check_metric(samples: Samples) -> None:
         )
 
 
-def control_violation(
-    system: DaeSystem, degrees: Sequence[int], margin: Margin
-) -> Violation | None:
+def control_violation(structure: Structure) -> Violation | None:
     """How a singular B(x) violates Assumption (4) or (5); None if it is regular."""
     causes = ((4, Cause.OUTPUT_DEGREE), (5, Cause.CONTROL_RANK))
-    return rank_violation(margin, system.output_signals, degrees, *causes)
+    margin, degrees = structure.control_margin, structure.output_degrees
+    violation = rank_violation(margin, structure.system.output_signals, degrees, *causes)
+    matrix = structure.control_matrix
+    return with_numbers(violation, 5, structure.manifold, structure.states, matrix)

@@ -117,8 +117,9 @@ class Contacts:
     def reserve(self, matrix: ca.SX) -> ca.SX:
         """The smallest principal minor of A(x), each divided by what it is without friction.
 
-        Minors are those of sets of contacts with all other constraints, of which none can open. It
-        is 1 without friction, positive exactly where all minors are, and does not depend on units.
+        Minors are those of sets of contacts with all other constraints, of which none can open. The
+        least ratio is the same in any order of the contacts and in any units, 1 without friction,
+        and positive exactly where all minors are.
 
         Args:
             matrix: A(x), shape (m, m).
@@ -131,8 +132,8 @@ class Contacts:
         both = [matrix, self.without_friction(matrix)]
         for i in kept:  # Positive without friction, of which these constraints have none.
             both = [_eliminated(part, i) for part in both]
-        for pivot, without in zip(*(_pivots(part, self.rows) for part in both), strict=True):
-            smallest = ca.fmin(smallest, pivot / without)
+        for minor, without in zip(*(_minors(part, self.rows) for part in both), strict=True):
+            smallest = ca.fmin(smallest, minor / without)
         return smallest
 
 
@@ -141,18 +142,24 @@ def _eliminated(matrix: ca.SX, i: int) -> ca.SX:
     return matrix - ca.mtimes(matrix[:, i], matrix[i, :]) / matrix[i, i]
 
 
-def _pivots(matrix: ca.SX, rows: Sequence[int]) -> Iterator[ca.SX]:
-    """Ratios of principal minors, positive exactly where all principal minors of some rows are.
+def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> Iterator[ca.SX]:
+    """All principal minors of some rows, one for each set of them.
 
-    A is a P-matrix if a_11 > 0 and both A without its first row and column and the Schur complement
-    of a_11 are (Tsatsomeros and Li, 2000).
+    A minor with the first row is a_11 times that of the Schur complement of a_11 without it; one
+    without the first row is that of A without it.
+
+    Args:
+        matrix: A, shape (m, m).
+        rows: The rows.
+        before: What minors are multiplied by: the pivots of rows that are eliminated.
     """
     if rows:
         first, *others = rows
-        yield matrix[first, first]
-        yield from _pivots(matrix, others)
+        with_first = before * matrix[first, first]
+        yield with_first
+        yield from _minors(matrix, others, before)
         if others:
-            yield from _pivots(_eliminated(matrix, first), others)
+            yield from _minors(_eliminated(matrix, first), others, with_first)
 
 
 def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:

@@ -6,9 +6,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, brief, numbers
 from drake_dae.errors import ModelError
 
 
@@ -54,10 +55,14 @@ class Parameter:
         symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
             not given.
         exogenous: Whether it moves.
+        bounds: Between which values it stays, (low, high), each a number or of shape (k,): only
+            there relative degrees have to be the same. If None, they are those of half and twice
+            the default, and -1 and 1 where that is 0. Bounds of one value hold it there, and as a
+            signal it stands still.
         derivatives: The symbols of w', w'', ..., each of shape (k, 1), if it moves.
 
     Raises:
-        ModelError: The value is not finite, or the symbol does not fit it.
+        ModelError: The value is not finite or out of its bounds, or the symbol does not fit it.
     """
 
     name: str
@@ -67,6 +72,7 @@ class Parameter:
     symbol: ca.SX = field(default=None)
     exogenous: bool = False
     nonnegative: bool = False
+    bounds: tuple[ArrayLike, ArrayLike] | None = None
     derivatives: tuple[ca.SX, ...] = field(init=False, default=(), repr=False)
 
     def __post_init__(self) -> None:
@@ -77,6 +83,7 @@ class Parameter:
             )
         value.setflags(write=False)
         object.__setattr__(self, "value", value)
+        self._check_bounds()
         self.check(value)
         if self.symbol is None:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
@@ -89,6 +96,33 @@ class Parameter:
         orders = range(1, DERIVATIVES + 1) if self.exogenous else ()
         rates = tuple(ca.SX.sym(self.name + "'" * order, value.size) for order in orders)
         object.__setattr__(self, "derivatives", rates)
+
+    def _check_bounds(self) -> None:
+        if self.bounds is None:
+            return
+        what = f"parameter '{self.name}': bounds"
+        low, high = (np.atleast_1d(numbers(what, bound)) for bound in self.bounds)
+        fits = all(bound.shape in ((1,), self.value.shape) for bound in (low, high))
+        if not fits or not np.all(low <= high):
+            raise ModelError(
+                f"{what} must be a lowest and a highest value, each a number or of shape "
+                f"({self.value.size},), got {self.bounds!r}"
+            )
+
+    @property
+    def low(self) -> FloatArray:
+        """The lowest values that are looked at, shape (k,)."""
+        if self.bounds is not None:
+            return np.broadcast_to(np.asarray(self.bounds[0], dtype=float), self.value.shape)
+        least = -1.0 if not (self.positive or self.nonnegative) else 0.0
+        return np.where(self.value == 0.0, least, np.minimum(0.5 * self.value, 2.0 * self.value))
+
+    @property
+    def high(self) -> FloatArray:
+        """The highest values that are looked at, shape (k,)."""
+        if self.bounds is not None:
+            return np.broadcast_to(np.asarray(self.bounds[1], dtype=float), self.value.shape)
+        return np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -114,6 +148,11 @@ class Parameter:
             raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
         if self.nonnegative and not np.all(value >= 0.0):
             raise ModelError(f"parameter '{self.name}' must not be negative, got {value}")
+        if self.bounds is not None and not np.all((self.low <= value) & (value <= self.high)):
+            raise ModelError(
+                f"parameter '{self.name}' must stay in its bounds, from {brief(self.bounds[0])} to "
+                f"{brief(self.bounds[1])}, got {value}"
+            )
 
 
 def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
@@ -126,6 +165,18 @@ def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Para
     return tuple(
         replace(p, exogenous=True) if p.name in names and not p.exogenous else p for p in parameters
     )
+
+
+def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parameter:
+    """The same parameter, with the same symbols, within bounds.
+
+    Raises:
+        ModelError: They are no bounds, or its value is out of them.
+    """
+    made = replace(parameter, bounds=bounds)
+    # Expressions hold the symbols of the derivatives already.
+    object.__setattr__(made, "derivatives", parameter.derivatives)
+    return made
 
 
 def is_symbol(value: Any) -> bool:

@@ -19,7 +19,7 @@ from drake_dae.dae.system.exogenous import Exogenous
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
 from drake_dae.dae.system.scale import natural_scale, spread_about
 from drake_dae.dae.system.sharing import Sharing
-from drake_dae.dae.system.signals import Parameter, Signal, moving
+from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -140,6 +140,7 @@ class DaeSystem:
         m: Callable[..., Any] | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
         exogenous: Sequence[str] = (),
+        bounds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
         **labels: Any,
     ) -> "DaeSystem":
         """Builds a system from Python functions of the state.
@@ -155,6 +156,7 @@ class DaeSystem:
                 without controls h; without controlled outputs l and m.
             parameters: Name -> default; a name must be a Python identifier.
             exogenous: The names of those parameters that move, as signals w(t).
+            bounds: Name of a parameter -> (low, high), between which it stays; see `with_bounds`.
             labels: The remaining fields of the class.
 
         Raises:
@@ -163,7 +165,8 @@ class DaeSystem:
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
         names = [item.name for item in fields(cls)]
         system = cls(**called_functions(state, functions, parameters or {}, labels, names))
-        return system.with_exogenous(exogenous) if exogenous else system
+        system = system.with_exogenous(exogenous) if exogenous else system
+        return system.with_bounds(bounds) if bounds else system
 
     @cached_property
     def explicit(self) -> "DaeSystem":
@@ -260,6 +263,45 @@ class DaeSystem:
         for name in names:
             self.parameter_slice(name)
         return replace(self, parameters=moving(self.parameters, names))
+
+    @checked(ModelError)
+    def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
+        """The same system, some of whose parameters stay between bounds.
+
+        Relative degrees belong to all numbers that a system may have: an input acts on a derivative
+        everywhere or nowhere. Where this holds only for some of them, bounds say which are meant.
+
+        Args:
+            bounds: Name -> (low, high), each a number or one for each entry; the default lies
+                between them. Where both are the same, the parameter stays there, and as an
+                exogenous signal it stands still.
+
+        Raises:
+            ModelError: No parameter has that name, or bounds make no sense.
+        """
+        for name in bounds:
+            self.parameter_slice(name)
+        return replace(
+            self,
+            parameters=tuple(
+                bounded(p, bounds[p.name]) if p.name in bounds else p for p in self.parameters
+            ),
+        )
+
+    @property
+    def parameter_box(self) -> tuple[FloatArray, FloatArray]:
+        """The lowest and highest values of `parameter_symbol` at which degrees are looked at.
+
+        Derivatives of signals are as large as the signals, or 1, in one second.
+        """
+        low, high = (
+            [np.zeros(0), *[getattr(p, k) for p in self.parameters]] for k in ("low", "high")
+        )
+        for p in self.exogenous.moving:
+            size = np.where(p.low < p.high, np.where(p.value == 0.0, 1.0, np.abs(p.value)), 0.0)
+            low += [-size] * len(p.derivatives)
+            high += [size] * len(p.derivatives)
+        return np.concatenate(low), np.concatenate(high)
 
     @cached_property
     def scale(self) -> FloatArray:

@@ -1,5 +1,6 @@
 """Damping of the constraint by the law, for contacts that give way."""
 
+import warnings
 from dataclasses import replace
 
 import casadi as ca
@@ -13,11 +14,17 @@ from drake_dae.dae.elimination import eliminate
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
-from drake_dae.errors import GainError, ModelError
+from drake_dae.errors import AdviceWarning, GainError, ModelError
 from drake_dae.trace.given import result_of
 
 STEPS = 200
 """Into how many steps an interval is divided in which the best damping is sought, twice."""
+
+STIFFER = 2.0
+"""By this factor a contact may be stiffer than was said, or softer by any, for what is advised."""
+
+STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIFFER, 31)[1:]])
+"""The stiffnesses that are looked at, relative to what was said."""
 
 
 def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structure:
@@ -114,6 +121,11 @@ def contact_damping(
     about 1, what is held is late by a quarter of a swing: it damps no more, and c is 0. Then the
     contact's own damping, or a shorter sample time, must help.
 
+    The advice is right, and nothing is said, where the contact comes to rest with it also if it is
+    softer, or stiffer by a factor of two: with one sample of delay up to w T = 0.6, with none up to
+    1.3, with two up to 0.36, with three up to 0.24. Beyond, this warns: a contact that is stiffer
+    by a tenth may diverge there, and above w T = pi samples do not show how it swings.
+
     Args:
         stiffness: k in N/m, positive.
         mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive: see
@@ -124,9 +136,22 @@ def contact_damping(
     Returns:
         c in 1/s, from 0 to 2 sqrt(A k).
 
+    Warns:
+        AdviceWarning: The contact is outside of the range in which the advice is right.
+
     Raises:
         ModelError: A number is not positive, or is negative.
     """
+    found = best_damping(stiffness, mobility, sample_time, delay)
+    if sample_time:
+        frequency = float(np.sqrt(mobility * stiffness))
+        lost = unstable_from(frequency, sample_time, delay, found)
+        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {found:.4g} 1/s")
+    return found
+
+
+def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:
+    """`contact_damping`, whether or not the contact is in the range in which it is right."""
     for name, value, least in (
         ("stiffness", stiffness, "positive"),
         ("mobility", mobility, "positive"),
@@ -139,11 +164,7 @@ def contact_damping(
     critical = 2.0 * frequency
     if sample_time == 0.0:
         return critical
-    # phi'' = -frequency^2 phi + held, with phi in units of 1 / frequency.
-    swing = np.zeros((3, 3))
-    swing[0, 1], swing[1, 0], swing[1, 2] = frequency, -frequency, 1.0
-    step = expm(swing * sample_time)[:2]
-    low, high = 0.0, critical
+    step, low, high = _step(frequency, sample_time), 0.0, critical
     for _ in range(2):
         tried = np.linspace(low, high, STEPS + 1)
         best = int(np.argmin([_radius(step, c, delay) for c in tried]))
@@ -151,21 +172,78 @@ def contact_damping(
     return float(tried[best])
 
 
-def _radius(step: FloatArray, damping: float, delay: int) -> float:
+def unstable_from(
+    frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
+) -> float | None:
+    """The stiffness from which on a contact does not come to rest, relative to what was said.
+
+    Args:
+        frequency: w = sqrt(A k) of what was said.
+        sample_time, delay: As for `contact_damping`.
+        damping: c.
+        integral: The gain K_i of the integral of the force's error.
+
+    Returns:
+        The least one of those up to a factor of two; None if all of them come to rest.
+    """
+    for share in STIFFNESSES.tolist():
+        own = frequency * share**0.5
+        added = integral * own * sample_time
+        shown = own * sample_time < np.pi
+        if not (shown and _radius(_step(own, sample_time), damping, delay, added) < 1.0):
+            return share
+    return None
+
+
+def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
+    """Warns where what is advised is not right.
+
+    Args:
+        lost: What `unstable_from` says.
+        stiffness: k of what was said, in N/m.
+        swing: w T of it.
+        advice: What is advised, in words.
+
+    Warns:
+        AdviceWarning: It is not.
+    """
+    if lost is None:
+        return
+    warnings.warn(
+        f"{advice} is outside of the range in which the advice is right: a contact of "
+        f"{lost * stiffness:.3g} N/m, which is {lost:.3g} times the given {stiffness:.3g} N/m, "
+        f"does not come to rest with it. The contact swings by {swing:.3g} rad in a sample: sample "
+        "more often, make it softer, or choose the gains yourself",
+        AdviceWarning,
+        stacklevel=4,
+    )
+
+
+def _step(frequency: float, sample_time: float) -> FloatArray:
+    """What (phi, phi', what is held) become within a sample, phi in units of 1 / frequency."""
+    swing = np.zeros((3, 3))
+    swing[0, 1], swing[1, 0], swing[1, 2] = frequency, -frequency, 1.0
+    return np.asarray(expm(swing * sample_time)[:2])
+
+
+def _radius(step: FloatArray, damping: float, delay: int, integral: float = 0.0) -> float:
     """The spectral radius of a contact whose damping is sampled, held and late.
 
     Args:
         step: What (phi, phi', what is held) become within a sample, shape (2, 3).
         damping: c.
         delay: How many samples later c phi' acts.
+        integral: What a sample adds to the sum of phi that acts as well, for phi of 1.
     """
-    # (phi, phi', what is held next, ..., what is held last).
-    matrix = np.zeros((2 + delay, 2 + delay))
+    # (phi, phi', the sum, what is held next, ..., what is held last).
+    matrix = np.zeros((3 + delay, 3 + delay))
     matrix[:2, :2] = step[:, :2]
+    matrix[2, 0], matrix[2, 2] = integral, 1.0 if integral else 0.0
     if delay == 0:
-        matrix[:, 1] -= damping * step[:, 2]
+        matrix[:2, 1] -= damping * step[:, 2]
+        matrix[:2, 2] -= step[:, 2]
     else:
-        matrix[:2, 2] = step[:, 2]
-        matrix[2:-1, 3:] = np.eye(delay - 1)
-        matrix[-1, 1] = -damping
+        matrix[:2, 3] = step[:, 2]
+        matrix[3:-1, 4:] = np.eye(delay - 1)
+        matrix[-1, 1:3] = -damping, -1.0
     return float(np.abs(np.linalg.eigvals(matrix)).max())

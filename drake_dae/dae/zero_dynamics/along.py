@@ -7,14 +7,9 @@ import numpy as np
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause, PinnedMotion
+from drake_dae.dae.zero_dynamics.returns import Return, close, find_multiple
 from drake_dae.dae.zero_dynamics.settling import Fate, carry_in_halves, fate_of, leave
-from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of
-
-CLOSED = 1e-7
-"""A motion is closed if it comes back to this, relative to the scale of the states."""
-
-CARRIED = 1e-6
-"""The error of a transition matrix, relative to its norm."""
+from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,67 +65,47 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
     if period is not None:
         # Late, where what dies out has died out; or early, where what grows is small yet.
         late = int(np.flatnonzero(motion.times <= motion.times[-1] - period)[-1])
-        for first in dict.fromkeys((late, 0)):
-            begin = float(motion.times[first])
-            closed = _closed_motion(flow, motion.states[first], begin, period)
-            if closed is not None:
-                return _by_multipliers(flow, *closed, begin, period)
+        starts = dict.fromkeys((late, 0))
+        found = (_closed(flow, motion, first, period) for first in starts)
+        closed = next((one for one in found if one is not None), None)
+        if closed is None or closed[0].repels:
+            # The motion itself may be another one, which repeats itself after several periods.
+            begin = float(motion.times[late])
+            repeating = flow.repeating(begin, period)
+            several = find_multiple(repeating, motion.states[late], begin, period)
+            if several is not None:
+                return _by_multipliers(repeating, several, begin)
+        if closed is not None:
+            return _by_multipliers(flow, *closed)
     return _by_exponents(flow, motion, period)
 
 
-def _closed_motion(
-    flow: Flow, state: FloatArray, begin: float, period: float
-) -> tuple[FloatArray, FloatArray] | None:
-    """Where the motion begins that comes back after a period, and its monodromy matrix.
-
-    Newton's method for the way that is left after a period, along the tangent space.
-    """
-    scale = flow.scale
-    for _ in range(12):
-        basis = flow.basis(state, begin)
-        try:
-            passage = flow.carry(state, begin, begin + period)
-        except Lost:
-            return None
-        scaled = (basis / scale[:, None]).T
-        with np.errstate(over="ignore"):
-            monodromy = np.exp(passage.growth) * (
-                scaled @ (passage.basis / scale[:, None]) @ passage.transition
-            )
-        if not np.all(np.isfinite(monodromy)):
-            return None
-        gap = scaled @ ((passage.state - state) / scale)
-        step = basis @ np.linalg.lstsq(monodromy - np.eye(gap.size), -gap, rcond=CARRIED)[0]
-        if np.max(np.abs(step) / scale, initial=0.0) <= CLOSED:
-            off = np.max(np.abs(passage.state - state) / scale)
-            return (state, monodromy) if off <= 1e3 * CLOSED * max(1.0, passage.growth) else None
-        try:
-            state = flow.onto(state + step, begin)
-        except Lost:
-            return None
-    return None
+def _closed(
+    flow: Flow, motion: PinnedMotion, first: int, period: float
+) -> tuple[Return, float] | None:
+    """The motion of the period near one of the states of a motion, and when it begins."""
+    begin = float(motion.times[first])
+    found = close(flow, motion.states[first], begin, period, patient=True)
+    return None if found is None else (found, begin)
 
 
-def _by_multipliers(
-    flow: Flow, state: FloatArray, monodromy: FloatArray, begin: float, period: float
-) -> StabilityAlong:
-    noise = CARRIED * max(1.0, float(np.linalg.norm(monodromy, 2)))
-    values, errors = eigenvalues_of(monodromy, np.full(monodromy.shape, noise))
-    order = np.argsort(-np.abs(values), kind="stable")
-    values, errors = values[order], errors[order]
+def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
+    values, errors, period = closed.multipliers, closed.errors, closed.period
     sizes = np.abs(values)
     exponents = np.log(np.maximum(sizes, 1e-300)) / period
     largest = f"the largest Floquet multiplier is {sizes[0]:.4g} over {period:.6g} s"
-    if np.all(sizes < 1.0 - errors):
+    if closed.attracts:
         verdict, reason = Verdict.STABLE, largest
-    elif np.any(sizes > 1.0 + errors):
+    elif closed.repels:
         verdict, reason = Verdict.UNSTABLE, f"small disturbances of the motion grow: {largest}"
         repeating, turning = flow.repeating(begin, period), 2.0 * np.pi / period
-        fate = leave(repeating, state, begin, float(exponents[0]), turning)
-        if fate is Fate.CIRCLES:
-            verdict = Verdict.BOUNDED
-        if fate in (Fate.CIRCLES, Fate.SETTLES):
-            reason += f"; what leaves it {fate.value}"
+        rate = float(exponents[0])
+        course = leave(repeating, closed.state, begin, rate, turning, period)
+        verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
+            course.fate, verdict
+        )
+        if course.fate not in (Fate.UNCLEAR, Fate.GROWS, Fate.SPREADS):
+            reason += f"; what leaves it {course}"
     else:
         count = np.count_nonzero(np.abs(sizes - 1.0) <= errors)
         verdict = Verdict.UNDECIDED
@@ -138,7 +113,7 @@ def _by_multipliers(
             f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to the error "
             f"of integration, over {period:.6g} s"
         )
-    return StabilityAlong(verdict, period, values, exponents, state, reason)
+    return StabilityAlong(verdict, period, values, exponents, closed.state, reason)
 
 
 def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
@@ -152,18 +127,20 @@ def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> Sta
         verdict = Verdict.UNSTABLE if lost.cause is Cause.UNBOUNDED else Verdict.UNDECIDED
         reason = f"from x = {show(motion.states[middle])}: {lost}"
         return StabilityAlong.without_numbers(verdict, reason, period)
+    fate = fate_of(passage, *halves)
     verdict = {
         Fate.SPREADS: Verdict.UNSTABLE,
         Fate.SETTLES: Verdict.STABLE,
-        Fate.CIRCLES: Verdict.BOUNDED,
-    }.get(fate_of(passage, *halves), Verdict.UNDECIDED)
+    }.get(fate, Verdict.UNDECIDED)
     sizes = np.linalg.svd(passage.transition, compute_uv=False)
     exponents = (np.log(np.maximum(sizes, 1e-300)) + passage.growth) / (end - begin)
     reason = (
         f"from {begin:.6g} to {end:.6g} s disturbances of the motion change by a factor "
         f"{np.exp(min(passage.growth, 700.0)):.3g} at most, {exponents[0]:.3g} 1/s"
     )
-    if verdict is Verdict.UNDECIDED:
+    if fate is Fate.WANDERS:
+        reason += f"; the motion {fate.value}"
+    elif verdict is Verdict.UNDECIDED:
         reason += "; that is not long enough to tell"
     none = np.zeros(0, dtype=complex)
     return StabilityAlong(verdict, period, none, exponents, None, reason)

@@ -7,8 +7,9 @@ eigenvalues of M are the Floquet multipliers.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy  # Which loads its heavy parts when they are used.
@@ -146,10 +147,38 @@ class Flow:
                 volume += max(float(np.linalg.slogdet(scaled)[1]), -700.0)
         return Passage(state, basis, transition, growth, volume)
 
+    def way(
+        self, state: FloatArray, begin: float, end: float
+    ) -> Iterator[tuple[float, FloatArray]]:
+        """Times, and the states there, after each step of the way from a state.
+
+        Raises:
+            Lost: As `carry`.
+        """
+        times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
+        for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+            for time, there, _ in self._steps(state, self.basis(state, start)[:, :0], start, stop):
+                steps -= 1
+                if steps < 0:
+                    raise Lost(Cause.TOO_FAST)
+                state = there
+                yield time, state
+            state = self.onto(state, stop)
+
     def _integrate(
         self, state: FloatArray, columns: FloatArray, begin: float, end: float, steps: int
     ) -> tuple[FloatArray, FloatArray, int]:
         """A state and directions at the end of a section, and how many steps are left."""
+        for _, there, along in self._steps(state, columns, begin, end):
+            state, columns, steps = there, along, steps - 1
+            if steps < 0:
+                raise Lost(Cause.TOO_FAST)
+        return state, columns, steps
+
+    def _steps(
+        self, state: FloatArray, columns: FloatArray, begin: float, end: float
+    ) -> Iterator[tuple[float, FloatArray, FloatArray]]:
+        """The time, the state and the directions after each step of a section."""
         n, unit = state.size, self.scale[:, None]
         bound = GROWN * np.maximum(1.0, np.max(np.abs(state) / self.scale))
 
@@ -176,16 +205,21 @@ class Flow:
             blocks = [matrix * self.scale / unit] * (1 + columns.shape[1])
             return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
 
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # That of a step that fails; it is told as Lost.
-            solver = scipy.integrate.LSODA(
-                rate, begin, joined(state, columns), end, rtol=ACCURACY, atol=ACCURACY, jac=slopes
+        def quietly(work: Callable[[], Any]) -> Any:
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # That of a step that fails; it is told as Lost.
+                return work()
+
+        y = joined(state, columns)
+        solver = quietly(
+            lambda: scipy.integrate.LSODA(
+                rate, begin, y, end, rtol=ACCURACY, atol=ACCURACY, jac=slopes
             )
-            while solver.status == "running":
-                solver.step()
-                steps -= 1
-                if not np.max(np.abs(solver.y[:n])) <= bound:
-                    raise Lost(Cause.UNBOUNDED)
-                if steps < 0 or solver.status == "failed":
-                    raise Lost(Cause.TOO_FAST)
-        return *split(solver.y), steps
+        )
+        while solver.status == "running":
+            quietly(solver.step)
+            if not np.max(np.abs(solver.y[:n])) <= bound:
+                raise Lost(Cause.UNBOUNDED)
+            if solver.status == "failed":
+                raise Lost(Cause.TOO_FAST)
+            yield solver.t, *split(solver.y)

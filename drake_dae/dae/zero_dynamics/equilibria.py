@@ -8,9 +8,14 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.zero_dynamics.isolation import Isolation, isolation
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.points import Point, Regularity
-from drake_dae.dae.zero_dynamics.stability import balanced_norm, linearized_eigenvalues
+from drake_dae.dae.zero_dynamics.stability import (
+    ComplexArray,
+    balanced_norm,
+    linearized_eigenvalues,
+)
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
 
@@ -139,7 +144,9 @@ class Equilibria:
         if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
             unrest = "it runs away from all states that are known"
         if converged and not unrest:
-            return state
+            if isolation(pinned, state, reference, parameters):
+                return state
+            unrest = "the rates are small and do not vanish"
         raise InconsistentStateError(
             f"{pinned.system.name}: {pinned.describe(reference)} have no regular state at rest "
             f"near the given one: the search ends at x = {show(state)}, where "
@@ -155,6 +162,7 @@ class Equilibria:
         Of those that are not isolated, which have a zero eigenvalue, only one that is found first.
         """
         found = np.zeros((0, self.sizes.size))
+        radii: list[float] = []
         for guess in guesses:
             try:
                 rest = self.find(reference, guess, parameters)
@@ -163,12 +171,27 @@ class Equilibria:
             near = np.abs(found - rest) <= APART * np.maximum(self.sizes, np.abs(rest))
             if np.any(np.all(near, axis=1)):
                 continue
-            values, errors = linearized_eigenvalues(
-                self.pinned, self.sizes, rest, reference, parameters
-            )
-            if not len(found) or np.all(np.abs(values) > errors):
-                found = np.vstack([found, rest])
+            values, errors, known = self.eigenvalues(reference, rest, parameters)
+            if np.all(np.abs(values) > errors):
+                radius = 0.0
+            else:
+                # Without a radius where the linearization is singular but for its round-off.
+                radius = known.radius if known.degenerate else np.inf
+            off = np.max(np.abs(found - rest) / self.pinned.system.scale, axis=1)
+            if np.any(off <= radius + np.array(radii)) or (radius == np.inf and len(found)):
+                continue
+            found = np.vstack([found, rest])
+            radii.append(radius if radius < np.inf else 0.0)
         return found
+
+    def eigenvalues(
+        self, reference: FloatArray, rest: FloatArray, parameters: FloatArray
+    ) -> tuple[ComplexArray, FloatArray, Isolation]:
+        """The eigenvalues at an equilibrium, their errors, and how well it is known."""
+        known = isolation(self.pinned, rest, reference, parameters)
+        known = known or Isolation(0, 0.0)
+        found = linearized_eigenvalues(self.pinned, self.sizes, rest, reference, parameters)
+        return found[0], known.errors(*found), known
 
     def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
         """What moves at a point, or that it is singular; None at a regular equilibrium.

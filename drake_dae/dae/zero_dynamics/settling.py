@@ -1,6 +1,6 @@
 """What becomes of a motion with pinned outputs in the long run."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -9,11 +9,11 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Passage
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.returns import Return, find_multiple, find_return
 from drake_dae.dae.zero_dynamics.stability import (
     Stability,
     Verdict,
     judge,
-    linearized_eigenvalues,
 )
 from drake_dae.errors import InconsistentStateError
 
@@ -22,6 +22,9 @@ FOLDINGS = 40.0
 
 BESIDE = 1e-3
 """How far beside a motion one starts that may leave it, relative to the scale of the states."""
+
+PATIENCE = 10.0
+"""For a return is waited so many times as long as for what becomes of disturbances."""
 
 PLAIN = float(np.log(10.0))
 """Disturbances grow or shrink where the logarithm of their size changes by more than this."""
@@ -39,18 +42,38 @@ class Fate(Enum):
 
     GROWS = "grows without bound"
     SETTLES = "settles into another motion, which is stable"
-    CIRCLES = "settles into a bounded motion, like a limit cycle"
+    CIRCLES = "settles into a bounded motion, a limit cycle"
+    LEAVES = "comes to a periodic motion that it leaves again"
+    WANDERS = "draws its neighbours to it, but was not seen to return: it may drift"
     SPREADS = "stays beside no neighbour: small disturbances grow on and on"
     UNCLEAR = "was not followed long enough to tell"
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What becomes of a motion, and what shows it.
+
+    Attributes:
+        fate: What becomes of it.
+        state: Where it was at the end; None if that is not known.
+        closed: The periodic motion that it comes to; None if there is none.
+    """
+
+    fate: Fate
+    state: FloatArray | None = None
+    closed: Return | None = None
+
+    def __str__(self) -> str:
+        return self.fate.value if self.closed is None else f"{self.fate.value} ({self.closed})"
 
 
 def fate_of(passage: Passage, *halves: Passage) -> Fate:
     """What an interval says of a motion that has lasted for some time.
 
     Neighbours that a motion draws to it come nearer in all directions. On a limit cycle those
-    ahead stay ahead, while volumes shrink. A growth that is no more than proportional to time, as
-    of neighbours that are a little faster, is not exponential: then that of both halves adds up
-    to much more.
+    ahead stay ahead, while volumes shrink; but so they do where a motion drifts for ever. A growth
+    that is no more than proportional to time, as of neighbours that are a little faster, is not
+    exponential: then that of both halves adds up to much more.
 
     Args:
         passage: The interval.
@@ -62,19 +85,39 @@ def fate_of(passage: Passage, *halves: Passage) -> Fate:
     if passage.growth < -PLAIN:
         return Fate.SETTLES
     if abs(passage.growth) < 0.7 * PLAIN and passage.volume < -2.0 * PLAIN:
-        return Fate.CIRCLES
+        return Fate.WANDERS
     return Fate.UNCLEAR
 
 
-def watch(flow: Flow, state: FloatArray, begin: float, end: float) -> tuple[Fate, Passage | None]:
-    """What becomes of the motion from a state, and the second half of the time."""
+def watch(
+    flow: Flow, state: FloatArray, begin: float, end: float, period: float | None = None
+) -> Course:
+    """What becomes of the motion from a state.
+
+    Args:
+        flow: Of a reference that can be asked at all times.
+        state: The state, shape (n,).
+        begin, end: From when to when it is watched, in s; the second half decides.
+        period: The period of the reference; None if it is constant.
+    """
     middle = 0.5 * (begin + end)
     try:
         later = flow.carry(state, begin, middle, disturbed=False).state
         passage, halves = carry_in_halves(flow, later, middle, end)
     except Lost as lost:
-        return (Fate.GROWS if lost.cause is Cause.UNBOUNDED else Fate.UNCLEAR), None
-    return fate_of(passage, *halves), passage
+        return Course(Fate.GROWS if lost.cause is Cause.UNBOUNDED else Fate.UNCLEAR)
+    fate, last = fate_of(passage, *halves), passage.state
+    if fate is not Fate.WANDERS:
+        return Course(fate, last)
+    if period is None:
+        closed = find_return(flow, last, PATIENCE * (end - begin))
+    else:
+        closed = find_multiple(flow, last, end, period)
+    if closed is not None and closed.attracts:
+        return Course(Fate.CIRCLES, closed.state, closed)
+    if closed is not None and closed.repels:
+        return Course(Fate.LEAVES, closed.state, closed)
+    return Course(fate, last)
 
 
 def carry_in_halves(
@@ -100,8 +143,8 @@ def carry_in_halves(
     return whole, (first, second)
 
 
-def watch_from(flow: Flow, state: FloatArray) -> tuple[Fate, FloatArray | None]:
-    """What becomes of the motion from a state that is not at rest, and where it is at the end.
+def watch_from(flow: Flow, state: FloatArray) -> Course:
+    """What becomes of the motion from a state that is not at rest, under a constant reference.
 
     How long that takes is told by how fast its disturbances move.
     """
@@ -109,16 +152,22 @@ def watch_from(flow: Flow, state: FloatArray) -> tuple[Fate, FloatArray | None]:
     slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters(0.0))
     slopes = slopes * flow.scale / flow.scale[:, None]
     if not np.all(np.isfinite(slopes)):
-        return Fate.UNCLEAR, None
+        return Course(Fate.UNCLEAR)
     rates = np.abs(np.linalg.eigvals(basis.T @ slopes @ basis))
     rates = rates[rates > SLOWEST * np.linalg.norm(slopes, 2)]
     if not rates.size:
-        return Fate.UNCLEAR, None
-    fate, passage = watch(flow, state, 0.0, FOLDINGS / float(rates.min()))
-    return fate, None if passage is None else passage.state
+        return Course(Fate.UNCLEAR)
+    return watch(flow, state, 0.0, FOLDINGS / float(rates.min()))
 
 
-def leave(flow: Flow, state: FloatArray, time: float, rate: float, fastest: float) -> Fate:
+def leave(
+    flow: Flow,
+    state: FloatArray,
+    time: float,
+    rate: float,
+    fastest: float,
+    period: float | None = None,
+) -> Course:
     """What becomes of the motions that leave an unstable one, on both sides of it.
 
     Args:
@@ -127,27 +176,28 @@ def leave(flow: Flow, state: FloatArray, time: float, rate: float, fastest: floa
         time: When it is there.
         rate: The largest exponent of its disturbances, in 1/s, positive.
         fastest: How fast it moves, in rad/s; what takes too many turns is not followed.
+        period: The period of the reference; None if it is constant.
 
     Returns:
         The fate that is worse, or that is not known; the circling one only if both sides circle.
     """
     duration = FOLDINGS / rate
     if duration * fastest > LONGEST:
-        return Fate.UNCLEAR
+        return Course(Fate.UNCLEAR)
     basis = flow.basis(state, 0.0)
     aside = basis @ np.random.default_rng(0).standard_normal(basis.shape[1])
     aside *= BESIDE / np.max(np.abs(aside) / flow.scale)
-    found = Fate.UNCLEAR
+    courses = []
     for side in (aside, -aside):
         try:
             start = flow.onto(state + side, time)
         except Lost:
-            return Fate.UNCLEAR
-        fate, _ = watch(flow, start, time, time + duration)
-        if fate not in (Fate.CIRCLES, Fate.SETTLES):
-            return fate
-        found = Fate.SETTLES if Fate.SETTLES in (found, fate) else fate
-    return found
+            return Course(Fate.UNCLEAR)
+        courses.append(watch(flow, start, time, time + duration, period))
+        if courses[-1].fate not in (Fate.CIRCLES, Fate.SETTLES, Fate.WANDERS):
+            return courses[-1]
+    order = (Fate.WANDERS, Fate.SETTLES, Fate.CIRCLES)
+    return min(courses, key=lambda course: order.index(course.fate))
 
 
 def judge_at_rest(
@@ -162,17 +212,24 @@ def judge_at_rest(
         parameters: Values of all parameters.
     """
     pinned, sizes = equilibria.pinned, equilibria.sizes
-    values, errors = linearized_eigenvalues(pinned, sizes, rest, goal, parameters)
+    values, errors, _ = equilibria.eigenvalues(goal, rest, parameters)
     place = f"at the equilibrium with {pinned.describe(goal)}"
     found = judge(values, errors, rest, place)
     if found.verdict is not Verdict.UNSTABLE:
         return found
     flow = Flow(pinned, lambda time: goal, lambda time: parameters, sizes)
-    fate = leave(flow, rest, 0.0, float(values[0].real), float(np.max(np.abs(values.imag))))
-    if fate not in (Fate.CIRCLES, Fate.SETTLES):
+    course = leave(flow, rest, 0.0, float(values[0].real), float(np.max(np.abs(values.imag))))
+    return _after(found, course)
+
+
+def _after(found: Stability, course: Course) -> Stability:
+    """What is said of an unstable equilibrium once it is known what becomes of what leaves it."""
+    verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
+        course.fate, Verdict.UNSTABLE
+    )
+    if course.fate in (Fate.UNCLEAR, Fate.GROWS, Fate.SPREADS):
         return found
-    verdict = Verdict.BOUNDED if fate is Fate.CIRCLES else Verdict.UNSTABLE
-    return replace(found, verdict=verdict, reason=f"{found.reason}; what leaves it {fate.value}")
+    return replace(found, verdict=verdict, reason=f"{found.reason}; what leaves it {course}")
 
 
 def judge_without_rest(
@@ -194,13 +251,18 @@ def judge_without_rest(
     nothing, pinned = np.zeros(0, dtype=complex), equilibria.pinned
     flow = Flow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
-        fate, end = watch_from(flow, pinned.state(goal, start, parameters))
-        if fate is Fate.SETTLES and end is not None:
-            rest = equilibria.find(goal, end, parameters)
+        course = watch_from(flow, pinned.state(goal, start, parameters))
+        if course.fate is Fate.SETTLES and course.state is not None:
+            rest = equilibria.find(goal, course.state, parameters)
             return judge_at_rest(equilibria, goal, rest, parameters)
     except InconsistentStateError:
         return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    verdict = {Fate.GROWS: Verdict.UNSTABLE, Fate.CIRCLES: Verdict.BOUNDED}.get(fate)
+    verdict = {
+        Fate.GROWS: Verdict.UNSTABLE,
+        Fate.LEAVES: Verdict.UNSTABLE,
+        Fate.CIRCLES: Verdict.BOUNDED,
+        Fate.WANDERS: Verdict.UNDECIDED,
+    }.get(course.fate)
     if verdict is None:
         return Stability(Verdict.UNDECIDED, nothing, None, reason)
-    return Stability(verdict, nothing, None, f"{reason}; the motion from there {fate.value}")
+    return Stability(verdict, nothing, None, f"{reason}; the motion from there {course}")

@@ -92,9 +92,36 @@ def linearized_eigenvalues(
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
     beside, _ = pinned.slopes(state + SHIFT * along, reference, parameters)
     if np.all(np.isfinite(beside)):
-        others, _ = eigenvalues_of((beside @ moved)[free] / units, 0.0 * off)
+        shifted = (beside @ moved)[free] / units
+        others, _ = eigenvalues_of(shifted, 0.0 * off)
         errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
+        if stays_off_the_axis(matrix, off + np.abs(shifted - matrix), rounded):
+            errors = np.minimum(errors, 0.5 * np.abs(values.real))
     return values, errors
+
+
+def stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) -> bool:
+    """Whether no eigenvalue of a matrix can cross the imaginary axis, within its error.
+
+    Single eigenvalues of a defective matrix are uncertain, by the root of its error, though all of
+    them may be far from the axis. A matrix E that moves one to i w is no smaller than the smallest
+    singular value of A - i w; that is e at some w only if i w is an eigenvalue of
+    [[A, -e], [e, -A^T]] (Byers 1988).
+
+    Args:
+        matrix, error, rounded: As for `eigenvalues_of`.
+    """
+    size = len(matrix)
+    with np.errstate(invalid="ignore"):
+        balanced, similarity = scipy.linalg.matrix_balance(matrix, permute=False)
+    units, norm = np.diag(similarity), float(np.linalg.norm(balanced, 2))
+    off = float(np.linalg.norm(error / units[:, None] * units, 2)) + rounded + ROUNDED * norm
+    if not (np.isfinite(off) and norm > 0.0):
+        return False
+    away = off * np.eye(size)
+    values = np.linalg.eigvals(np.block([[balanced, -away], [away, -balanced.T]]))
+    # The eigenvalues of this one are known to the root of a rounding, where they meet on the axis.
+    return bool(np.min(np.abs(values.real)) > np.sqrt(ROUNDED) * norm)
 
 
 def balanced_norm(matrix: FloatArray) -> float:

@@ -125,12 +125,14 @@ def fit_relief(x: FloatArray, y: FloatArray, heights: FloatArray, resolution: fl
     at_x, at_y = along.at(x), across.at(y)
     beyond_x, beyond_y = along.at(along.around), across.at(across.around)
     for least in _LEAST:
-        to_x, to_y = (np.linalg.pinv(bells, rcond=least) for bells in (at_x, at_y))
-        factors = to_y @ rest @ to_x.T
+        (basis_x, to_x), (basis_y, to_y) = _spanned(at_x, least), _spanned(at_y, least)
+        shares = basis_y.T @ rest @ basis_x
+        factors = to_y @ shares @ to_x.T
         if np.max(np.abs(beyond_y @ factors @ beyond_x.T)) <= _CALM * np.ptp(rest):
             break
-    left, sizes, right = np.linalg.svd(factors, full_matrices=False)
-    a, b = right.T, left * sizes
+    # In heights and not in factors, which hold the round-off of the data a million times larger.
+    left, sizes, right = np.linalg.svd(shares, full_matrices=False)
+    a, b = to_x @ right.T, to_y @ (left * sizes)
     terms_a, terms_b = at_x @ a, at_y @ b
 
     # A few terms often do: a wave along one axis takes one. What the others add is less than how
@@ -149,3 +151,18 @@ def fit_relief(x: FloatArray, y: FloatArray, heights: FloatArray, resolution: fl
         float(np.max(np.abs(error))),
         float(np.sqrt(np.mean(error**2))),
     )
+
+
+def _spanned(bells: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
+    """What bells can tell apart: orthonormal values at the data, and the bells' factors for them.
+
+    Args:
+        bells: The bells at the data, shape (data, bells).
+        least: Singular values below this, relative to the largest, are left out.
+
+    Returns:
+        The values, shape (data, r), and the factors, shape (bells, r).
+    """
+    values, sizes, factors = np.linalg.svd(bells, full_matrices=False)
+    kept = sizes > least * sizes[0]
+    return values[:, kept], factors[kept].T / sizes[kept]

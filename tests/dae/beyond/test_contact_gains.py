@@ -1,11 +1,13 @@
 """The advice of gains, against the roots of the loops that it closes."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from drake_dae import contact_gains
-from drake_dae.errors import ModelError
+from drake_dae.errors import AdviceWarning, ModelError
 
 
 def test_one_sample_at_a_kilohertz_gives_the_rate_of_the_docstring():
@@ -105,9 +107,35 @@ def test_positions_that_are_sampled_late_come_to_rest(sample_time):
 
 def test_stiff_contact_that_samples_cannot_damp_gets_no_damping():
     """At w T = 1.3 what is held is late by more than a quarter of a swing."""
-    found = contact_gains((1.3e3) ** 2 / 0.03, 0.03, 1e-3)
+    with pytest.warns(AdviceWarning, match="does not come to rest"):
+        found = contact_gains((1.3e3) ** 2 / 0.03, 0.03, 1e-3)
     assert found.constraint_damping == 0.0
     assert found.force_gain > 0.0
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+@pytest.mark.parametrize("swing", [0.3, 0.6, 1.0, 1.5, 2.2, 4.5])
+def test_gains_are_advised_in_silence_only_where_neighbours_come_to_rest(swing, delay):
+    """(phi, phi', the integral of the force's error, what is held), as its own recursion."""
+    T, mobility = 1e-3, 0.03
+    frequency = swing / T
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = contact_gains(frequency**2 / mobility, mobility, T, delay, 0.0)
+    if told:
+        assert swing > {0: 1.3, 1: 0.6, 2: 0.36}[delay]
+        return
+    for factor in (0.3, 1.0, 1.1, 2.0):
+        own = frequency * factor**0.5
+        step = expm(T * np.array([[0.0, 1.0, 0.0], [-(own**2), 0.0, 1.0], [0.0, 0.0, 0.0]]))[:2]
+        (place, speed), total, held = (1.0, 0.0), 0.0, [0.0] * delay
+        sizes = []
+        for _ in range(3000):
+            held.append(-found.constraint_damping * speed - total)
+            total += found.force_gain * own**2 * T * place
+            place, speed = step @ [place, speed, held.pop(0)]
+            sizes.append(abs(place))
+        assert max(sizes[-300:]) < 0.5 * max(sizes[:300]), factor
 
 
 def test_numbers_that_make_no_sense_are_refused():

@@ -296,12 +296,37 @@ def test_the_inverse_stays_on_the_branch_of_its_guess():
             np.testing.assert_allclose(state, expected, rtol=0, atol=1e-14 / y**2 + 1e-13)
 
 
-@pytest.mark.parametrize("seed", [467])
-def test_continuation_arrives_where_newtons_method_alone_does_not(seed):
-    """From one random configuration of the 7-joint arm to another, some 0.5 rad per joint apart."""
-    normal_form, random = form("seven_joint"), np.random.default_rng(seed)
-    manifold, nominal = normal_form.structure.manifold, normal_form.structure.states[0]
-    guess, x = (manifold.project(nominal + 0.5 * random.standard_normal(14)) for _ in range(2))
+def outputs_of_a_state(outputs, nominal_state):
+    """x' = u and z = l(x): zeta is l(x), and there is nothing else."""
+    size = len(nominal_state)
+    return NormalForm(
+        DaeSystem.from_functions(
+            size,
+            f=lambda x: size * [0],
+            h=lambda x: np.eye(size),
+            l=outputs,
+            nominal_state=nominal_state,
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("outputs", "guess", "x"),
+    [
+        (lambda x: x[0] / (1 + x[0] ** 2), [0.9], [0.0]),
+        (lambda x: x[0] / (1 + x[0] ** 2), [-0.85], [0.0]),
+        (lambda x: x[0] / (1 + x[0] ** 2) ** 0.75, [1.3], [0.0]),
+        (lambda x: [x[0] / (1 + x[0] ** 2), x[1] + 0.1 * x[0]], [0.9, 0.0], [0.0, 0.5]),
+    ],
+    ids=["fold", "from below", "slow", "two states"],
+)
+def test_continuation_arrives_where_newtons_method_alone_does_not(outputs, guess, x):
+    """The guess is near a fold, where l(x) is flat: one Newton step leads far beyond the state.
+
+    Out there l(x) decays, so every further step leads farther away, by more than its own length, on
+    any processor. On the straight way through l(x) each state is near the one before.
+    """
+    normal_form = outputs_of_a_state(outputs, x)
     coordinates = normal_form.coordinates(x)
 
     def linearize(state):
@@ -310,8 +335,20 @@ def test_continuation_arrives_where_newtons_method_alone_does_not(seed):
             lambda z: inverse @ (coordinates - normal_form.coordinates(z)), is_regular=True
         )
 
-    assert not newton(guess, linearize)[1]
-    np.testing.assert_allclose(normal_form.state(coordinates, guess), x, rtol=0, atol=1e-12)
+    found, converged = newton(np.array(guess), linearize)
+    assert not converged
+    assert np.max(np.abs(found)) > 5.0
+    np.testing.assert_allclose(normal_form.state(coordinates, guess), x, rtol=0, atol=1e-14)
+
+
+def test_the_way_from_one_configuration_of_an_arm_to_another():
+    """Some 0.5 rad per joint apart, whether by Newton's method or by continuation."""
+    normal_form, random = form("seven_joint"), np.random.default_rng(467)
+    manifold, nominal = normal_form.structure.manifold, normal_form.structure.states[0]
+    for _ in range(5):
+        guess, x = (manifold.project(nominal + 0.5 * random.standard_normal(14)) for _ in range(2))
+        found = normal_form.state(normal_form.coordinates(x), guess)
+        np.testing.assert_allclose(found, x, rtol=0, atol=1e-12)
 
 
 def test_coordinates_out_of_reach_are_named():

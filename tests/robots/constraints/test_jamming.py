@@ -9,6 +9,7 @@ J M^-1 J_t^T = -3 sin a cos a / m, so that
 which is least at tan a = 2, where it is 4/3.
 """
 
+import itertools
 from dataclasses import replace
 
 import casadi as ca
@@ -210,6 +211,29 @@ def test_the_reserve_is_positive_exactly_for_a_p_matrix(seed):
         reserve = function([friction])[0].item()
         assert (reserve > 0.0) == bool(np.all(minors(A_0 - friction * D, rows) > 0.0))
         assert (reserve > 0.0) == (share < 1.0 or not np.isfinite(critical))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_reserve_is_the_least_ratio_of_minors_in_any_order_of_the_contacts(seed, count):
+    random = np.random.default_rng(seed)
+    root = random.standard_normal((count + 1, count + 3))
+    A_0 = root @ root.T
+    rows = list(range(count))
+    A_1 = A_0 * (1.0 + random.uniform(-0.6, 0.3, A_0.shape))
+    A_1[:, count:] = A_0[:, count:]  # The last constraint cannot open, and has no friction.
+    mu, names = ca.SX.sym("mu"), [f"f{i}" for i in range(count + 1)]
+    parameter = Parameter("mu", np.array([0.0]), symbol=mu)
+    wanted = min(1.0, (minors(A_1, rows) / minors(A_0, rows)).min())
+    for order in itertools.permutations(rows):
+        places = [*order, count]
+        contacts = [Contact(f"f{i}", "mu") for i in range(count)]
+        both = Contacts("x", [Signal(names[i]) for i in places], [parameter], contacts)
+        matrix = ca.SX(A_0 + 0.0) + mu * (A_1 - A_0)
+        reserve = both.reserve(matrix[places, places])
+        found = TracedFunction("r", {"mu": mu}, {"r": reserve})([1.0])[0].item()
+        # Determinants of four rows, by elimination in another order.
+        assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
 def test_sets_of_forces_are_those_of_complementarity():

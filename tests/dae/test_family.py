@@ -1,0 +1,271 @@
+"""Relative degrees belong to all numbers that a system may have, not to its defaults alone."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import pendulum, system_of
+
+from drake_dae import DaePlant, analyze
+from drake_dae.analysis.findings import Finding
+from drake_dae.dae.structure.assumptions import Cause
+from drake_dae.dae.structure.constrained import find_constraint_structure
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import AssumptionError, ModelError
+
+
+def integrators(count, output, parameters, **more):
+    """x_0' = x_1, ..., x_(n-1)' = u."""
+    return DaeSystem.from_functions(
+        count,
+        f=lambda x, p: [*[x[i + 1] for i in range(count - 1)], 0],
+        h=lambda x, p: [*[0] * (count - 1), 1],
+        l=output,
+        parameters=parameters,
+        **more,
+    )
+
+
+def chain_that_moves(exogenous, drift=0, **more):
+    """0 = s_0 with s_0' = s_1 + w a, s_1' = s_2 - w b, and a' = b.
+
+    Then s_0'' = s_2 + w' a, and its derivative is c + w'' a + w' b with c = s_2'. In b' = -a + v
+    and c' = d + drift v and d' = -s_1 + v the input acts on the fourth derivative by drift, and by
+    w' in any case: without drift the degree is 5 at rest.
+    """
+    return DaeSystem.from_functions(
+        ["s0", "s1", "s2", "a", "b", "c", "d"],
+        f=lambda x, p: [x[1] + p.w * x[3], x[2] - p.w * x[4], x[5], x[4], -x[3], x[6], -x[1]],
+        g=lambda x, p: [0, 0, 0, 0, 1, drift, 1],
+        k=lambda x, p: x[0],
+        parameters={"w": 0.0},
+        exogenous=exogenous,
+        **more,
+    )
+
+
+def coupled(gain):
+    """Two inputs that an output each has, coupled by numbers."""
+    return DaeSystem.from_functions(
+        2,
+        f=lambda x, p: [-x[0], -x[1]],
+        h=lambda x, p: gain(p),
+        l=lambda x, p: [x[0], x[1]],
+        parameters={"a": 1.0, "b": 1.0},
+    )
+
+
+OUTPUTS = {
+    "sum": (lambda x, p: x[0] + p.w * x[1], {"w": 0.0}, 2, ("w",)),
+    "last": (lambda x, p: x[0] + p.w * x[2] ** 3, {"w": 0.0}, 1, ("w",)),
+    "one of a vector": (lambda x, p: x[0] + p.w[1] * x[1], {"w": [1.0, 0.0]}, 2, ("w",)),
+    "difference": (lambda x, p: x[0] + (p.a - p.b) * x[2], {"a": 2.0, "b": 2.0}, 1, ("a", "b")),
+    "both": (lambda x, p: x[0] + p.a * p.b * x[2], {"a": 0.0, "b": 0.0, "c": 3.0}, 1, ("a", "b")),
+    "sine": (lambda x, p: x[0] + ca.sin(p.w) * ca.sin(x[1]), {"w": 0.0}, 2, ("w",)),
+}
+"""Outputs of three integrators, parameters, the degree elsewhere, and what decides. At the defaults
+the degree is 3."""
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("moves", [False, True])
+def test_an_output_whose_degree_hangs_on_numbers_is_refused(name, moves):
+    output, parameters, degree, deciding = OUTPUTS[name]
+    system = integrators(3, output, parameters, exogenous=[deciding[0]] if moves else [])
+    with pytest.raises(AssumptionError) as caught:
+        find_structure(system)
+    violation = caught.value.violation
+    assert (violation.assumption, violation.cause) == (4, Cause.NUMBERS)
+    assert violation.order == degree
+    assert violation.deciding.names == deciding
+    assert "'z0'" in str(caught.value)
+    assert f"{deciding[0]} = " in str(caught.value)
+    assert "with_bounds" in str(caught.value)
+    # `analyze` reports it instead of raising it.
+    found = analyze(system).assumptions[3]
+    assert found.finding is Finding.VIOLATED
+    assert found.violation.deciding.names == deciding
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("moves", [False, True])
+def test_bounds_of_one_value_restrict_it_by_the_users_word(name, moves):
+    output, parameters, _, deciding = OUTPUTS[name]
+    held = {key: (parameters[key], parameters[key]) for key in deciding}
+    signals = [deciding[0]] if moves else []
+    system = integrators(3, output, parameters, bounds=held, exogenous=signals)
+    assert find_structure(system).output_degrees == (3,)
+    after = integrators(3, output, parameters, exogenous=signals).with_bounds(held)
+    assert find_structure(after).output_degrees == (3,)
+
+
+@pytest.mark.parametrize("bounds", [None, {"w": (0.2, 0.9)}])
+@pytest.mark.parametrize("moves", [False, True])
+def test_elsewhere_the_degree_is_that_of_the_family(bounds, moves):
+    """With the default 0.5 and its factor of two, or bounds that do not hold 0, mu = 1."""
+    signals = ["w"] if moves else []
+    system = integrators(
+        2, lambda x, p: x[0] + p.w * x[1], {"w": 0.5}, bounds=bounds, exogenous=signals
+    )
+    assert find_structure(system).output_degrees == (1,)
+    assert not [a for a in analyze(system).assumptions if a.finding is Finding.VIOLATED]
+
+
+def test_a_feedthrough_that_hangs_on_numbers():
+    """z = x_0 + w v, and v = x_0 - u: mu = 0 except at w = 0, where nothing acts at all."""
+    system = DaeSystem.from_functions(
+        3,
+        f=lambda x, p: [x[2], -x[0], 0],
+        g=lambda x, p: [0, 1, 0],
+        h=lambda x, p: [0, 1, 1],
+        k=lambda x, p: x[1],
+        l=lambda x, p: x[0],
+        m=lambda x, p: p.w,
+        parameters={"w": 0.0},
+    )
+    with pytest.raises(AssumptionError) as caught:
+        find_structure(system)
+    assert (caught.value.violation.order, caught.value.violation.cause) == (0, Cause.NUMBERS)
+    assert find_structure(system.with_bounds({"w": (0, 0)})).output_degrees == (2,)
+
+
+def test_a_constraint_whose_degree_hangs_on_the_rate_of_a_signal():
+    """A derivative of it holds w' v, so that r is one less while w moves."""
+    moves = chain_that_moves(["w"])
+    with pytest.raises(AssumptionError) as caught:
+        find_constraint_structure(moves)
+    violation = caught.value.violation
+    assert (violation.assumption, violation.cause, violation.order) == (1, Cause.NUMBERS, 4)
+    assert violation.deciding.names == ("w'",)
+    assert violation.names == ("y0",)
+    for still in (chain_that_moves([]), moves.with_bounds({"w": (0.0, 0.0)})):
+        assert find_constraint_structure(still).constraint_degrees == (5,)
+    # Where v acts on the fourth derivative anyway, w may move.
+    assert find_constraint_structure(chain_that_moves(["w"], drift=1)).constraint_degrees == (4,)
+
+
+@pytest.mark.parametrize(
+    ("k", "cause"),
+    [
+        (lambda x, p: [x[0], x[0] + p.w * x[1]], Cause.REDUNDANT),
+        (lambda x, p: [x[0], p.w * x[1]], Cause.NO_FORCE),
+        (lambda x, p: [x[0] + x[1], x[0] + x[1] + ca.sin(p.w) * x[1]], Cause.REDUNDANT),
+    ],
+)
+def test_a_constraint_that_is_there_with_other_numbers_alone(k, cause):
+    """Redundant, or none at all, with the defaults: the words say which numbers change that."""
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x, p: [x[2], x[3], 0, 0],
+        g=lambda x, p: [[0, 0], [0, 0], [1, 0], [0, 1]],
+        k=k,
+        parameters={"w": 0.0, "c": 1.0},
+        exogenous=["w"],
+    )
+    with pytest.raises(AssumptionError, match=r"This hangs on numbers: .* at w = ") as caught:
+        find_constraint_structure(system)
+    assert caught.value.violation.cause is cause
+    assert caught.value.violation.deciding.names[0] == "w"
+
+
+def test_a_rank_of_b_that_hangs_on_numbers():
+    with pytest.raises(AssumptionError, match=r"B\(x\) is regular at a = ") as caught:
+        find_structure(coupled(lambda p: [[1, p.a], [p.b, 1]]))
+    assert caught.value.assumption == 5
+    assert set(caught.value.violation.deciding.names) == {"a", "b"}
+    # det = 1 - a b / 2 is lost at a = 2.
+    regular = coupled(lambda p: [[1, 0.5 * p.a], [p.b, 1]])
+    assert find_structure(regular).output_degrees == (1, 1)
+    assert find_structure(regular.with_bounds({"a": (0.1, 1.5)})).output_degrees == (1, 1)
+    wide = regular.with_bounds({"a": (0.1, 3.0)})
+    with pytest.raises(AssumptionError, match="within the bounds of 'a', between its default 1 "):
+        find_structure(wide)
+    found = analyze(wide).assumptions[4]
+    assert found.finding is Finding.VIOLATED
+    assert found.violation.cause is Cause.BOUNDS
+
+
+def test_a_rank_of_a_within_bounds():
+    """A = 1 + w: lost at w = -1, which bounds may hold."""
+    system = DaeSystem.from_functions(
+        2,
+        f=lambda x, p: [x[1], 0],
+        g=lambda x, p: [0, 1 + p.w],
+        k=lambda x, p: x[0],
+        parameters={"w": 0.0},
+    )
+    narrow = system.with_bounds({"w": (-0.9, 5)})
+    assert find_constraint_structure(narrow).constraint_degrees == (2,)
+    for low in (-1.0, -2.0):
+        with pytest.raises(AssumptionError, match=r"A\(x\) loses rank within the bounds of 'w'"):
+            find_constraint_structure(system.with_bounds({"w": (low, 5.0)}))
+
+
+def test_where_no_state_is_consistent_with_numbers_nearer_ones_are_taken():
+    """x_0^2 + x_1^2 = 4 w^2 - 4 has none for w < 1; the default is 1.05."""
+    system = DaeSystem.from_functions(
+        4,
+        f=lambda x, p: [x[2], x[3], 0, 0],
+        g=lambda x, p: [0, 0, x[0], x[1]],
+        h=lambda x, p: [0, 0, -x[1], x[0]],
+        k=lambda x, p: x[0] ** 2 + x[1] ** 2 + 4 - 4 * p.w**2,
+        l=lambda x, p: x[0] + (p.w - 1.05) * x[2],
+        m=lambda x, p: 0,
+        parameters={"w": 1.05},
+        nominal_state=[0.2, 0.6, 0.0, 0.0],
+        bounds={"w": (0.1, 1.1)},
+    )
+    with pytest.raises(AssumptionError) as caught:
+        find_structure(system)
+    assert caught.value.violation.cause is Cause.NUMBERS
+    assert caught.value.violation.deciding.names == ("w",)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "words"),
+    [
+        ({"gain": (3.0, 1.0)}, "a lowest and a highest value"),
+        ({"gain": (3.0, 4.0)}, r"'gain' must stay in its bounds, from 3.0 to 4.0, got \[2.\]"),
+        ({"gain": ([1.0, 1.0], 3.0)}, r"each a number or of shape \(1,\)"),
+        ({"gian": (1.0, 3.0)}, "did you mean 'gain'"),
+        ({"gain": 3.0}, "bounds"),
+        ({"gain": (float("nan"), 3.0)}, "bounds"),
+    ],
+)
+def test_bounds_that_make_no_sense(bounds, words):
+    system = integrators(2, lambda x, p: x[0] * p.gain, {"gain": 2.0})
+    with pytest.raises(ModelError, match=words):
+        system.with_bounds(bounds)
+
+
+def test_bounds_keep_the_symbols_of_derivatives():
+    """Expressions hold them."""
+    signal = Parameter("w", [0.0, 1.0], exogenous=True)
+    still = system_of(2, f=lambda x: [x[1], 0], h=lambda x: [0, 1], l=lambda x: [x[0]])
+    system = DaeSystem(
+        state=still.state,
+        f=still.f + ca.vertcat(0, signal.rate[1]),
+        g=[],
+        h=still.h,
+        k=[],
+        l=still.l,
+        m=[],
+        parameters=(signal,),
+    ).with_bounds({"w": ([-1.0, 0.5], 2.0)})
+    assert find_structure(system).output_degrees == (2,)
+    (parameter,) = system.parameters
+    assert ca.is_equal(parameter.rate, signal.rate)
+    np.testing.assert_array_equal(parameter.low, [-1.0, 0.5])
+    np.testing.assert_array_equal(parameter.high, [2.0, 2.0])
+
+
+def test_values_out_of_bounds_are_refused_where_they_are_set():
+    system = pendulum().system
+    length = next(p for p in system.parameters if p.name == "length")
+    value = float(length.value[0])
+    plant = DaePlant(system.with_bounds({"length": (0.5 * value, 1.5 * value)}))
+    context = plant.CreateDefaultContext()
+    plant.set_parameter(context, "length", 1.2 * value)
+    with pytest.raises(ModelError, match="'length' must stay in its bounds"):
+        plant.set_parameter(context, "length", 1.6 * value)
