@@ -50,6 +50,7 @@ from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.scenario.model import add_robot
+from drake_dae.scenario.plants import Planted
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
@@ -154,6 +155,9 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.ClosedLoop: loop,
     dd.ContactMaterial: dd.ContactMaterial,
     dd.ContactPlant: contact_plant,
+    dd.Controller: lambda: loop().controller,
+    dd.LoopSettings: dd.LoopSettings,
+    dd.Plant: lambda: loop().plant,
     dd.DaePlant: lambda: loop().plant,
     dd.DaeSystem: lambda: arm("two_link").model.dae,
     dd.Extension: lambda: dd.Extension(
@@ -202,6 +206,9 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     TreeKinematics: lambda: arm("two_link").model.links.kinematics(),
     Links: lambda: arm("two_link").model.links,
     MultibodyPlant: lambda: arm("two_link").plant,
+    Planted: lambda: Planted(
+        arm("two_link").model, arm("two_link").structure, False, "", add_arm, {}, ()
+    ),
     PositionOutput: lambda: arm("two_link").model.positions[0],
     Reaction: lambda: Reaction(ca.SX(2, 1)),
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
@@ -451,6 +458,9 @@ def public() -> Iterator[tuple[str, Any]]:
 # What the library calls on its members, with arguments of its own: rules for who writes one.
 CONTRACTS = (Surface, Constraint, PositionOutput, dd.ForceOutput, Stage, dd.Reference, Phase)
 
+# And what it calls on plants and controllers, whose other rules are for everybody.
+CALLED = {"add_own_view", "check_plant", "derived", "motion_under", "predicted_error", "robot"}
+
 
 def methods(cls: type) -> set[str]:
     """Public methods of ours; those of Drake begin with a capital, or are its own.
@@ -463,6 +473,7 @@ def methods(cls: type) -> set[str]:
         if base.__module__.startswith("drake_dae")
         for name, member in vars(base).items()
         if name[0].islower()
+        and not (name in CALLED and issubclass(cls, dd.Plant | dd.Controller))
         and (inspect.isfunction(member) or isinstance(member, (classmethod, staticmethod)))
         and not any(hasattr(contract, name) for contract in CONTRACTS if issubclass(cls, contract))
         and "casadi" not in str(inspect.signature(getattr(cls, name)))

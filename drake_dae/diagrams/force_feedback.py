@@ -49,6 +49,7 @@ def add_force_feedback(
             period = sensor.sample_period or sensor.time_constant
             source = RandomSource(RandomDistribution.kGaussian, size, period)
             noise = builder.AddSystem(source)
+            noise.set_name("force_noise")
             builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     takers: list[System] = [controller, *others]
     for taker in takers:

@@ -18,13 +18,13 @@ from pydrake.systems.primitives import (
 from drake_dae.dae.references import Reference
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
 Block = TypeVar("Block", bound=System)
@@ -72,12 +72,39 @@ def add_exogenous(
     return generator
 
 
-def check_sensor(plant: Plant, controller: Controller, sensor: ForceSensor | None) -> None:
-    """Refuses a sensor that does not fit: Drake would name the ports, but not what is wrong.
+_NEEDS = dict.fromkeys(
+    ("observer", "tolerances"), "it takes the references of a generator, and here is none"
+)
+
+
+def check_parts(
+    plant: Plant,
+    controller: Controller,
+    reference: ReferenceGenerator | None,
+    parts: LoopSettings,
+) -> None:
+    """Refuses parts that do not fit: Drake would name the ports, but not what is wrong.
+
+    Args:
+        plant: The plant.
+        controller: The controller.
+        reference: What gives it its references, if anything.
+        parts: The parts.
 
     Raises:
-        WiringError: The sensor measures another number of forces, or no law uses it.
+        WiringError: The controller cannot be wired with a part, the sensor measures another number
+            of forces, or no law uses it.
     """
+    refused = controller.refused if reference is not None else {**_NEEDS, **controller.refused}
+    given = {name: getattr(parts, name) for name in refused}
+    found = [
+        f"{name}: {refused[name]}"
+        for name, value in given.items()
+        if value is not None and not (name == "exogenous" and not value)
+    ]
+    if found:
+        raise WiringError("; ".join(found))
+    sensor = parts.sensor
     if sensor is None:
         return
     own, size = plant.dae, sensor.GetInputPort("force").size()

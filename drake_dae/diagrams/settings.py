@@ -1,6 +1,6 @@
 """What a closed loop has beside its plant, its controller and its references."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
@@ -52,24 +52,6 @@ class LoopSettings:
     plant_exogenous: Sequence[Reference] | None = None
     tolerances: Tolerances | None = None
     start_time: float = 0.0
-
-    def has(self, name: str) -> bool:
-        """Whether a loop has the part of that name."""
-        value = getattr(self, name)
-        return value is not None and not (name == "exogenous" and not value)
-
-    def check(self, refused: Mapping[str, str]) -> None:
-        """Refuses parts that a controller cannot be wired with.
-
-        Args:
-            refused: Name of a setting -> why, as `Controller.refused`.
-
-        Raises:
-            WiringError: There is such a part.
-        """
-        found = [f"{name}: {text}" for name, text in refused.items() if self.has(name)]
-        if found:
-            raise WiringError("; ".join(found))
 
     def period(self, step: float) -> float:
         """The time between samples of the law in s, on a plant with such a step; 0 for none."""

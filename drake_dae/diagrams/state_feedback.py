@@ -38,8 +38,16 @@ class MeasuredState:
         """
         if self.noise is not None:
             own = self.noise.GetMyMutableContextFromRoot(context)
-            # Other numbers than those of a force sensor with the same seed.
-            self.noise.SetRandomContext(own, RandomGenerator((seed + 2**31) % 2**32))
+            self.noise.SetRandomContext(own, RandomGenerator(encoder_seed(seed)))
+
+
+def encoder_seed(seed: int) -> int:
+    """The seed of the noise of encoders: other numbers than a force sensor's with the same seed.
+
+    Args:
+        seed: The seed that the user gave, below 2^32.
+    """
+    return (seed + 2**31) % 2**32
 
 
 def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:

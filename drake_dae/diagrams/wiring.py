@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference, references_by_name
@@ -19,7 +20,7 @@ from drake_dae.diagrams.parts import (
     add_exogenous,
     add_hold,
     add_watch,
-    check_sensor,
+    check_parts,
     hold_before,
     log_steps,
     open_holds,
@@ -39,10 +40,6 @@ from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 Named = dict[str, tuple[OutputPort, Sequence[Signal]]]
 """Name -> output port, names and units of what a record has."""
-
-_NEEDS = dict.fromkeys(
-    ("observer", "tolerances"), "it takes the references of a generator, and here is none"
-)
 
 
 @checked(WiringError)
@@ -136,8 +133,7 @@ def wire_loop(
     """
     parts = settings or LoopSettings()
     controller.check_plant(plant)
-    parts.check(controller.refused if reference is not None else {**_NEEDS, **controller.refused})
-    check_sensor(plant, controller, parts.sensor)
+    check_parts(plant, controller, reference, parts)
     builder, law = DiagramBuilder(), controller.law
 
     # The plant, its references and its controller.
@@ -192,21 +188,12 @@ def wire_loop(
     if parts.tolerances is not None and reference is not None:
         add_watch(builder, plant, reference, law, parts.tolerances)
 
-    # Every signal under its own name: exported, and logged once per step if nothing else tells it.
+    # Every signal has its own name: it is exported, and logged at each step or told afterwards.
     named = {
         **_of_plant(plant, moving, reference, law, control),
         **_of_parts(plant, controller, measured, limits, observer, parts.sensor),
     }
-    told = _told_afterwards(plant, controller, control)
-    loggers = {}
-    for name, (port, signals) in named.items():
-        builder.ExportOutput(port, name)
-        if name not in told:
-            loggers[name] = (log_steps(builder, port, plant), signals)
-    for name in controller.shown:
-        builder.ExportOutput(controller.GetOutputPort(name), name)
-    if plant.model is not None:
-        builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+    loggers = _logged(builder, plant, controller, control, named)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -245,12 +232,36 @@ def can_be_fed_back(
     return is_direct and law.system.num_controls > 0 and not takes_more
 
 
-def _told_afterwards(plant: Plant, controller: Controller, control: OutputPort) -> set[str]:
-    """The signals of a record that follow from what was logged: nothing logs them."""
-    if not plant.functions:
-        return set()
-    acts_at_once = controller.follows and control.get_system() is controller
-    return {*plant.functions, "reference", "exogenous", *(["control"] if acts_at_once else [])}
+def _logged(
+    builder: DiagramBuilder,
+    plant: Plant,
+    controller: Controller,
+    control: OutputPort,
+    named: Named,
+) -> dict[str, tuple[VectorLogSink, Sequence[Signal]]]:
+    """Exports all signals, and logs those that do not follow from what is logged.
+
+    Args:
+        builder: The builder of the diagram.
+        plant, controller: The blocks.
+        control: What arrives at the plant.
+        named: The signals.
+    """
+    told: set[str] = set()
+    if plant.functions:
+        told = {*plant.functions, "reference", "exogenous"}
+        if controller.follows and control.get_system() is controller:
+            told.add("control")
+    loggers = {}
+    for name, (port, signals) in named.items():
+        builder.ExportOutput(port, name)
+        if name not in told:
+            loggers[name] = (log_steps(builder, port, plant), signals)
+    for name in controller.shown:
+        builder.ExportOutput(controller.GetOutputPort(name), name)
+    if plant.model is not None:
+        builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+    return loggers
 
 
 def _of_plant(

@@ -3,18 +3,20 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from importlib import import_module
+from typing import Any, ClassVar
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import positive
+from drake_dae.arrays import brief, positive
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.pushes import Push
@@ -151,3 +153,48 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 parameters=robot.parameters,
                 pushes=robot.pushes,
             )
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class OwnPlant(ScenarioPlant):
+    """The plant is one of your own: a class that keeps the contract of `drake_dae.Plant`.
+
+    It is called with the robot and the structure of its system, as `maker(model, structure)`, and
+    returns the plant. Processes of a sweep find its module as Python does, by PYTHONPATH.
+
+    Attributes:
+        maker: The module and the class or function in it, as "my_plants:SpringyPlant".
+
+    Raises:
+        ModelError: The text names no module and class.
+    """
+
+    maker: str
+
+    def __post_init__(self) -> None:
+        module, _, name = self.maker.partition(":")
+        if not (module and name.isidentifier()):
+            raise ModelError(
+                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
+                f"'{brief(self.maker)}'"
+            )
+
+    def plant(self, robot: Planted) -> Plant:
+        module, _, name = self.maker.partition(":")
+        with at("plant.maker"):
+            try:
+                made: Plant = getattr(import_module(module), name)(robot.model, robot.structure)
+            except (ImportError, AttributeError) as error:
+                raise ModelError(f"'{self.maker}' cannot be loaded: {error}") from error
+            return made
+
+
+def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
+    """The member that plain data choose; the first one where they choose none of the family.
+
+    Args:
+        data: What stands under `plant`.
+    """
+    kinds = {f"!{kind.__name__}": kind for kind in ScenarioPlant.__subclasses__()}
+    return kinds.get(data.get(TAG, ""), IdealConstraints)

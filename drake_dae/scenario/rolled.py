@@ -8,6 +8,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
@@ -47,14 +48,16 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    seeds = [scenario.force.seed] if scenario.force.is_measured else None
+    seeds = {"force_noise": scenario.force.seed} if scenario.force.is_measured else {}
+    if scenario.encoders is not None:
+        seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
     (found,) = run_loop(
         loop,
         start,
         parameters,
         rollout_times(scenario),
         config=scenario.integrator,
-        seeds=seeds,
+        seeds=[seeds],
         lasting=lasting,
         stop=stop,
     )

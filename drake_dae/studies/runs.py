@@ -25,6 +25,7 @@ from drake_dae.errors import (
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.plants import plant_kind
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.figures import exceeded, run_figures
@@ -106,7 +107,7 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     own = dict(data)
     for key in ("description", "plant_parameters", "duration", "integrator", "write"):
         own[key] = base[key]
-    if own["plant"].get(TAG) == "!MultibodyPlant":  # It is built with its numbers.
+    if plant_kind(own["plant"]).carries:  # It is built with its numbers.
         own["plant_parameters"] = data["plant_parameters"]
     first, positions = base["start"], own["start"].get("positions", {})
     if positions.keys() == first["positions"].keys():

@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
+from pydrake.systems.framework import BasicVector, LeafSystem
 
-from drake_dae import ForceOutput, PointOnSurface
+from drake_dae import Controller, ForceOutput, Plant, PointOnSurface
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.actuation.numbers import diagonal_parameter
 from drake_dae.robots.actuation.stage import AttachedStage, Stage
@@ -107,6 +108,105 @@ class TorqueLag(Stage):
             parameters=(parameter,),
             ports={"lagged_torque": slice(0, count)},
         )
+
+
+class SpringyPlant(LeafSystem, Plant):
+    """A robot whose constraints spring back where it has left them, instead of a projection:
+
+        k'' + 2 a k' + a^2 k = 0    for each constraint k of degree 2 (Baumgarte 1972).
+
+    With v_0 the force that keeps k'' = 0, that is v = v_0 - A^-1 (2 a k' + a^2 k). Its numbers are
+    fixed, nothing moves, and all of it is logged.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, model, structure, rate=40.0):
+        super().__init__()
+        self.model, self.dae, self.structure = model, model.dae, structure
+        dae, derivatives = model.dae, structure.derivatives
+        control = derivatives.control
+        exact = derivatives.expand(derivatives.constraint_input)
+        residual = structure.manifold.residual_expression
+        back = 2.0 * rate * residual[1::2] + rate**2 * residual[0::2]
+        change = -ca.solve(structure.elimination.constraint_matrix, back)
+        moved = ca.solve(ca.densify(dae.mass_matrix), ca.mtimes(dae.g, change))
+        force = exact + change
+        self._rate = dae.trace(
+            "rate", {"rate": derivatives.expand(derivatives.rate) + moved}, {"control": control}
+        )
+        shown = {
+            "constraint_force": dae.forces(force),
+            "controlled_output": dae.l + ca.mtimes(dae.m, force),
+        }
+        self._shown = {
+            n: dae.trace(n, {n: value}, {"control": control}) for n, value in shown.items()
+        }
+        self._residual = dae.trace("residual", {"residual": residual})
+        links = model.links.q.numel() + model.links.v.numel()
+
+        self.set_name(dae.name)
+        self.DeclareContinuousState(BasicVector(structure.manifold.project(dae.nominal_state)))
+        self._control = self.DeclareVectorInputPort("control", dae.num_controls)
+        of_state = {self.xc_ticket()}
+        for name, size in {"state": dae.num_states, "link_state": links}.items():
+            self.DeclareVectorOutputPort(
+                name,
+                size,
+                lambda c, out, size=size: out.SetFromVector(self.state(c)[:size]),
+                of_state,
+            )
+        for name, function in self._shown.items():
+            self.DeclareVectorOutputPort(
+                name,
+                function.function.numel_out(0),
+                lambda c, out, f=function: out.SetFromVector(
+                    f(self.state(c), self._control.Eval(c), dae.parameter_values)[0]
+                ),
+            )
+        self.DeclareVectorOutputPort(
+            "constraint_residual",
+            residual.numel(),
+            lambda c, out: out.SetFromVector(
+                self._residual(self.state(c), dae.parameter_values)[0]
+            ),
+            of_state,
+        )
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        control = self._control.Eval(context)
+        found = self._rate(self.state(context), control, self.dae.parameter_values)
+        derivatives.SetFromVector(found[0])
+
+
+class RestingController(LeafSystem, Controller):
+    """Holds a robot where a run begins: the law with references that stand still there."""
+
+    __slots__ = ()
+
+    def __init__(self, law):
+        super().__init__()
+        self.law, dae = law, law.system
+        self.set_name("resting")
+        self._goal = np.zeros(law.layout.reference_size)
+        self._goal[law.layout.lowest] = [0.3, 20.0]
+        self._state = self.DeclareVectorInputPort("estimated_state", dae.num_states)
+        self.DeclareVectorOutputPort("control", dae.num_controls, self._calc)
+
+    def _calc(self, context, output):
+        given = self._state.Eval(context), self._goal, self.law.all_parameters()
+        output.SetFromVector(self.law.function(*given)[0])
+
+    def derived(self, context, times, values):
+        signals, outputs = self.law.system.output_signals, values["controlled_output"]
+        desired = np.tile(self._goal[self.law.layout.lowest], (times.size, 1))
+        return {
+            "desired_output": (desired, signals),
+            "tracking_error": (outputs - desired, signals),
+        }
+
+    def predicted_error(self, times, values, parameters):
+        return self.law.predicted_error(times - times[0], values["state"][0], self._goal)
 
 
 def subclasses(family, package="drake_dae"):

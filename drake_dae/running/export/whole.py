@@ -90,7 +90,7 @@ def _call(name: str, function: ca.Function, inputs: Sequence[str]) -> Call:
     if len(given) < function.n_in():
         given.append(ca.SX(0, 1))
     value, valid = function.call(given)
-    regular = ca.if_else(0.0 * valid == 0.0, 1.0, 0.0)
+    regular = ca.if_else(ca.fabs(valid) < np.inf, 1.0, 0.0)
     traced = TracedFunction(name, symbols, {name: value}, regular, often=False)
     return Call(traced, list(inputs), [name])
 

@@ -1,5 +1,6 @@
 """When a diagram's discrete states change, and the random numbers that they take then."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,9 @@ from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
+
+Seed = int | Mapping[str, int]
+"""What chooses the noise of a run: one number for all sources, or the name of each -> its own."""
 
 SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
@@ -53,7 +57,7 @@ def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
 
 
 def noise_of(
-    compiled: CompiledDiagram, events: Events, start: float, seed: int | None
+    compiled: CompiledDiagram, events: Events, start: float, seed: Seed | None
 ) -> FloatArray:
     """The random numbers at the start and from each update on, shape (k + 1, number of entries).
 
@@ -63,7 +67,8 @@ def noise_of(
         compiled: The diagram.
         events: Its updates.
         start: When the run begins, in s.
-        seed: The seed; that of every run without one if None. A second source has another.
+        seed: The seed, or the name of a source -> its own; None, or a source that is not named, is
+            the noise that every run has. A second source takes another seed from a number.
     """
     found = np.zeros((events.times.size + 1, compiled.sizes["noise"]))
     for number, (source, part) in enumerate(compiled.noise):
@@ -71,7 +76,9 @@ def noise_of(
         key = update.period, update.offset, update.is_unrestricted
         keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in compiled.rates]
         own = np.flatnonzero(events.due & (1 << keys.index(key)))
-        chosen = None if seed is None else (seed + number * 2**31) % 2**32
+        chosen = (seed + number * 2**31) % 2**32 if isinstance(seed, int) else None
+        if isinstance(seed, Mapping):
+            chosen = seed.get(source.get_name())
         found[[0, *(own + 1)], part] = _drawn(source, start, events.times[own], key[0], chosen)
     return found
 

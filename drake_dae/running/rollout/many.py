@@ -40,6 +40,8 @@ UFUNCS: dict[int, Callable[..., Any]] = {
     ca.OP_COSH: np.cosh,
     ca.OP_TANH: np.tanh,
     ca.OP_FABS: np.fabs,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
     ca.OP_SIGN: np.sign,
     ca.OP_INV: np.reciprocal,
     ca.OP_NOT: lambda value, out: np.equal(value, 0.0, out),

@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray, brief, numbers
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.events import events_of, noise_of
+from drake_dae.running.rollout.events import Seed, events_of, noise_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Problem
 from drake_dae.systems.blocks.traced import Block
@@ -73,7 +73,7 @@ def problems_of(
     starts: ArrayLike,
     parameters: ArrayLike | None,
     times: FloatArray,
-    seeds: Sequence[int] | None,
+    seeds: Sequence[Seed] | None,
 ) -> list[Problem]:
     """The runs that `rollout` was asked for, whose arguments these are.
 
@@ -93,7 +93,8 @@ def problems_of(
         raise ModelError(f"{len(given)} rows of parameters for {count} starts")
     if seeds is not None and len(seeds) != count:
         raise ModelError(f"{len(seeds)} seeds for {count} starts")
-    bad = [seed for seed in seeds or () if not 0 <= seed < 2**32]
+    numbers_of = [[s] if isinstance(s, int) else list(s.values()) for s in seeds or ()]
+    bad = [seed for each in numbers_of for seed in each if not 0 <= seed < 2**32]
     if bad:
         raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(bad[0])}")
     problems, lock = [], Lock()

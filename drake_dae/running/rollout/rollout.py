@@ -15,6 +15,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout import interpreted, machine
+from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.fused import Fused
 from drake_dae.running.rollout.problems import checked_times, problems_of
@@ -65,7 +66,7 @@ def rollout(
     *,
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
-    seeds: Sequence[int] | None = None,
+    seeds: Sequence[Seed] | None = None,
 ) -> list[Rollout]:
     """Runs a diagram from one start or from thousands, without Drake, on all cores.
 
@@ -89,7 +90,8 @@ def rollout(
             without it steps of max_step_size by the scheme. Drake's default if None.
         compiled: Whether to make machine code; the choice of the plant's system if None, and "auto"
             for a diagram. "auto" makes it if that pays for the runs at hand.
-        seeds: The seed of the noise in each run; the same noise for all if None.
+        seeds: The seed of the noise in each run, or name of a RandomSource -> its seed, for several
+            of them; the same noise for all if None.
 
     Returns:
         A run for each start. One that fails has its failure, and its record up to there.
@@ -112,7 +114,7 @@ def run_loop(
     *,
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
-    seeds: Sequence[int] | None = None,
+    seeds: Sequence[Seed] | None = None,
     lasting: float | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[Rollout]:

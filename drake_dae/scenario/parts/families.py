@@ -91,7 +91,7 @@ Payload = Annotated[payloads.Payload, Form()]
 Push = Annotated[pushes.Push, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
-    plants.IdealConstraints | plants.MultibodyPlant | plants.Unilateral,
+    plants.IdealConstraints | plants.MultibodyPlant | plants.Unilateral | plants.OwnPlant,
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.layout import Layout
@@ -27,6 +28,7 @@ Derived = dict[str, tuple[FloatArray, tuple[Signal, ...]]]
 """Name of a signal -> its values, one row for each time, and their names and units."""
 
 
+@checked(ModelError)
 class Controller(System):
     """The contract of a controller: a Drake System that computes the control of a plant.
 

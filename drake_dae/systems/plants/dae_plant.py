@@ -1,27 +1,20 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
-from weakref import ref
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
-    CacheEntry,
-    CacheIndex,
     Context,
     ContinuousState,
     EventStatus,
     State,
-    ValueProducer,
 )
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.structure.passage import Passage
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import (
@@ -38,36 +31,18 @@ from drake_dae.systems.blocks.failures import (
     off_manifold,
     off_start,
 )
-from drake_dae.systems.blocks.feedback import Feedback, motion_under, nothing
+from drake_dae.systems.blocks.feedback import Feedback
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.crossing import Crossing
+from drake_dae.systems.plants.law_input import LawInput
 from drake_dae.systems.plants.traced_plant import traced_plant
 from drake_dae.trace.functions import TracedFunction
 
 _CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
-
-
-class _FedBack(NamedTuple):
-    """What a plant's derivative needs besides time and state; it never changes.
-
-    Attributes:
-        feedback: The law that is fed back; None where the control has a wire or a fixed value.
-        parameters: Values of all parameters.
-        motion: x' under that law as a function of time and state, whose array the next call
-            overwrites, None where it has no value; None without a law.
-        entry: The cache entry that this is the value of: to find it again takes longer.
-    """
-
-    feedback: Feedback | None
-    parameters: FloatArray
-    motion: Callable[[float, FloatArray], FloatArray | None] | None
-    entry: CacheEntry
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "_FedBack":
-        return self
 
 
 @checked(ModelError)
@@ -165,8 +140,8 @@ class DaePlant(ParameterizedSystem, Plant):
         self._output_needs_control = elimination.n_star.nnz() > 0
         self._is_controlled = system.num_controls > 0
         rate = derivatives.expand(derivatives.rate)
-        self._passage = Passage(structure)
-        doubt = self._passage.doubt
+        self._crossing = Crossing(structure)
+        doubt = self._crossing.doubt
         self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
         self._force = structure.trace("constraint force", force, self._force_needs_control, doubt)
         self._output = structure.trace(
@@ -177,12 +152,8 @@ class DaePlant(ParameterizedSystem, Plant):
             "constraint_residual": structure.manifold.residual_function,
             "controlled_output": self._output,
         }
+        self._crossing.stands_in_for(self.dynamics, self._force, self._output)
 
-        v = {"v": derivatives.constraint_input}
-        shown = {"force": system.forces(v["v"]), "output": system.outputs(v["v"])}
-        self._force_of, self._output_of = (
-            system.trace(name, {"value": value}, v, often=False) for name, value in shown.items()
-        )
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
         residual = structure.manifold.residual_expression
@@ -220,44 +191,19 @@ class DaePlant(ParameterizedSystem, Plant):
     def _declare_feedback(self, wanted: bool) -> None:
         """Declares the input port `feedback`, and what u depends on besides time and state."""
         self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
-        self._fed_back: CacheIndex | None = None
-        # Whoever holds an entry holds its system: a context may, but not the system itself.
-        self._entry: Callable[[], CacheEntry | None] = lambda: None
-        self._motion: tuple[TracedFunction, TracedFunction] | None = None
-        self._latest = [np.zeros(0)]
+        self._law: LawInput | None = None
         if not wanted:
             return
         if not self._is_controlled or self._exogenous is not None:
             missing = "has exogenous signals" if self._is_controlled else "has no control"
             raise ModelError(f"{self.dae.name} {missing}: no law can be fed back to it")
-        self._feedback_port = self.DeclareAbstractInputPort("feedback", nothing())
-        self._control_tickets.add(self.input_port_ticket(self._feedback_port.get_index()))
-        # Both are the same for many states: one look at the context, and not three.
-        self._fed_back = self.DeclareCacheEntry(
-            "feedback and parameters",
-            ValueProducer(nothing, weakly(self._calc_fed_back)),
-            self._control_tickets | {self.all_parameters_ticket()},
-        ).cache_index()
-
-    def _calc_fed_back(self, context: Context, value: AbstractValue) -> None:
-        is_fed_back = not self._control_port.HasValue(context)
-        feedback = self._feedback_port.Eval(context) if is_fed_back else None
-        motion = None
-        parameters = np.array(self._values(context))
-        if feedback is not None:
-            self._steps.note_law(context, feedback.parameters)
-            function = self.motion_under(feedback.function)
-            motion = feedback.motion(function, parameters, self._latest)
-        entry = self.get_cache_entry(self._fed_back)
-        self._entry = ref(entry)
-        value.set_value(_FedBack(feedback, parameters, motion, entry))
+        values, compiled = weakly(self._values), self.dae.compiled
+        self._law = LawInput(self, self._control_port, values, self._steps, self.dynamics, compiled)
+        self._control_tickets.add(self.input_port_ticket(self._law.port.get_index()))
 
     def motion_under(self, law: TracedFunction) -> TracedFunction:
         """Law and plant as one function; see `feedback.motion_under`."""
-        if self._motion is None or self._motion[0] is not law:
-            self._motion = law, motion_under(law, self.dynamics, self.dae.compiled)
-            self._latest[0] = np.zeros(0)
-        return self._motion[1]
+        return super().motion_under(law) if self._law is None else self._law.motion_under(law)
 
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
@@ -288,9 +234,8 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         # What an integrator calls most: without a call more where the values are of use.
-        if self._fed_back is not None:
-            entry = self._entry() or self.get_cache_entry(self._fed_back)
-            motion = entry.Eval(context).motion
+        if self._law is not None:
+            motion = self._law.motion(context)
             if motion is not None:
                 state = context.get_continuous_state_vector().value()
                 rate = motion(context.get_time(), state)
@@ -334,10 +279,7 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def _feedback(self, context: Context) -> Feedback | None:
         """The law that is fed back; None where the control has a wire or a fixed value."""
-        if self._fed_back is None:
-            return None
-        found: _FedBack = self.get_cache_entry(self._fed_back).Eval(context)
-        return found.feedback
+        return None if self._law is None else self._law.feedback(context)
 
     def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
         """The parameters of the law that was fed back, as `parameters_along`; None if none was."""
@@ -351,18 +293,7 @@ class DaePlant(ParameterizedSystem, Plant):
         inputs: Sequence[FloatArray],
         parameters: FloatArray,
     ) -> tuple[FloatArray, ...] | None:
-        own = tuple(value.copy() for value in function.evaluate(state, *inputs, parameters))
-        if not all(np.isfinite(given).all() for given in (state, *inputs)):
-            return None
-        is_regular = function.is_regular
-        control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
-        found = self._passage.motion(state, control, parameters)
-        if found is None:
-            return own if is_regular else None
-        if function is self.dynamics:
-            return found[:1]
-        given = {self._force: self._force_of, self._output: self._output_of}.get(function)
-        return None if given is None else (given(state, found[1], parameters)[0],)
+        return self._crossing.values(function, state, inputs, parameters)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """What a port of `functions` showed at moments, one row for each; nan where nothing.
@@ -386,16 +317,15 @@ class DaePlant(ParameterizedSystem, Plant):
             if name not in given or np.shape(given[name])[1:] != (sizes[name],):
                 raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
         return function_along(
-            function, given, lambda at: self._otherwise(function, at[0], at[1:-1], at[-1])
+            function, given, lambda at: self._crossing.values(function, at[0], at[1:-1], at[-1])
         )
 
     def _crosses(self, state: FloatArray, context: Context) -> bool:
         """Whether the system crosses a singular configuration at a state next to one."""
         control = self._control(context) if self._is_controlled else np.zeros(0)
-        return (
-            control is not None
-            and self._passage.motion(state, control, self._values(context)) is not None
-        )
+        if control is None:
+            return False
+        return self._crossing.happens(state, control, self._values(context))
 
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray

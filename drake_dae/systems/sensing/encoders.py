@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
@@ -10,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, not_traced
+from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
@@ -212,7 +213,56 @@ class StateSensor(LeafSystem):
         return np.concatenate([[sample], q, v])
 
     def traced(self) -> Block:
-        raise not_traced("a state that encoders measure")
+        count, size = self._count, self._port.size()
+        time, held = ca.SX.sym("time"), ca.SX.sym("held", 1 + 2 * count)
+        state, noise = ca.SX.sym("state", size), ca.SX.sym("noise", 2 * count)
+        sample = ca.floor(time / self.period + _SAME)
+        q, v = state[:count] + self._bias, state[count : 2 * count]
+        sources, inputs = [TIME, HELD, "state"], [time, held, state]
+        if self._noise is not None:
+            sources, inputs = [*sources, "noise"], [*inputs, noise]
+            q = q + self._position_noise * noise[:count]
+            v = v + self._velocity_noise * noise[count:]
+        rounded = np.flatnonzero(self._resolution > 0.0).tolist()
+        q = ca.SX(q)
+        for i in rounded:
+            q[i] = self._resolution[i] * _rounded(q[i] / self._resolution[i])
+        is_known = ca.fabs(held[0]) < np.inf  # Where it is a number.
+        if self.encoders.velocity_bandwidth is not None:
+            a = np.exp(-self.encoders.velocity_bandwidth * self.period)
+            filtered = a * held[1 + count :] + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
+            v = ca.if_else(is_known, filtered, v)
+        fresh = ca.vertcat(sample, q, v)
+        found = ca.if_else(ca.eq(held[0], sample), held, fresh)
+        shown = ca.vertcat(found[1:], state[2 * count :])
+        first = ca.substitute(fresh, held, ca.SX.nan(1 + 2 * count, 1))
+        begun = [source for source in sources if source != HELD]
+        given = [symbol for symbol in inputs if symbol is not held]
+        return Block(
+            self,
+            (Computation(_function(inputs, shown), tuple(sources), ("estimated_state",)),),
+            (
+                Update(
+                    Computation(_function(inputs, found), tuple(sources), (HELD,)),
+                    self.period,
+                    0.0,
+                    True,
+                ),
+            ),
+            initial=Computation(_function(given, first), tuple(begun), (HELD,)),
+        )
+
+
+def _function(inputs: list[ca.SX], value: ca.SX) -> ca.Function:
+    return ca.Function("encoders", inputs, [ca.densify(value)])
+
+
+def _rounded(number: ca.SX) -> ca.SX:
+    """The nearest whole number; of two the even one, as `numpy.round` has it."""
+    up = ca.floor(number + 0.5)
+    is_tie = ca.eq(up, number + 0.5)
+    is_odd = ca.eq(2.0 * ca.floor(up / 2.0) + 1.0, up)
+    return up - ca.logic_and(is_tie, is_odd)
 
 
 def _each(name: str, given: ArrayLike, count: int) -> FloatArray:

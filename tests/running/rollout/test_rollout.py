@@ -22,6 +22,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
+from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import (
     InconsistentStateError,
     MachineCodeWarning,
@@ -439,6 +440,11 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
             "integral=[tool.z]",
             "gains=!Poles {all: [-4, -5, -6]}",
         ],
+        ["sampling={period: 0.002}", "encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"],
+        [
+            "sampling={period: 0.002, delay: 0.001}",
+            "encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3, position_bias: 1e-4}",
+        ],
     ],
 )
 def test_sampled_laws_are_those_of_drake(settings, compiled):
@@ -447,7 +453,9 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
-    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    seeds = {"force_noise": chosen.force.seed} if chosen.force.is_measured else {}
+    if chosen.encoders is not None:
+        seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
     (found,) = rollout(
         loop,
         start,
@@ -455,7 +463,7 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
         grid(0.2, 1e-3),
         config=chosen.integrator,
         compiled=compiled,
-        seeds=seeds,
+        seeds=[seeds],
     )
     assert found.failure is None
     assert_equal_records(found.record, wanted, 1e-11)

@@ -22,6 +22,8 @@ from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 
 def measured_law(integral, gain=0.5):
@@ -70,6 +72,15 @@ BLOCKS = {
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
     "ForceSensor with a lag": lambda: ForceSensor(2, 0.01, bias=0.1),
     "ForceSensor with samples": lambda: ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
+    "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
+    "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
+    "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),
+    "StateSensor with differences": lambda: StateSensor(
+        4, 2, Encoders(resolution=1e-3, velocity_bandwidth=200.0, position_bias=0.1), 0.01
+    ),
+    "StateSensor with noise": lambda: StateSensor(
+        4, 2, Encoders(position_noise=0.1, velocity_noise=0.2), 0.01
+    ),
     "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2]),
 }
 

@@ -1,0 +1,183 @@
+"""The rules of `Controller`, on every member: those of the package and one of `members`."""
+
+import numpy as np
+import pytest
+from arms import arm, error_controlled, fixed_step, law
+from members import RestingController
+from polishing import laws, polisher, task_loop
+
+from drake_dae import (
+    Approach,
+    ConstantReference,
+    Encoders,
+    ForceSensor,
+    LoopSettings,
+    Press,
+    ReferenceGenerator,
+    RobotPlant,
+    Sampling,
+    Task,
+    TaskController,
+    Tolerances,
+    TrackingController,
+    TrackingLaw,
+    UnilateralRobotPlant,
+    poles,
+    simulate,
+    wire_loop,
+)
+from drake_dae.errors import ModelError, WiringError
+from drake_dae.systems.control.contract import Controller
+
+GOALS = [0.3, 20.0]
+
+
+def integrating():
+    found = arm("two_link")
+    chosen = TrackingLaw(
+        found.model.dae, poles(-4.0), structure=found.structure, integral=["tool.z"]
+    )
+    return TrackingController(chosen)
+
+
+def task():
+    return TaskController(Task([Approach(), Press(20.0)]), *laws())
+
+
+MEMBERS = {
+    "law": lambda: TrackingController(law("two_link")),
+    "with integral": integrating,
+    "task": task,
+    "resting": lambda: RestingController(law("two_link")),
+}
+
+
+def wired(controller, **settings):
+    """A loop of a controller, at rest where it begins."""
+    plant, generator = RobotPlant(arm("two_link").model, structure=arm("two_link").structure), None
+    if controller.takes_over:
+        plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
+    elif controller.HasInputPort("reference"):
+        generator = ReferenceGenerator(
+            [ConstantReference(goal) for goal in GOALS], controller.law.degrees
+        )
+    loop = wire_loop(plant, controller, generator, LoopSettings(**settings))
+    context = loop.diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    if controller.takes_over:
+        plant.set_state(own, controller.rest_state([0.3, 0.02], plant.dae.nominal_state))
+    else:
+        q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
+        plant.set_consistent_state(own, [*q, 0.0, 0.0])
+    return loop, context
+
+
+def test_no_member_is_left_out():
+    package = {cls for cls in Controller.__subclasses__() if cls.__module__.startswith("drake_dae")}
+    assert package <= {type(make()) for make in MEMBERS.values()}
+
+
+@pytest.fixture(params=MEMBERS)
+def controller(request):
+    return MEMBERS[request.param]()
+
+
+def test_rules_1_and_2_what_it_reads_and_gives(controller):
+    dae, optional = controller.law.system, {"reference", "measured_force", "exogenous", "hold"}
+    assert controller.GetInputPort("estimated_state").size() == dae.num_states
+    names = {controller.get_input_port(i).get_name() for i in range(controller.num_input_ports())}
+    assert names - {"estimated_state"} <= optional
+    assert controller.GetOutputPort("control").size() == dae.num_controls
+    for name, signals in controller.further_signals.items():
+        assert controller.GetOutputPort(name).size() == len(signals), name
+    for name in controller.shown:
+        assert controller.HasOutputPort(name)
+        assert name not in controller.further_signals
+
+
+def test_rule_3_laws(controller):
+    context = controller.CreateDefaultContext()
+    values = controller.all_parameters(context)
+    assert values.shape == controller.law.all_parameters().shape
+    np.testing.assert_array_equal(
+        controller.parameters_along(context, [0.0, 1.0]), [values, values]
+    )
+    if controller.takes_over or isinstance(controller, RestingController):
+        with pytest.raises(ModelError, match="are fixed when it is made"):
+            controller.set_gains(context, poles(-9.0))
+    else:
+        controller.set_gains(context, poles(-9.0))
+        assert not np.array_equal(controller.all_parameters(context), values)
+
+
+def test_rule_4_plants_and_parts(controller):
+    with pytest.raises(WiringError, match="14 states, 7 controls"):
+        controller.check_plant(
+            RobotPlant(arm("seven_joint").model, structure=arm("seven_joint").structure)
+        )
+    parts = {
+        "exogenous": [ConstantReference(0.0)],
+        "plant_exogenous": [ConstantReference(0.0)],
+        "control_limits": [1.0, 1.0],
+        "encoders": Encoders(1e-5),
+        "tolerances": Tolerances({"tool.z": 0.1}),
+    }
+    for name, why in controller.refused.items():
+        assert why[0].islower()
+        if name in parts:
+            with pytest.raises(WiringError, match=f"^{name}: {why}"):
+                wired(controller, **{name: parts[name]})
+
+
+def test_what_takes_references_is_refused_where_there_are_none():
+    with pytest.raises(WiringError, match="tolerances: it takes the references of a generator"):
+        wired(MEMBERS["resting"](), tolerances=Tolerances({"tool.z": 0.1}))
+
+
+def test_a_sensor_that_nothing_reads_is_refused(controller):
+    if not controller.HasInputPort("measured_force"):
+        with pytest.raises(WiringError, match="takes no measured force"):
+            wired(controller, sensor=ForceSensor(1, 0.01))
+
+
+@pytest.mark.slow
+def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
+    """At rest at its goals a law has no error: round-off, and that of steps of 1 ms."""
+    loop, context = wired(controller)
+    config = error_controlled(1e-8) if controller.takes_over else fixed_step()
+    simulate(loop.diagram, context, 0.05, config)
+    record = loop.record(context)
+    assert {"desired_output", "tracking_error", "control"} <= {*record.signals}
+    outputs, desired = record["controlled_output"], record["desired_output"]
+    np.testing.assert_allclose(record["tracking_error"], outputs - desired, atol=1e-12)
+    predicted = loop.predicted_error(record)
+    assert predicted.shape == record["tracking_error"].shape
+    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-6)
+    own = controller.GetMyContextFromRoot(context)
+    assert ("control" in loop.loggers) is not controller.follows
+    assert len(controller.changes(own)) == (1 if controller.takes_over else 0)
+
+
+@pytest.mark.slow
+def test_a_controller_that_is_sampled_is_logged(controller):
+    if controller.takes_over:
+        controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=0.01)
+    loop, context = wired(controller, sampling=Sampling(0.01))
+    simulate(loop.diagram, context, 0.02, fixed_step())
+    assert "control" in loop.loggers
+    assert np.isfinite(loop.record(context)["control"]).all()
+
+
+def test_rule_7_starts(controller):
+    manifold = controller.start_structure.manifold
+    assert manifold.system.num_states == controller.law.system.num_states
+    assert manifold.is_consistent(manifold.project(manifold.system.nominal_state))
+
+
+def test_rule_8_phases():
+    """A task tells when it began; a law has no phases."""
+    loop = task_loop([Approach(), Press(20.0)])
+    assert loop.changes(loop.diagram.CreateDefaultContext()) == ()
+    assert loop.controller.phase_signals[0].name == "1 Approach"
+    other, context = wired(MEMBERS["law"]())
+    assert other.changes(context) == ()

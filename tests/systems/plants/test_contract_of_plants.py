@@ -1,0 +1,302 @@
+"""The rules of `Plant`, on every member: those of the package and one of `members`."""
+
+import os
+from functools import cache
+from pathlib import Path
+
+import members
+import numpy as np
+import pytest
+from arms import arm, fixed_step
+from members import SpringyPlant
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_dae import (
+    ConstantReference,
+    ContactMaterial,
+    ContactPlant,
+    DaePlant,
+    RobotPlant,
+    TrackingLaw,
+    UnilateralRobotPlant,
+    build_scenario,
+    load_scenario,
+    make_animation,
+    make_closed_loop,
+    poles,
+    simulate,
+    start_meshcat,
+    sweep,
+)
+from drake_dae.diagrams.parts import log_steps
+from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.scenario.model import add_robot
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.simulation.records.record import Record
+from drake_dae.studies.runs import Outcome
+from drake_dae.systems.plants.contract import Plant
+
+FINE = 1e-10
+"""Round-off of a few hundred operations on forces of some 10 N."""
+
+
+def contact():
+    found = arm("two_link")
+    robot = load_scenario(find_scenario("two_link_wall")).robot
+    return ContactPlant(
+        found.model,
+        lambda plant, scene_graph: add_robot(robot, plant, scene_graph),
+        ContactMaterial(),
+        structure=found.structure,
+    )
+
+
+MEMBERS = {
+    "dae": lambda: DaePlant(arm("two_link").model.dae, structure=arm("two_link").structure),
+    "robot": lambda: RobotPlant(arm("two_link").model, structure=arm("two_link").structure),
+    "fed back": lambda: RobotPlant(
+        arm("two_link").model, structure=arm("two_link").structure, feedback=True
+    ),
+    "unilateral": lambda: UnilateralRobotPlant(
+        arm("two_link").model, {"wall": 0.0}, structure=arm("two_link").structure
+    ),
+    "contact": contact,
+    "springy": lambda: SpringyPlant(arm("two_link").model, arm("two_link").structure),
+}
+
+
+def test_no_member_is_left_out():
+    """Bases of one member alone, as what shows the modes of a plant, are none."""
+
+    def leaves(cls):
+        own = cls.__subclasses__()
+        return set().union(*map(leaves, own)) | (
+            {cls} if cls.__module__.endswith("plant") else set()
+        )
+
+    package = {cls for cls in leaves(Plant) if cls.__module__.startswith("drake_dae")}
+    assert package <= {type(make()) for make in MEMBERS.values()}
+
+
+@pytest.fixture(params=MEMBERS)
+def plant(request):
+    return MEMBERS[request.param]()
+
+
+def run_of(plant, duration=0.02):
+    """The plant, its diagram, its context and what was logged, with a control that stands still."""
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    source = builder.AddSystem(ConstantVectorSource([20.0, 10.0]))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    ports = {
+        "state": plant.dae.state_signals,
+        "constraint_force": plant.dae.force_signals,
+        "constraint_residual": plant.structure.manifold.residual_signals,
+        "controlled_output": plant.dae.output_signals,
+        **plant.further_signals,
+    }
+    loggers = {n: (log_steps(builder, plant.GetOutputPort(n), plant), s) for n, s in ports.items()}
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_consistent_state(own, plant.dae.nominal_state)
+    simulate(diagram, context, duration, fixed_step())
+    return own, Record.from_logs(loggers, context)
+
+
+def test_rule_1_ports(plant):
+    dae = plant.dae
+    assert plant.GetInputPort("control").size() == dae.num_controls
+    sizes = {
+        "state": dae.state_signals,
+        "constraint_force": dae.force_signals,
+        "constraint_residual": plant.structure.manifold.residual_signals,
+        "controlled_output": dae.output_signals,
+        **plant.further_signals,
+    }
+    for name, signals in sizes.items():
+        assert plant.GetOutputPort(name).size() == len(signals), name
+
+
+def test_rules_2_and_3_system_and_robot(plant):
+    assert plant.structure.system is plant.dae
+    if plant.model is None:
+        with pytest.raises(ModelError, match="an animation needs a robot, as of a RobotPlant"):
+            plant.robot("an animation")
+        return
+    assert plant.robot("an animation") is plant.model
+    assert plant.model.dae.state_signals == plant.dae.state_signals
+    links = plant.model.links
+    assert plant.GetOutputPort("link_state").size() == links.q.numel() + links.v.numel()
+
+
+def test_rule_4_state_and_steps(plant):
+    """A plant logs a sample at each step of 1 ms, its own or the integrator's, and at the end."""
+    own, record = run_of(plant)
+    assert plant.time_step >= 0.0
+    assert record.time.size == 21
+    np.testing.assert_array_equal(plant.GetOutputPort("state").Eval(own), plant.state(own))
+
+
+def test_rules_5_and_6_what_is_computed_afterwards_is_what_the_ports_showed(plant):
+    own, record = run_of(plant)
+    given = {name: record[name] for name in record.signals if name not in plant.functions}
+    given["parameters"] = plant.parameters_along(own, record.time)
+    given["control"] = np.tile(plant.GetInputPort("control").Eval(own), (record.time.size, 1))
+    for port in plant.functions:
+        np.testing.assert_allclose(plant.along(port, given), record[port], atol=FINE, err_msg=port)
+    with pytest.raises(ModelError, match="port"):
+        plant.along("nothing", given)
+
+
+def test_rule_7_exogenous_signals(plant):
+    assert not plant.exogenous_layout.degrees  # Of this robot nothing moves.
+    assert list(plant.exogenous_places) == []
+    assert not plant.HasInputPort("exogenous")
+
+
+def test_rule_8_parameters(plant):
+    context = plant.CreateDefaultContext()
+    before = plant.parameters(context)
+    np.testing.assert_array_equal(before, plant.dae.parameter_values)
+    np.testing.assert_array_equal(plant.current_parameters(context), before)
+    np.testing.assert_array_equal(plant.parameters_along(context, [0.0, 1.0]), [before, before])
+    with pytest.raises(ModelError, match="nothing"):
+        plant.set_parameter(context, "nothing", 1.0)
+    place = plant.dae.parameter_slice("link2.mass")
+    if isinstance(plant, ContactPlant | SpringyPlant):  # A test knows its members.
+        with pytest.raises(ModelError, match="fixed when it is made"):
+            plant.set_parameter(context, "link2.mass", 6.0)
+        np.testing.assert_array_equal(plant.parameters(context), before)
+    else:
+        plant.set_parameter(context, "link2.mass", 6.0)
+        assert plant.parameters(context)[place] == 6.0
+
+
+def test_rule_9_starts(plant):
+    context, nominal = plant.CreateDefaultContext(), plant.dae.nominal_state
+    plant.set_state(context, nominal)
+    np.testing.assert_array_equal(plant.state(context), nominal)
+    found = plant.set_consistent_state(context, nominal)
+    np.testing.assert_array_equal(plant.state(context), found)
+    assert plant.structure.manifold.is_consistent(found)
+    with pytest.raises(ModelError, match="shape"):
+        plant.set_state(context, nominal[:-1])
+
+
+def test_rule_10_opening_contacts(plant):
+    own, record = run_of(plant)
+    assert len(plant.contacts) == len(plant.normals)
+    if plant.contacts:
+        names = [plant.dae.force_signals[i].name.split(".")[0] for i in plant.normals]
+        assert tuple(names) == plant.contacts
+        is_open = record["mode"] == 0.0
+        assert not record["constraint_force"][:, list(plant.normals)][is_open].any()
+    for event in plant.events(own):
+        assert set(event.contacts) <= set(plant.contacts)
+
+
+def test_rules_11_and_13_projection_and_contact(plant):
+    """Fixed steps of 1 ms leave N* by less than 1e-9, and by no more than round-off with it."""
+    _, record = run_of(plant)
+    assert plant.projects in (True, False)
+    if plant.is_ideal:
+        assert np.max(np.abs(record["constraint_residual"])) < 1e-9
+    else:  # A contact that gives way is pressed in.
+        assert np.max(np.abs(record["constraint_residual"])) > 1e-6
+
+
+def test_rule_12_feedback(plant):
+    context = plant.CreateDefaultContext()
+    assert plant.laws_along(context, [0.0]) is None
+    function = arm_law().function
+    if plant.HasInputPort("feedback"):
+        assert plant.motion_under(function).input_names[-1] == "plant"
+
+
+@cache
+def arm_law():
+    return TrackingLaw(arm("two_link").model.dae, poles(-4.0), structure=arm("two_link").structure)
+
+
+@pytest.fixture(scope="module")
+def meshcat():
+    return start_meshcat()
+
+
+@pytest.mark.slow
+def test_every_member_goes_through_a_loop(plant, meshcat):
+    """Wiring, a run, its record, live view and picture; the ideal ones follow theory.
+
+    From N* on, with steps of 1 ms, RK5 leaves less than 1e-8 of errors of 5 cm.
+    """
+    references = [ConstantReference(0.3), ConstantReference(20.0)]
+    loop = make_closed_loop(plant, arm_law(), references, meshcat=meshcat)
+    context = loop.diagram.CreateDefaultContext()
+    q = arm("two_link").model.configuration([0.35], [1.2, -1.6])
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_consistent_state(own, [*q, 0.0, 0.0])
+    simulate(loop.diagram, context, 0.1, fixed_step())
+    record = loop.record(context)
+    assert {"state", "constraint_force", "reference", "control", "tracking_error"} <= {
+        *record.signals
+    }
+    if plant.is_ideal:
+        np.testing.assert_allclose(
+            record["tracking_error"], loop.predicted_error(record), atol=1e-8
+        )
+    is_drawn = loop.diagram.HasSubsystemNamed("constraint_force_visualizer")
+    assert is_drawn is (plant.model is not None)
+    if plant.model is not None:
+        assert "<html" in make_animation(loop, record, context)
+
+
+def test_a_plant_from_outside_springs_back_as_its_equation_says():
+    """k = k_0 (1 + a t) exp(-a t) from k' = 0; RK5 with 1 ms leaves 1e-9 of it."""
+    plant = MEMBERS["springy"]()
+    loop = make_closed_loop(plant, arm_law(), [ConstantReference(0.3), ConstantReference(20.0)])
+    context = loop.diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    state = plant.set_consistent_state(own, plant.dae.nominal_state)
+    plant.set_state(own, state + np.array([1e-3, 0.0, 0.0, 0.0]))
+    simulate(loop.diagram, context, 0.2, fixed_step())
+    record = loop.record(context)
+    k, at = record["constraint_residual"][:, 0], 40.0 * record.time
+    np.testing.assert_allclose(k, k[0] * (1.0 + at) * np.exp(-at), atol=1e-6 * abs(k[0]))
+
+
+@pytest.mark.slow
+def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monkeypatch):
+    """Named in the file alone. Its errors are those of the package's plant, to the accuracy."""
+    places = [str(Path(members.__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, places)))  # Of other processes.
+    settings = ["duration=0.1", "integrator.accuracy=1e-8"]
+    path = find_scenario("two_link_wall")
+    changes = [{"start.errors": {"tool.z": 0.05}}, {"start.errors": {"tool.z": 0.02}}]
+    found = []
+    for kind in ("!OwnPlant {maker: 'members:SpringyPlant'}", "!IdealConstraints {}"):
+        scenario = load_scenario(path, [*settings, f"plant={kind}"])
+        study = sweep(scenario, changes, tmp_path / f"{len(found)}.jsonl", workers=1)
+        assert {run.outcome for run in study.results} == {Outcome.FINISHED}, study.results
+        found.append([run.figures["largest error of tool.z [m]"] for run in study.results])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("maker", "told"),
+    [
+        ("members", "plant: maker: a module and a class in it are needed"),
+        (
+            "no_such_module:Plant",
+            r"plant.maker: 'no_such_module:Plant' cannot be loaded: No module",
+        ),
+        ("members:NoSuchPlant", "plant.maker: .* has no attribute 'NoSuchPlant'"),
+    ],
+)
+def test_a_plant_that_cannot_be_loaded_is_refused_with_its_key(maker, told):
+    with pytest.raises(ScenarioError, match=told):
+        build_scenario(
+            load_scenario(find_scenario("two_link_wall"), [f"plant=!OwnPlant {{maker: '{maker}'}}"])
+        )
