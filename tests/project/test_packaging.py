@@ -43,11 +43,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_from_sdist_holds_every_file_of_the_package(wheel: Path) -> None:
     expected = {
         Path(folder, file).relative_to(ROOT).as_posix()
-        for folder, _, files in os.walk(ROOT / "drake_dae", followlinks=True)
+        for folder, _, files in os.walk(ROOT / "drake_dae")
         for file in files
         if Path(folder).name != "__pycache__" and not file.startswith(".")
     }
-    # What it must be able to lose: the folder behind the link, and each kind of file in it.
+    # Each kind of file, and the folder that the link at the top leads to.
     diagrams = {name for name in expected if name.startswith("drake_dae/diagrams/")}
     assert {Path(name).suffix for name in diagrams} >= {".py", ".urdf", ".xml", ".yaml"}
     packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}

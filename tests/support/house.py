@@ -5,7 +5,6 @@ so that nothing is loaded, and those inside functions or under TYPE_CHECKING cou
 """
 
 import ast
-import os
 import re
 import sys
 import tomllib
@@ -82,13 +81,9 @@ def declared_modules() -> set[str]:
 
 
 def modules() -> dict[str, Path]:
-    """Every module of the package; os.walk, since rglob does not follow the link to diagrams."""
-    found = {}
-    for folder, _, files in os.walk(PACKAGE, followlinks=True):
-        for path in (Path(folder, file) for file in files if file.endswith(".py")):
-            parts = ("drake_dae", *path.relative_to(PACKAGE).with_suffix("").parts)
-            found[".".join(parts)] = path
-    return found
+    """Every module of the package."""
+    paths = {path: path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.py")}
+    return {".".join(inside.with_suffix("").parts): path for path, inside in paths.items()}
 
 
 def imported_modules(module: str, source: str, existing: set[str]) -> set[str]:
