@@ -92,9 +92,14 @@ def check_parts(
         parts: The parts.
 
     Raises:
-        WiringError: The controller cannot be wired with a part, the sensor measures another number
-            of forces, or no law uses it.
+        WiringError: The controller cannot be wired with a part, or needs references that are not
+            given, the sensor measures another number of forces, or no law uses it.
     """
+    if controller.HasInputPort("reference") is not (reference is not None):
+        needs = "plans its references itself: leave `reference` out"
+        if reference is None:
+            needs = "needs a ReferenceGenerator(references, controller.law.degrees)"
+        raise WiringError(f"{controller.get_name()} {needs}")
     refused = controller.refused if reference is not None else {**_NEEDS, **controller.refused}
     given = {name: getattr(parts, name) for name in refused}
     found = [
@@ -195,14 +200,17 @@ def add_hold(
     builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
 
 
-def open_holds(builder: DiagramBuilder, plant: Plant, law: TrackingLaw) -> list[OutputPort]:
+def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) -> list[OutputPort]:
     """Ports for the `hold` of a controller: integrals of forces of open contacts stand still.
 
     Args:
         builder: The builder of the diagram, with the plant in it.
         plant: The plant.
-        law: The law, whose integrals they are.
+        controller: The controller, of whose law they are.
     """
+    if not controller.HasInputPort("hold"):
+        return []
+    law = controller.law
     inputs = law.measured_force.inputs if law.measured_force else {}
     found = np.zeros((len(law.integral.outputs), len(plant.contacts)))
     for row, output in enumerate(law.integral.outputs):

@@ -140,6 +140,7 @@ def wire_loop(
     for block in (plant, reference, controller):
         if block is not None:
             add_block(builder, block)
+    goal = None if reference is None else reference.GetOutputPort("reference")
 
     # The state goes to the controller, through encoders.
     state, measured = plant.GetOutputPort("state"), None
@@ -156,9 +157,8 @@ def wire_loop(
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
         builder.Connect(control, plant.GetInputPort("control"))
-        if reference is not None:
-            wanted = reference.GetOutputPort("reference")
-            builder.Connect(wanted, controller.GetInputPort("reference"))
+        if goal is not None:
+            builder.Connect(goal, controller.GetInputPort("reference"))
 
     # What nobody here steers goes to both, to the plant as it is and to the law as it knows it.
     own = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
@@ -167,11 +167,10 @@ def wire_loop(
 
     # An observer tells the law what its model lacks. Integrals stand still while a contact is open
     # or lost, or a drive is at its limit.
-    holds, observer = open_holds(builder, plant, law), None
-    if parts.observer is not None and reference is not None:
-        wanted = reference.GetOutputPort("reference")
+    holds, observer = open_holds(builder, plant, controller), None
+    if parts.observer is not None and goal is not None:
         observer = add_observer(
-            builder, plant, controller, parts.observer, state, held, control, wanted, limits
+            builder, plant, controller, parts.observer, state, held, control, goal, limits
         )
         holds.append(observer.GetOutputPort("hold"))
     elif limits is not None:

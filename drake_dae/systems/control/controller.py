@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cache
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -90,11 +91,20 @@ class TrackingController(ParameterizedSystem, Controller):
     __slots__ = SHARED_DICTIONARY
     follows, shown = True, ("tracking_error",)
 
+    def __new__(cls, *arguments: Any, **named: Any) -> Self:
+        """A controller of a class with a time derivative, where its integrals are continuous."""
+        law = arguments[0] if arguments else named.get("law")
+        integral = getattr(law, "integral", None)  # __init__ refuses what is no law.
+        if integral is None or not integral.outputs or named.get("sample_period"):
+            return super().__new__(cls)
+        return super().__new__(_integrating(cls))  # type: ignore[arg-type]
+
     def __init__(
         self,
         law: TrackingLaw,
         outputs: ArrayLike | None = None,
         integral_limits: ArrayLike = np.inf,
+        *,
         sample_period: float = 0.0,
         references: ReferenceGenerator | None = None,
         feedback: bool = False,
@@ -153,7 +163,6 @@ class TrackingController(ParameterizedSystem, Controller):
             tickets = {self.xd_ticket()}
         else:
             self.DeclareContinuousState(count)
-            self.__class__ = _integrating(type(self))  # type: ignore[arg-type]
             tickets = state_tickets(self)
         self._evaluators.append(weakly(self._integrals))
         self._rate_evaluators = list(self._evaluators)

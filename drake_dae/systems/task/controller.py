@@ -22,7 +22,7 @@ from drake_dae.systems.control.contract import Controller, Derived, check_same_s
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.laws import check_laws
+from drake_dae.systems.task.open_contact import opened_contact
 from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import Segment, places_at
@@ -116,7 +116,7 @@ class TaskController(Diagram, Controller):
             raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
         self.task, self.law, self.free_law = task, law, free_law
         self.sample_period = sample_period
-        self.place, self.force = check_laws(law, free_law)
+        self.place, self.force = opened_contact(law, free_law)
         self.outputs = self._trace_outputs()
         distance = law.system.constraint_output_signals[self.force]
         self.output_signals = (*law.system.output_signals, distance)

@@ -134,6 +134,19 @@ def test_what_takes_references_is_refused_where_there_are_none():
         wired(MEMBERS["resting"](), tolerances=Tolerances({"tool.z": 0.1}))
 
 
+def test_references_are_where_the_controller_takes_them(controller):
+    plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
+    if controller.takes_over:
+        plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
+    if controller.HasInputPort("reference"):
+        with pytest.raises(WiringError, match="tracking_controller needs a ReferenceGenerator"):
+            wire_loop(plant, controller)
+    else:
+        generator = ReferenceGenerator([ConstantReference(g) for g in GOALS], [2, 0])
+        with pytest.raises(WiringError, match="plans its references itself"):
+            wire_loop(plant, controller, generator)
+
+
 def test_a_sensor_that_nothing_reads_is_refused(controller):
     if not controller.HasInputPort("measured_force"):
         with pytest.raises(WiringError, match="takes no measured force"):
