@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from alone import alone
+from blocks_of_users import Counter_
 from pydrake.common import RandomDistribution
 from pydrake.math import sin
 from pydrake.symbolic import Variable, if_then_else, logical_and
@@ -108,6 +109,7 @@ SYSTEMS = {
     "SymbolicVectorSystem": by_symbols,
     "a diagram of primitives": lambda: StateInterpolatorWithDiscreteDerivative(2, 0.1),
     "a template of the user's": lambda: Pendulum_[None](0.8),
+    "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
 }
 
 
@@ -250,3 +252,30 @@ def test_a_multirate_loop_of_primitives_is_that_of_the_simulator():
     simulator.get_mutable_integrator().set_target_accuracy(1e-12)
     simulator.AdvanceTo(2.0)
     np.testing.assert_allclose(state, compiled.start(simulator.get_context())[0], atol=1e-10)
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_an_input_of_a_diagram_inside_feeds_all_blocks_that_take_it(depth):
+    source = Sine(1.0, 2.0, 0.3, 1)
+    inner = DiagramBuilder()
+    gains = [inner.AddSystem(Gain(factor, 1)) for factor in (2.0, -3.0, 5.0)]
+    inner.ExportInput(gains[0].get_input_port(), "in")
+    for number, gain in enumerate(gains):
+        if number:
+            inner.ConnectInput("in", gain.get_input_port())
+        inner.ExportOutput(gain.get_output_port(), f"out {number}")
+    block = inner.Build()
+    for level in range(depth):
+        builder = DiagramBuilder()
+        builder.AddSystem(block)
+        if level == depth - 1:
+            builder.Connect(builder.AddSystem(source).get_output_port(0), block.get_input_port())
+        else:
+            builder.ExportInput(block.get_input_port(), "in")
+        for number in range(3):
+            builder.ExportOutput(block.GetOutputPort(f"out {number}"), f"out {number}")
+        block = builder.Build()
+    compiled, context = compile_diagram(block), block.CreateDefaultContext()
+    context.SetTime(0.7)
+    row, _ = compiled.row(0.7, *compiled.start(context), compiled.values(context))
+    np.testing.assert_allclose(row.full()[:, 0], np.array([2.0, -3.0, 5.0]) * np.sin(1.7))

@@ -259,3 +259,36 @@ def test_the_inverse_holds_no_unknown_whose_slope_cancels():
     found, *_ = motion.inverse(both, wanted)
     function = TracedFunction("inverse", {"x": x, "wanted": wanted}, {"u": found})
     np.testing.assert_allclose(function([0.3, 0.2, 0.1, 0.4], [5.0, 7.0])[0], [5.0, 7.0])
+
+
+@pytest.mark.parametrize("angle", [1.0, 0.3, -1e-3, 1e-13, 0.0])
+def test_the_inverse_tells_where_constraint_inputs_that_no_control_moves_are_not_determined(angle):
+    """A has the columns (1, 0) and (cos a, sin a): its pivot is |sin a|. v is of the state alone,
+
+    v_2 = -w_2 / sin a and v_1 = -w_1 - cos a v_2, and u = wanted - v_1 - 2 v_2 needs it.
+    """
+    x = ca.SX.sym("x", 6)  # Two that are held, a, w_1, w_2, and what u moves.
+    system = DaeSystem(
+        state=x,
+        f=ca.vertcat(x[3], x[4], 0, 0, 0, 0),
+        g=ca.vertcat(
+            ca.horzcat(1, ca.cos(x[2])),
+            ca.horzcat(0, ca.sin(x[2])),
+            ca.SX(3, 2),
+            ca.SX([[1, 2]]),
+        ),
+        h=ca.vertcat(ca.SX(5, 1), 1),
+        k=x[:2],
+        l=x[5],
+        m=ca.SX(1, 2),
+        nominal_state=[0.0, 0.0, 1.0, 0.4, 0.7, 0.2],
+    )
+    motion = find_structure(system).derivatives
+    control, pivot, _ = motion.inverse(motion.rate[5], ca.SX(3.0))
+    function = ca.Function("inverse", [x], [control, pivot])
+    found = [value.full().item() for value in function([0.0, 0.0, angle, 0.4, 0.7, 0.2])]
+    assert found[1] == pytest.approx(abs(np.sin(angle)), rel=1e-9, abs=1e-300)
+    if abs(angle) > 1e-6:
+        second = -0.7 / np.sin(angle)
+        first = -0.4 - np.cos(angle) * second
+        assert found[0] == pytest.approx(3.0 - first - 2.0 * second, rel=1e-9)

@@ -5,15 +5,18 @@ import subprocess
 
 import numpy as np
 import pytest
+from blocks_of_users import Counter_, Guarded
 from by_hand import OUTPUTS, wired
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import (
     Adder,
+    ConstantVectorSource,
     DiscreteDerivative,
     FirstOrderLowPassFilter,
     Gain,
+    Integrator,
     LinearSystem,
     LogVectorOutput,
     RandomSource,
@@ -175,3 +178,87 @@ def test_what_drake_alone_can_run_is_named():
     diagram = builder.Build()
     with pytest.raises(ModelError, match=r"'my own block' \(WrapToSystem\) cannot be traced"):
         start_values(diagram, diagram.CreateDefaultContext())
+
+
+@both
+@pytest.mark.parametrize("begin", [0.0, 0.2, 0.43])
+def test_updates_begin_at_their_offset(begin, compiled):
+    """A counter at 0.3, 0.4, ... s from some start on is that of Drake's Simulator."""
+    builder = DiagramBuilder()
+    one = builder.AddSystem(ConstantVectorSource([1.0]))
+    counter = builder.AddSystem(Counter_[None](0.1, 0.3))
+    builder.Connect(one.get_output_port(), counter.get_input_port())
+    builder.ExportOutput(counter.get_output_port(), "sum")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    start, parameters = start_values(diagram, context)
+    times = np.arange(0.01, 1.0, 0.05)
+    times = np.array([begin, *times[times > begin]])
+    (found,) = rollout(diagram, start, parameters, times, config=fixed(5e-3), compiled=compiled)
+    context.SetTime(begin)
+    simulator = Simulator(diagram, context)
+    wanted = []
+    for time in times[1:]:
+        simulator.AdvanceTo(time)
+        wanted.append(counter.get_output_port().Eval(counter.GetMyContextFromRoot(context))[0])
+    assert wanted[-1] > 3.0
+    np.testing.assert_array_equal(found.record["sum"][1:, 0], wanted)
+
+
+@both
+def test_two_sources_of_noise_of_one_run_have_numbers_of_their_own(compiled):
+    """And each run those of its seed."""
+    builder = DiagramBuilder()
+    for name in ("one", "other"):
+        noise = builder.AddNamedSystem(name, RandomSource(RandomDistribution.kGaussian, 1, 0.1))
+        builder.ExportOutput(noise.get_output_port(), name)
+    low = builder.AddSystem(FirstOrderLowPassFilter(0.05, 1))
+    builder.Connect(noise.get_output_port(), low.get_input_port())
+    builder.ExportOutput(low.get_output_port(), "filtered")
+    diagram = builder.Build()
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    times = np.arange(10) * 0.1 + 0.05
+    seeds = [3, 4, 3]
+    found = rollout(
+        diagram,
+        [start] * 3,
+        parameters,
+        times,
+        config=fixed(5e-2),
+        compiled=compiled,
+        seeds=seeds,
+    )
+    first, second, again = (
+        np.hstack([run.record["one"], run.record["other"]]).ravel().tolist() for run in found
+    )
+    assert first == again
+    assert len({*first, *second}) == len(first) + len(second)
+
+
+@both
+@pytest.mark.parametrize("is_held", [False, True])
+@pytest.mark.parametrize("is_fixed", [True, False])
+def test_a_run_ends_where_a_block_has_no_value_of_use(is_fixed, is_held, compiled):
+    """cos(w t) > 0 up to 0.55 s: a derivative ends there, an update at the sample after it.
+
+    No value is infinite or no number. The step that fails begins 0.02 s before, or less.
+    """
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Sine(1.0, np.pi / 1.1, np.pi / 2.0, 1))
+    chain = [Guarded(), *([ZeroOrderHold(0.1, 1)] if is_held else []), Integrator(1)]
+    last = source.get_output_port(0)
+    for block in chain:
+        builder.AddSystem(block)
+        builder.Connect(last, block.get_input_port(0))
+        last = block.get_output_port(0)
+    builder.ExportOutput(last, "sum")
+    diagram = builder.Build()
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    config = fixed(1e-2)
+    config.use_error_control, config.accuracy = not is_fixed, 1e-6
+    config.max_step_size = 1e-2
+    times = np.linspace(0.0, 1.0, 101)
+    (found,) = rollout(diagram, start, parameters, times, config=config, compiled=compiled)
+    assert found.failure is not None
+    assert found.failure.time == pytest.approx(0.6 if is_held else 0.55, abs=0.02)
+    assert np.isfinite(found.record["sum"]).all()

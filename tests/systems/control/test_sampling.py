@@ -1,5 +1,6 @@
 """Sampled laws and drives with limits, against maps written by hand and the continuous law."""
 
+import re
 from itertools import pairwise
 
 import casadi as ca
@@ -25,6 +26,7 @@ from drake_dae import (
     Sampling,
     SinusoidReference,
     TrackingLaw,
+    build_scenario,
     make_closed_loop,
     poles,
     simulate,
@@ -292,3 +294,60 @@ def test_scenario_samples_and_limits():
     assert found.sampling == Sampling(2e-3, 1e-3)
     with pytest.raises(ScenarioError, match="sampling: a sampling's period must be positive"):
         scenario("two_link_wall", "sampling={period: 0.0}")
+
+
+def grown(gain, a, late):
+    """By how much errors of the measured force grow in a sample, by the loop sample by sample."""
+    felt, read, sizes = 1.0, [1.0] * late, []
+    for _ in range(400):
+        read.append(felt)
+        felt = a * felt - (1.0 - a) * gain * read.pop(0)
+        sizes.append(abs(felt))
+    return (max(sizes[-20:]) / max(sizes[180:200])) ** (1.0 / 200.0)
+
+
+@pytest.mark.parametrize(("gain", "late"), [(7.0, 0), (4.6, 1)])
+def test_what_a_sampled_sensor_takes_is_read_a_sample_later(gain, late):
+    """These gains would be stable, were the newest sample read at once.
+
+    Maxima over 20 samples of an error that swings tell its growth in 200 to 1e-3.
+    """
+    period, lag = 0.01, 0.05
+    a = np.exp(-period / lag)
+    radius = grown(gain, a, late + 1)
+    assert grown(gain, a, late) < 0.99 < 1.01 < radius
+    found, sampling = arm("two_link"), Sampling(period, late * period)
+    more = {"structure": found.structure, "measured_force": True, "force_gain": gain}
+    tracking = TrackingLaw(found.model.dae, poles(-4.0), **more)
+    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    settings = LoopSettings(sensor=ForceSensor(1, lag, period), sampling=sampling)
+    plant = RobotPlant(found.model, structure=found.structure)
+    with pytest.raises(WiringError, match="multiplies the force error by") as told:
+        make_closed_loop(plant, tracking, wanted, settings)
+    number = float(re.search(r"force error by ([0-9.]*[0-9])", str(told.value))[1])
+    assert number == pytest.approx(radius, rel=5e-3)
+
+
+def test_force_of_a_sampled_sensor_follows_the_control_of_two_samples_before():
+    """e_(k+2) = a e_(k+1) - (1 - a) Gbar e_k of the measured force, in Drake's Simulator.
+
+    The law's model is right, so that nothing else moves the force: that of the integrator, 1e-8.
+    """
+    found = scenario(
+        "two_link_wall",
+        "references={tool.z: 0.3, wall.force: 20}",
+        "start.errors={}",
+        "force=!MeasuredForce {gain: 5, time_constant: 0.05, sample_period: 0.01}",
+        "sampling={period: 0.01, delay: 0.0}",
+    )
+    loop, context = build_scenario(found)
+    loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), [19.0])
+    simulator, errors, a = Simulator(loop.diagram, context), [], np.exp(-0.2)
+    for k in range(12):
+        simulator.AdvanceTo((k + 0.5) * 0.01)
+        own = loop.sensor.GetMyContextFromRoot(context)
+        errors.append(loop.sensor.GetOutputPort("measured_force").Eval(own).item() - 20.0)
+    errors = np.array(errors)
+    assert np.abs(errors).max() > 0.9
+    wanted = a * errors[1:-1] - (1.0 - a) * 5.0 * errors[:-2]
+    assert_allclose(errors[2:], wanted, atol=1e-5)

@@ -187,6 +187,28 @@ def test_seed_is_that_of_the_scenario():
     assert not np.array_equal(end(3), first)
 
 
+@pytest.mark.parametrize("seed", [0, 7, 2**32 - 1])
+def test_encoders_and_force_sensor_of_one_seed_have_noise_of_their_own(seed):
+    """Numbers of one generator would make errors of the force and of the positions follow."""
+    found = scenario(
+        "two_link_wall",
+        f"force=!MeasuredForce {{sample_period: 2.0e-3, noise_deviation: 0.1, seed: {seed}}}",
+        f"encoders={{position_noise: 1.0e-6, velocity_noise: 1.0e-3, seed: {seed}}}",
+        *SAMPLED,
+    )
+    loop, context = build_scenario(found)
+    simulator = Simulator(loop.diagram, context)
+    felt, measured = [], []
+    for k in range(4):
+        simulator.AdvanceTo((k + 0.5) * 2.0 * T)
+        for source, numbers in ((loop.noise, felt), (loop.encoders.noise, measured)):
+            own = source.GetMyContextFromRoot(context)
+            numbers.extend(source.get_output_port().Eval(own))
+    assert len(set(felt)) == 4
+    assert len(set(measured)) == 16
+    assert not set(felt) & set(measured)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

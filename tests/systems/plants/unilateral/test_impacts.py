@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import brentq
 
 from drake_dae.systems.plants.unilateral.frictional import Rubbing, impact
 from drake_dae.systems.plants.unilateral.impacts import (
@@ -218,6 +219,49 @@ def test_one_contact_in_space_always_finds_its_impulse():
         way = after[1:] / np.linalg.norm(after[1:])
         assert_allclose(impulses[1:], -most * way, atol=1e-6 * most)
     assert slid > 100
+
+
+@pytest.mark.parametrize(
+    ("entries", "before", "mu"),
+    [
+        ([47.428, 4.333, 29.59, 5.253, 7.049, 22.429], [-0.134, 1.425, 1.425], 1.74),
+        ([33.125, 37.055, -18.584, 43.27, -26.511, 34.743], [-0.321, 0.139, -1.104], 0.72),
+        ([8.066, -0.874, -5.023, 3.117, -2.38, 5.996], [-0.683, 2.021, -1.613], 1.37),
+        ([10.3, -10.249, -1.429, 10.297, 1.461, 0.615], [-0.795, -1.186, -1.269], 0.99),
+    ],
+)
+def test_of_several_directions_of_sliding_it_is_that_which_goes_on_most_as_it_came(
+    entries, before, mu
+):
+    """All of them by a fine grid of angles: where what is across a direction changes its sign."""
+    A, before = np.zeros((3, 3)), np.array(before)
+    A[np.triu_indices(3)] = entries
+    A += np.triu(A, 1).T
+
+    def slid(angle):
+        way = np.array([np.cos(angle), np.sin(angle)])
+        push = np.array([1.0, *(-mu * way)])
+        impulses = push * -before[0] / (A[0] @ push)
+        return impulses, (before + A @ impulses)[1:], way
+
+    def across(angle):
+        _, after, way = slid(angle)
+        return way[0] * after[1] - way[1] * after[0]
+
+    angles = np.linspace(0.0, 2.0 * np.pi, 2001)
+    values = [across(angle) for angle in angles]
+    crossings = np.flatnonzero(np.diff(np.sign(values)))
+    found = []
+    for k in crossings.tolist():
+        impulses, after, way = slid(brentq(across, angles[k], angles[k + 1], xtol=1e-13))
+        # Where no impulse would do the sign changes at a pole.
+        if 0.0 < impulses[0] < 1e6 and after @ way >= 0.0:
+            found.append((before[1:] @ after, impulses))
+    assert len(found) == 3
+    _, wanted = max(found, key=lambda one: one[0])
+    impulses = impact(A, before, rows(), [Rubbing(0, rows(1, 2), mu, 0.0)])
+    # Directions lie as close as 1e-3 to each other, and zeros are good to 1e-13.
+    assert_allclose(impulses, wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("bounce", [0.0, 0.5])
