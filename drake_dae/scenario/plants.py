@@ -160,14 +160,15 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
 class OwnPlant(ScenarioPlant):
     """The plant is one of your own: a class that keeps the contract of `drake_dae.Plant`.
 
-    It is called with the robot and the structure of its system, as `maker(model, structure)`, and
-    returns the plant. Processes of a sweep find its module as Python does, by PYTHONPATH.
+    It is called with the robot and its structure, as `maker(model, structure)`. Reading such a
+    scenario imports that module, which Python finds by PYTHONPATH, in the processes of a
+    sweep as well: take such files from people whose code you would run.
 
     Attributes:
-        maker: The module and the class or function in it, as "my_plants:SpringyPlant".
+        maker: The module and the class in it, as "my_plants:SpringyPlant".
 
     Raises:
-        ModelError: The text names no module and class.
+        ModelError: The text names no module and class; or, when the plant is made, no such class.
     """
 
     maker: str
@@ -184,10 +185,14 @@ class OwnPlant(ScenarioPlant):
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:
-                made: Plant = getattr(import_module(module), name)(robot.model, robot.structure)
+                kind = getattr(import_module(module), name)
             except (ImportError, AttributeError) as error:
                 raise ModelError(f"'{self.maker}' cannot be loaded: {error}") from error
-            return made
+            if not (isinstance(kind, type) and issubclass(kind, Plant)):
+                raise ModelError(
+                    f"'{self.maker}' is no class that keeps the contract of drake_dae.Plant"
+                )
+            return kind(robot.model, robot.structure)
 
 
 def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
