@@ -50,7 +50,7 @@ from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.scenario.model import add_robot
-from drake_dae.scenario.plants import Planted
+from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
@@ -206,7 +206,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     TreeKinematics: lambda: arm("two_link").model.links.kinematics(),
     Links: lambda: arm("two_link").model.links,
     MultibodyPlant: lambda: arm("two_link").plant,
-    Planted: lambda: Planted(
+    RobotToSimulate: lambda: RobotToSimulate(
         arm("two_link").model, arm("two_link").structure, False, "", add_arm, {}, ()
     ),
     PositionOutput: lambda: arm("two_link").model.positions[0],

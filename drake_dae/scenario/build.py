@@ -27,7 +27,7 @@ from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import add_robot, completed_model, scenario_structure
 from drake_dae.scenario.observed import observed_structure
 from drake_dae.scenario.own_model import check_pushes, own_model
-from drake_dae.scenario.plants import Planted
+from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, opening_contact, task_controller
@@ -178,7 +178,7 @@ def make_plant(
     check_pushes(scenario.plant_pushes, model.links)
     adds = partial(add_robot, scenario.robot, payloads=scenario.plant_payloads)
     parameters, pushes = scenario.plant_parameters, scenario.plant_pushes
-    robot = Planted(model, structure, feedback, opens, adds, parameters, pushes)
+    robot = RobotToSimulate(model, structure, feedback, opens, adds, parameters, pushes)
     return scenario.plant.plant(robot)
 
 

@@ -27,7 +27,7 @@ from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
 
 
 @dataclass(frozen=True, eq=False)
-class Planted:
+class RobotToSimulate:
     """The robot that a plant is made of.
 
     Attributes:
@@ -66,7 +66,7 @@ class ScenarioPlant(ABC):
         return None
 
     @abstractmethod
-    def plant(self, robot: Planted) -> Plant:
+    def plant(self, robot: RobotToSimulate) -> Plant:
         """The plant.
 
         Raises:
@@ -78,7 +78,7 @@ class ScenarioPlant(ABC):
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
-    def plant(self, robot: Planted) -> Plant:
+    def plant(self, robot: RobotToSimulate) -> Plant:
         if robot.opens:  # In a task its contact opens, without a bounce.
             return Unilateral({robot.opens: 0.0}).plant(robot)
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
@@ -112,7 +112,7 @@ class Unilateral(ScenarioPlant):
         for name, value in self.restitution.items():
             coefficient(f"restitution.{name}", value)
 
-    def plant(self, robot: Planted) -> Plant:
+    def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
             pushing = [one.name for one in robot.model.constraints if any(one.can_only_push)]
             if not pushing:
@@ -143,7 +143,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     def material(self) -> ContactMaterial:
         return self
 
-    def plant(self, robot: Planted) -> Plant:
+    def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters"):
             return ContactPlant(
                 robot.model,
@@ -181,7 +181,7 @@ class OwnPlant(ScenarioPlant):
                 f"'{brief(self.maker)}'"
             )
 
-    def plant(self, robot: Planted) -> Plant:
+    def plant(self, robot: RobotToSimulate) -> Plant:
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:

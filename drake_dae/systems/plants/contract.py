@@ -43,7 +43,7 @@ class Plant(System):
        `dae.state_signals`, `dae.force_signals`, `structure.manifold.residual_signals` and
        `dae.output_signals`.
     2. System. `dae` is the system, and `structure` its structure with all contacts closed.
-    3. Robots. `model` is the robot, and `model.dae` is `dae`; then the output port `link_state` is
+    3. Robots. `model` is the robot whose system `dae` is; then the output port `link_state` is
        (q, v) of its links. It is None for a plant that is no robot.
     4. State and steps. `time_step` is the time between its steps in s, and 0 where it is
        continuous. `state` returns x, shape (n,). A discrete plant takes at each step the control
