@@ -14,8 +14,8 @@ from drake_dae.trace.factorization import Factorization, smallest_sine
 def test_shortest_solution_of_rows_that_are_nearly_parallel(small):
     """A^T x = b for Lauchli's A, which has ones above a diagonal D, by fractions: x = A y.
 
-    (1 1^T + D^2) y = b, as Sherman and Morrison solve it. Directions are orthogonal to
-    1e-16 / small alone. The error is that of the condition, with room, and A^T x = b holds to round-off.
+    (1 1^T + D^2) y = b, as Sherman and Morrison solve it. Directions are orthogonal to 1e-16 over
+    small alone. The error is that of the condition, with room, and A^T x = b holds to round-off.
     """
     diagonal = small * np.array([1.0, 2.0, -1.0])
     A = np.vstack([np.ones(3), np.diag(diagonal)])
