@@ -52,6 +52,16 @@ def test_which_contacts_push_does_not_depend_on_units(seed):
     assert_allclose(other.values * s, fit.values, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1.0, 1e6, 1e12])
+def test_a_contact_that_would_pull_opens_in_any_units(scale):
+    """Held, row 0 would keep both closed, with y_0 = -1: so it opens, and row 1 has y_1 = 1/2."""
+    A, b, s = np.array([[1.0, -0.9], [-0.9, 1.0]]), np.array([1.0, -0.5]), np.array([scale, 1.0])
+    touches = [Touch(0, rows(0)), Touch(1, rows(1))]
+    fit = complementary(A * s * s[:, None], b * s, rows(), touches)
+    assert fit.pushing == (1,)
+    assert_allclose(fit.values, [0.0, 0.5], rtol=1e-14)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_an_impact_gains_no_energy_and_pierces_nothing(seed):
     """c+ = c- + A Lambda with coefficients of restitution of each contact; it changes by
