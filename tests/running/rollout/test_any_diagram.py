@@ -272,9 +272,9 @@ def test_a_run_ends_where_a_block_has_no_value_of_use(is_fixed, is_held, compile
     ids=["grows", "decays", "swings"],
 )
 def test_error_control_takes_the_same_steps_of_what_changes_fast(matrix, begin):
-    """An error is measured by the larger state of a step's ends, as in SciPy, with machine code
+    """With machine code and without; an error is measured by the larger state of a step's ends.
 
-    and without. A step may err by a millionth of the state and of one, which grows as the state.
+    A step may err by a millionth of the state and of one, which grows as the state.
     """
     n, builder = len(begin), DiagramBuilder()
     system = builder.AddSystem(LinearSystem(np.array(matrix), np.zeros((n, 0)), np.eye(n)))
