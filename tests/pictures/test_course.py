@@ -3,9 +3,10 @@
 import casadi as ca
 import numpy as np
 import pytest
+from runs import run_scenario, scenario
 
 from drake_dae import LinkExpressions, PointCoordinates, PointOnSurface, RobotModel, Sphere
-from drake_dae.pictures.course import Course, contact_paths
+from drake_dae.pictures.course import Course, contact_paths, follow
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 
 
@@ -39,3 +40,15 @@ def test_a_path_around_a_sphere_is_seen_from_a_side(turns):
     ends = path.actual[[1, 3]] if turns == 1.0 else path.actual
     np.testing.assert_allclose(np.linalg.norm(ends[1] - ends[0]), width, rtol=1e-12)
     assert np.linalg.norm(np.ptp(path.actual, axis=0)) == pytest.approx(width)
+
+
+def test_wheels_turn_in_the_desired_course_as_they_turned():
+    """The outputs leave open how far: it is as it was, while the rest of the cart is elsewhere."""
+    loop, _, record = run_scenario(scenario("cart_wall", "duration=0.2"))
+    course = follow(loop, record, loop.diagram.CreateDefaultContext())
+    names = [signal.name for signal in loop.plant.dae.state_signals]
+    axles = [names.index("left_axle"), names.index("right_axle")]
+    assert len(course.wanted) == len(course.states)
+    assert np.ptp(course.states[:, axles], axis=0).min() > 0.01
+    np.testing.assert_allclose(course.wanted[:, axles], course.states[:, axles], atol=1e-9)
+    assert np.abs(course.wanted - course.states)[:, names.index("rod")].max() > 0.01
