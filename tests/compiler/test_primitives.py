@@ -275,7 +275,8 @@ def test_an_input_of_a_diagram_inside_feeds_all_blocks_that_take_it(depth):
         for number in range(3):
             builder.ExportOutput(block.GetOutputPort(f"out {number}"), f"out {number}")
         block = builder.Build()
-    compiled, context = compile_diagram(block), block.CreateDefaultContext()
-    context.SetTime(0.7)
-    row, _ = compiled.row(0.7, *compiled.start(context), compiled.values(context))
+    compiled = compile_diagram(block)
+    assert compiled.fixed == ()
+    values = compiled.values(block.CreateDefaultContext())
+    row, _ = compiled.row(0.7, [], [], values)
     np.testing.assert_allclose(row.full()[:, 0], np.array([2.0, -3.0, 5.0]) * np.sin(1.7))

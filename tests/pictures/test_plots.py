@@ -7,6 +7,7 @@ from matplotlib.colors import to_hex
 from drake_dae import Record
 from drake_dae.dae.system.signals import Signal
 from drake_dae.pictures.course import ContactPath
+from drake_dae.pictures.phases import phase_spans, phases_at
 from drake_dae.pictures.plots import (
     PLOTS,
     plot_controls,
@@ -233,3 +234,17 @@ def test_a_single_moment_can_be_drawn(tmp_path):
     )
     line = np.zeros((1, 2))
     save_plots(start, predicted[:1], None, tmp_path, [ContactPath("wall", line, line)], 1e-8)
+
+
+def test_the_moment_of_a_change_shows_the_phase_before_it():
+    """As a sample there does: the phase that begins is told from the next one on."""
+    names = ("0 Approach", "1 Press", "2 Release")
+    run = Record(
+        np.arange(6.0),
+        {"phase": Recorded(np.eye(3)[[0, 0, 0, 1, 1, 2]], tuple(Signal(n, "") for n in names))},
+    )
+    spans = [(span.name, span.begin, span.end) for span in phase_spans(run)]
+    assert spans == [("Approach", 0.0, 2.0), ("Press", 2.0, 4.0), ("Release", 4.0, 5.0)]
+    times = np.array([0.0, 1.9, 2.0, 2.1, 4.0, 4.1, 5.0])
+    wanted = ["Approach"] * 3 + ["Press"] * 2 + ["Release"] * 2
+    assert phases_at(run, times) == wanted

@@ -12,6 +12,7 @@ from drake_dae import ExpressionOutput, Record, RobotModel
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.textbook import LinkExpressions
+from drake_dae.simulation.open_contacts import contact_notes, open_spans
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import Limits, summary
@@ -149,6 +150,17 @@ def test_a_verdict_is_the_same_in_metres_and_millimetres(unit):
     assert found.share == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize(
+    ("accuracy", "wanted"),
+    [(None, Tracking.NEARLY), (1e-6, Tracking.NEARLY), (1e-3, Tracking.AS_PREDICTED)],
+)
+def test_a_coarse_integrator_is_judged_by_what_it_was_asked_for(accuracy, wanted):
+    """An error of 2e-3 of its size is within ten times an accuracy of 1e-3."""
+    near = np.add(PREDICTED, [[0.0, 0.0], [1e-3, 0.0], [0.0, 0.0]])
+    run = record(tracking_error=(near.tolist(), [("tool.z", "m"), ("axis.y", "")]))
+    assert judge(run, PREDICTED, accuracy).tracking is wanted
+
+
 def test_round_off_of_an_output_that_is_zero_is_no_drift():
     """A moment of 3e-15 N m beside motors of 7 N m is 0, and judged beside these."""
     signals = [("tool.z", "m"), ("grasp.mx", "N m")]
@@ -246,3 +258,21 @@ def test_limits_of_a_textbook_robot():
     limits = Limits.of(RobotModel(links, [], [output]))
     np.testing.assert_array_equal(limits.control, [3.0])
     assert limits.state is None
+
+
+def test_a_contact_that_is_open_before_the_run_begins_is_told_by_its_first_step():
+    """The mode of a sample is that of the step that it ends; the first one ends none."""
+    run = record(
+        mode=([[0.0], [0.0], [1.0]], [("wall.mode", "")]),
+        gap=([[0.3], [0.2], [0.0]], [("wall.gap", "m")]),
+    )
+    assert contact_notes(run) == [
+        ("contacts", "no impacts"),
+        ("wall", "open for 0.4 s, first from 0 s on, up to 0.2 m away"),
+    ]
+    closed = record(
+        mode=([[0.0], [1.0], [1.0]], [("wall.mode", "")]),
+        gap=([[0.0], [0.0], [0.0]], [("wall.gap", "m")]),
+    )
+    assert contact_notes(closed)[1] == ("wall", "closed all the time")
+    assert open_spans(closed) == []

@@ -54,6 +54,17 @@ def test_cut_off_at_any_byte_it_has_the_whole_lines_and_goes_on(tmp_path):
         assert path.read_bytes() == data
 
 
+def test_a_run_that_stands_twice_counts_as_it_did_first(tmp_path):
+    """What a study has told once does not change."""
+    path = tmp_path / "runs.jsonl"
+    written(path)
+    other = RunResult(2, Outcome.FAILED, "another machine", {}, (), 0.1)
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(other.to_dict()) + "\n")
+    with open_journal(path, head()) as journal:
+        assert journal.results == {result.run: result for result in RESULTS}
+
+
 def test_zeros_after_a_loss_of_power_are_removed(tmp_path):
     path = tmp_path / "runs.jsonl"
     data = written(path)

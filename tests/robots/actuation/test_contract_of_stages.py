@@ -4,12 +4,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, touching
+from grippers import gripper, parsed
 from members import TorqueLag, subclasses
 
 from drake_dae import DcMotors, ElectrohydraulicServos, FlexibleJoints, RobotPlant
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation import Stage
 from drake_dae.robots.actuation.chain import chain
+from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.trace.functions import TracedFunction
 
 MEMBERS = {
@@ -94,6 +96,26 @@ def test_rotors_turn_once(stage):
     if own.carries_rotors:
         with pytest.raises(ModelError, match="come once in a chain"):
             chain([stage, stage], links())
+
+
+@pytest.mark.parametrize("driven", [("arm",), ("left",), ("arm", "left")])
+def test_shafts_have_the_units_of_the_joints_that_they_drive(driven):
+    """The arm of a gripper turns, and its left finger slides."""
+    links = MultibodyExpressions(parsed(gripper(driven)))
+    own = FlexibleJoints(8e3, inertia=1.0).attach(links)
+    wanted = ["rad" if name == "arm" else "m" for name in driven]
+    assert [s.unit for s in own.state_signals] == [*wanted, *(f"{unit}/s" for unit in wanted)]
+
+
+def test_motors_may_have_no_resistance():
+    """L I' = u - K_m N q' then, which is (75) without R I."""
+    own = DcMotors(0.1, 2e-3, 0.0, [100.0, 80.0]).attach(links())
+    velocity = ca.SX.sym("v", 2)
+    symbols = ca.vertcat(*[p.symbol for p in own.parameters])
+    values = np.concatenate([p.value for p in own.parameters])
+    drift = ca.Function("drift", [own.state, velocity, symbols], [own.drift(velocity, velocity)])
+    found = drift([3.0, -4.0], [0.2, 0.5], values).full()[:, 0]
+    np.testing.assert_allclose(found, [-0.1 * 100.0 * 0.2, -0.1 * 80.0 * 0.5], rtol=1e-14)
 
 
 @pytest.mark.slow

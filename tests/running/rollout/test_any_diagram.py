@@ -25,6 +25,7 @@ from pydrake.systems.primitives import (
     WrapToSystem,
     ZeroOrderHold,
 )
+from scipy.linalg import expm
 
 from drake_dae import export_code, rollout, start_values
 from drake_dae.errors import ModelError
@@ -262,3 +263,33 @@ def test_a_run_ends_where_a_block_has_no_value_of_use(is_fixed, is_held, compile
     assert found.failure is not None
     assert found.failure.time == pytest.approx(0.6 if is_held else 0.55, abs=0.02)
     assert np.isfinite(found.record["sum"]).all()
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize(
+    ("matrix", "begin"),
+    [([[8.0]], [1e-3]), ([[-8.0]], [1.0]), ([[0.0, 20.0], [-20.0, 0.0]], [0.0, 1.0])],
+    ids=["grows", "decays", "swings"],
+)
+def test_error_control_takes_the_same_steps_of_what_changes_fast(matrix, begin):
+    """With machine code and without; an error is measured by the larger state of a step's ends.
+
+    A step may err by a millionth of the state and of one, which grows as the state.
+    """
+    n, builder = len(begin), DiagramBuilder()
+    system = builder.AddSystem(LinearSystem(np.array(matrix), np.zeros((n, 0)), np.eye(n)))
+    builder.ExportOutput(system.get_output_port(), "x")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    context.SetContinuousState(begin)
+    start, parameters = start_values(diagram, context)
+    config = SimulatorConfig(max_step_size=0.5, accuracy=1e-3)
+    one, other = (
+        rollout(diagram, start, parameters, [0.0, 2.0], config=config, compiled=compiled)[0]
+        for compiled in (False, True)
+    )
+    assert one.steps == other.steps
+    exact = expm(2.0 * np.array(matrix)) @ begin
+    for run in (one, other):
+        found = run.record["x"][-1]
+        np.testing.assert_allclose(found, exact, rtol=0.0, atol=2e-4 * np.abs(exact).max() + 1e-6)

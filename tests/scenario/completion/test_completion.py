@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
+from arms import arm
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
@@ -21,6 +23,8 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ScenarioError
+from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.scenario.completion.tool_axis import tool_axis
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.parts.parts import Start
@@ -250,3 +254,15 @@ def test_a_planar_arm_gets_the_direction_that_it_can_move_in():
 def test_a_robot_that_is_only_simulated_gets_no_outputs():
     still = left_out("slider_crank", forces=[], references={})
     assert complete_scenario(still).scenario is still
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_tool_sticks_out_along_the_axis_that_leads_to_its_point(axis, sign):
+    """From the last joint that moves, which is less than 1 m away from the frame."""
+    links = arm("two_link").model.links
+    point = [0.1, -0.2, 0.3]
+    point["xyz".index(axis)] = 5.0 * sign
+    touch = Touch("tool", tuple(point), ca.SX([0.0, 0.0, 1.0]), lambda place: place[2])
+    found = tool_axis(links, touch)
+    assert (found.axis, found.sign, found.column) == (axis, sign, "xyz".index(axis))

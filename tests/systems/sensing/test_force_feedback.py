@@ -255,6 +255,24 @@ def test_lag_and_bias():
     np.testing.assert_allclose(values[0], 8.0 * (1 - np.exp(-times / 0.1)) + 0.5, atol=1e-10)
 
 
+@pytest.mark.parametrize(("lag", "period"), [(0.1, 0.0), (0.0, 0.1), (0.1, 0.1)])
+def test_a_sensor_starts_as_if_it_had_felt_a_constant_force(lag, period):
+    """It shows that force and its bias from the start on, as long as the force stays."""
+    sensor, force = ForceSensor(2, lag, period, [0.5, -0.2]), [8.0, 3.0]
+    builder = DiagramBuilder()
+    builder.AddSystem(sensor)
+    source = builder.AddSystem(ConstantVectorSource(force))
+    builder.Connect(source.get_output_port(), sensor.GetInputPort("force"))
+    simulator = Simulator(builder.Build())
+    own = sensor.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    sensor.set_force(own, force)
+    for time in (0.0, 0.05, 0.25):
+        if time:
+            simulator.AdvanceTo(time)
+        shown = sensor.GetOutputPort("measured_force").Eval(own)
+        np.testing.assert_allclose(shown, [8.5, 2.8], rtol=1e-14)
+
+
 def test_sampling_holds():
     times, values = sensed(ForceSensor(1, sample_period=0.1), Sine(1.0, 3.0, 0.0, 1), 1.0)
     # Between its samples, at the middle of each period, it shows the last one.

@@ -1,7 +1,9 @@
 """Tasks in phases: touches as designed, changes without bumps, reactions, and what is refused."""
 
+from dataclasses import replace
 from itertools import pairwise
 
+import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, numbers, touching
@@ -437,3 +439,18 @@ def test_discrete_plant_needs_guards_in_samples():
     plant = ContactPlant(found.model, add_arm, ContactMaterial(), structure=found.structure)
     with pytest.raises(WiringError, match=r"make the controller with sample_period=0\.001"):
         wire_loop(plant, TaskController(Task([Approach()]), *laws()))
+
+
+@pytest.mark.parametrize(
+    ("m", "is_taken"), [([0.0, 1.0], True), ([1.0, 1.0], False), ([0.0, 2.0], False)]
+)
+def test_a_contact_opens_only_where_its_force_is_an_output_by_itself(m, is_taken):
+    """z = (l_1 + m_1 lambda, m_2 lambda): no law of the open contact could hold the first."""
+    system = replace(arm("two_link").model.dae, m=ca.SX(m))
+    if is_taken:
+        found = open_contact(system, "wall.force")
+        assert [s.name for s in found.output_signals] == ["tool.z", "wall.distance"]
+        assert found.num_constraints == 0
+    else:
+        with pytest.raises(ModelError, match=r"'wall.force' must be one of the outputs by itself"):
+            open_contact(system, "wall.force")

@@ -40,6 +40,28 @@ def test_what_fits_is_complementary(seed):
             assert_allclose(fit.values[touch.rows], 0.0, atol=0.0)
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_which_contacts_push_does_not_depend_on_units(seed):
+    """Rows in other units: A_ij s_i s_j and b_i s_i have y_i / s_i."""
+    random = np.random.default_rng(seed)
+    root, b = random.standard_normal((5, 7)), random.standard_normal(5)
+    A, s = root @ root.T, 10.0 ** random.uniform(-12.0, 12.0, 5)
+    fit = complementary(A, b, rows(0), TOUCHES)
+    other = complementary(A * s * s[:, None], b * s, rows(0), TOUCHES)
+    assert other.pushing == fit.pushing
+    assert_allclose(other.values * s, fit.values, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1.0, 1e6, 1e12])
+def test_a_contact_that_would_pull_opens_in_any_units(scale):
+    """Held, row 0 would keep both closed, with y_0 = -1: so it opens, and row 1 has y_1 = 1/2."""
+    A, b, s = np.array([[1.0, -0.9], [-0.9, 1.0]]), np.array([1.0, -0.5]), np.array([scale, 1.0])
+    touches = [Touch(0, rows(0)), Touch(1, rows(1))]
+    fit = complementary(A * s * s[:, None], b * s, rows(), touches)
+    assert fit.pushing == (1,)
+    assert_allclose(fit.values, [0.0, 0.5], rtol=1e-14)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_an_impact_gains_no_energy_and_pierces_nothing(seed):
     """c+ = c- + A Lambda with coefficients of restitution of each contact; it changes by
@@ -280,6 +302,27 @@ def test_a_lever_of_one_freedom_rubs(slope, bounce):
     # Leaving, the tip slides along slope, where it rubs by -mu sign(slope).
     locks = 1.0 - mu * abs(slope) <= 0.0
     assert_allclose(after, 0.0 if locks else 2.0 * bounce * J, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("tangents", [1, 2])
+def test_of_impulses_that_stick_alike_those_are_taken_that_rub_least(tangents, seed):
+    """One freedom less than rows: Lambda + s n sticks alike for each s, where J^T n = 0."""
+    random = np.random.default_rng(seed)
+    J = random.standard_normal((1 + tangents, tangents))
+    n = np.linalg.svd(J.T)[2][-1]
+    # By impulses that push more than they rub, so that they are in the cone.
+    given = np.array([3.0, *random.uniform(-1.0, 1.0, tangents)])
+    before = -J @ J.T @ given
+    if before[0] > 0.0:
+        J[0], n[0] = -J[0], -n[0]
+        before = -J @ J.T @ given
+    along = np.arange(1, 1 + tangents)
+    impulses = impact(J @ J.T, before, rows(), [Rubbing(0, along, 10.0, 0.0)])
+    assert_allclose(before + J @ J.T @ impulses, 0.0, atol=1e-12 * np.abs(before).max())
+    best = given - n * (n[1:] @ given[1:]) / (n[1:] @ n[1:])
+    if best[0] > 0.0 and np.linalg.norm(best[1:]) < 10.0 * best[0]:
+        assert_allclose(impulses, best, rtol=1e-9, atol=1e-10)
 
 
 def test_a_block_that_lands_on_one_foot_sticks_or_slides():
