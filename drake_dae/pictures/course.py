@@ -86,11 +86,14 @@ class ContactPath:
         name: The constraint's name.
         actual: The path along two axes of the surface, m, shape (k, 2).
         desired: The path that the reference wanted, m, shape (j, 2).
+        points_left: Whether the first axis points to the left of who stands on the free side, where
+            the second points up.
     """
 
     name: str
     actual: FloatArray
     desired: FloatArray
+    points_left: bool = False
 
 
 def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
@@ -156,7 +159,12 @@ def contact_paths(course: Course) -> list[ContactPath]:
         # Of a path all around the surface no normal is the mean.
         normal = next(n for n in (np.mean(normals, axis=0), normals[0]) if np.linalg.norm(n) > 1e-3)
         axes = np.column_stack(tangents(normal / np.linalg.norm(normal)))
-        found.append(ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes))
+        points_left = bool(np.cross(axes[:, 0], axes[:, 1]) @ normal < 0.0)
+        found.append(
+            ContactPath(
+                constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes, points_left
+            )
+        )
     return found
 
 
