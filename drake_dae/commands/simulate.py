@@ -44,7 +44,7 @@ from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.records.record_writer import RecordWriter
-from drake_dae.simulation.remarks import stop_remarks, surface_remarks
+from drake_dae.simulation.remarks import ball_remarks, stop_remarks, surface_remarks
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 
@@ -206,7 +206,9 @@ def _write(run: _Run) -> bool:
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
         )
         if model is not None:
-            text = "\n".join([text, *surface_remarks(model, record)])
+            material = run.scenario.plant.material
+            rolling = ball_remarks(None if material is None else material.radius)
+            text = "\n".join([text, *surface_remarks(model, record), *rolling])
         if changes := loop.changes(run.context):
             stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, changes), *stopped])

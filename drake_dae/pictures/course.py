@@ -161,9 +161,7 @@ def contact_paths(course: Course) -> list[ContactPath]:
         axes = np.column_stack(tangents(normal / np.linalg.norm(normal)))
         points_left = bool(np.cross(axes[:, 0], axes[:, 1]) @ normal < 0.0)
         found.append(
-            ContactPath(
-                constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes, points_left
-            )
+            ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes, points_left)
         )
     return found
 

@@ -15,6 +15,10 @@ SHARE = 0.05
 """A link counts as behind a surface where it is so deep, relative to its distance from the contact:
 tools lie along a surface, and surfaces give way."""
 
+NEARER = 1.1
+"""A link belongs to the contact where its distance from there is below so many times that from what
+stands still."""
+
 MOST = 300
 """So many states of a motion are looked at, at most."""
 
@@ -52,7 +56,7 @@ def links_behind(
 
     A link is where the origin of its frame is, and its surface asked for the distance there. A
     surface may end before it reaches the robot's base, as a table does that the robot stands
-    beside. So a link counts where it is nearer to the contact than to all that stands still.
+    beside. So a link counts where it is not farther from the contact than from what stands still.
     Between the origins of frames nothing is looked at, and no link is compared with another one.
 
     Args:
@@ -110,7 +114,7 @@ def _deepest(
         for state, own in zip(states, parameters, strict=True)
     ]
     depths, to_contact, to_base = (np.array(each) for each in zip(*values, strict=True))
-    counts = (depths > SHARE * to_contact) & (to_contact < to_base)
+    counts = (depths > SHARE * to_contact) & (to_contact < NEARER * to_base)
     # What is at the contact itself is on the surface.
     counts &= to_contact > SHARE * to_contact.max(axis=1, keepdims=True)
     if not counts.any():

@@ -26,6 +26,7 @@ from pydrake.systems.primitives import Integrator
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import show_state
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.interruption import Ending, ending_signals
@@ -147,7 +148,7 @@ def simulate(
             state = context.get_continuous_state_vector().CopyToVector()
             raise SimulationError(
                 f"the simulation cannot go on at t = {context.get_time():.6g} s, state "
-                f"{np.array2string(state, precision=4, separator=', ')}: "
+                f"{show_state(state)}: "
                 f"{str(error).rstrip('.')}. Where the state grows without bound or a reference "
                 "leaves what the robot can reach, change these; otherwise choose other integrator "
                 "settings",
