@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
+from drake_dae.pictures.surroundings import scene_extent
 from drake_dae.pictures.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
 from drake_dae.robots.model import RobotModel
@@ -20,6 +21,9 @@ from drake_dae.systems.plants.contract import Plant
 
 STILL = 1e-4
 """A contact point whose path is shorter than this share of its distance has no path to draw."""
+
+_PLACES = 12
+"""So many states of a run tell how much room it takes."""
 
 
 class Loop(Protocol):
@@ -164,6 +168,21 @@ def contact_paths(course: Course) -> list[ContactPath]:
             ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes, points_left)
         )
     return found
+
+
+def run_extent(course: Course, scene_graph: SceneGraph | None) -> tuple[FloatArray, float]:
+    """The middle and the size, in m, of the box around all places of the robot.
+
+    Args:
+        course: Where the robot was.
+        scene_graph: The geometry of its links, or None.
+    """
+    some = course.states[:: max(1, len(course.states) // _PLACES)]
+    boxes = [scene_extent(course.model, course.acting, state, scene_graph) for state in some]
+    half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
+    middles = np.array([middle for middle, _ in boxes])
+    low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low))
 
 
 def _pushes(course: Course) -> FloatArray:
