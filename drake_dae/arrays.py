@@ -15,6 +15,9 @@ FloatArray = np.typing.NDArray[np.float64]
 
 Booleans = np.typing.NDArray[np.bool_]
 
+MEANINGFUL = 1e12
+"""A state with a larger number has left all measure, in whatever units."""
+
 
 def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> FloatArray:
     """Real numbers as a new array; they need not be finite. Text and masked entries are none.
@@ -150,3 +153,10 @@ def show(array: ArrayLike) -> str:
     return np.array2string(
         np.asarray(array), precision=4, separator=", ", max_line_width=10**6, threshold=40
     )
+
+
+def show_state(state: ArrayLike) -> str:
+    """A state in a message: its numbers, or how far it has grown where they mean nothing more."""
+    values = np.asarray(state, dtype=float)
+    largest = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0))
+    return f"grown to {largest:.0e}" if largest > MEANINGFUL else show(values)

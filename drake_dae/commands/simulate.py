@@ -33,6 +33,7 @@ from drake_dae.pictures.course import Course, contact_paths, follow
 from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.view import start_meshcat
+from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -43,7 +44,7 @@ from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.records.record_writer import RecordWriter
-from drake_dae.simulation.remarks import stop_remarks, surface_remarks
+from drake_dae.simulation.remarks import ball_remarks, stop_remarks, surface_remarks
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, summary
 
@@ -116,6 +117,7 @@ def _step(run: _Run) -> RunStatistics:
         run.scenario.integrator,
         progress=True,
         after_step=run.writer.update if run.scenario.write.record else None,
+        may_diverge=run.scenario.may_diverge,
     )
 
 
@@ -199,9 +201,14 @@ def _write(run: _Run) -> bool:
         fixed = loop.plant.time_step or not config.use_error_control
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
-        text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
+        behind = _behind(loop, record, run.context)
+        text = summary(
+            record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
+        )
         if model is not None:
-            text = "\n".join([text, *surface_remarks(model, record)])
+            material = run.scenario.plant.material
+            rolling = ball_remarks(None if material is None else material.radius)
+            text = "\n".join([text, *surface_remarks(model, record), *rolling])
         if changes := loop.changes(run.context):
             stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, changes), *stopped])
@@ -235,6 +242,17 @@ def _write(run: _Run) -> bool:
         with suppress(OSError):
             _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
     return not problems
+
+
+def _behind(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind, ...]:
+    """The links that went behind a surface in a run."""
+    plant = loop.plant
+    if plant.model is None:
+        return ()
+    own = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+    if "exogenous" in record.signals:
+        own[:, plant.exogenous_places] = record["exogenous"]
+    return links_behind(plant.model, record.time, record["state"], own)
 
 
 def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:

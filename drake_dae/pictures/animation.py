@@ -17,13 +17,14 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import LEAST_SCALE, PATH_COLOR, path_of
-from drake_dae.pictures.course import Course, Loop, follow
+from drake_dae.pictures.course import Course, Loop, follow, run_extent
 from drake_dae.pictures.phases import Span, phase_spans
+from drake_dae.pictures.surroundings import scene_extent, surroundings
 from drake_dae.pictures.view import (
     FRAME_RATE,
     draw_scene,
     draw_surroundings,
-    scene_extent,
+    look_at,
     start_meshcat,
     view_of_links,
 )
@@ -94,13 +95,15 @@ def animate(
         meshcat = start_meshcat()
     plant, acting = course.plant, course.acting
     model = course.model
-    arrows = draw_scene(plant, meshcat)
+    arrows = draw_scene(plant, meshcat, scene_graph)
     links = view_of_links(plant, scene_graph, meshcat)
     arrows.measure(course.loads)
 
     # What stands still: what it touches, where it went, and where the reference wanted it.
-    draw_surroundings(meshcat, model, acting, course.states[0], course.parameters[0])
-    _, size = scene_extent(model, acting, course.states[0])
+    _, size = scene_extent(model, acting, course.states[0], scene_graph)
+    seen = surroundings(model, acting, course.points, course.parameters[0], size)
+    draw_surroundings(meshcat, seen)
+    look_at(meshcat, *run_extent(course, scene_graph))
     _draw_paths(meshcat, acting, course.points, "actual", PATH_COLOR, 0.003 * size)
     _draw_paths(meshcat, acting, course.wanted_points, "desired", _DESIRED, 0.0015 * size)
 

@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
+from drake_dae.pictures.surroundings import scene_extent
 from drake_dae.pictures.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
 from drake_dae.robots.model import RobotModel
@@ -20,6 +21,9 @@ from drake_dae.systems.plants.contract import Plant
 
 STILL = 1e-4
 """A contact point whose path is shorter than this share of its distance has no path to draw."""
+
+_PLACES = 12
+"""So many states of a run tell how much room it takes."""
 
 
 class Loop(Protocol):
@@ -86,11 +90,14 @@ class ContactPath:
         name: The constraint's name.
         actual: The path along two axes of the surface, m, shape (k, 2).
         desired: The path that the reference wanted, m, shape (j, 2).
+        points_left: Whether the first axis points to the left of who stands on the free side, where
+            the second points up.
     """
 
     name: str
     actual: FloatArray
     desired: FloatArray
+    points_left: bool = False
 
 
 def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
@@ -156,8 +163,26 @@ def contact_paths(course: Course) -> list[ContactPath]:
         # Of a path all around the surface no normal is the mean.
         normal = next(n for n in (np.mean(normals, axis=0), normals[0]) if np.linalg.norm(n) > 1e-3)
         axes = np.column_stack(tangents(normal / np.linalg.norm(normal)))
-        found.append(ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes))
+        points_left = bool(np.cross(axes[:, 0], axes[:, 1]) @ normal < 0.0)
+        found.append(
+            ContactPath(constraint.name, actual @ axes, desired.reshape(-1, 3) @ axes, points_left)
+        )
     return found
+
+
+def run_extent(course: Course, scene_graph: SceneGraph | None) -> tuple[FloatArray, float]:
+    """The middle and the size, in m, of the box around all places of the robot.
+
+    Args:
+        course: Where the robot was.
+        scene_graph: The geometry of its links, or None.
+    """
+    some = course.states[:: max(1, len(course.states) // _PLACES)]
+    boxes = [scene_extent(course.model, course.acting, state, scene_graph) for state in some]
+    half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
+    middles = np.array([middle for middle, _ in boxes])
+    low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)
+    return (low + high) / 2, float(np.linalg.norm(high - low))
 
 
 def _pushes(course: Course) -> FloatArray:

@@ -35,9 +35,9 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.course import Course, Loop, follow
+from drake_dae.pictures.course import Course, Loop, follow, run_extent
 from drake_dae.pictures.phases import phases_at
-from drake_dae.pictures.view import scene_extent
+from drake_dae.pictures.surroundings import surroundings
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.simulation.records.record import Record
 
@@ -58,7 +58,8 @@ _LEAST_FORCE = 0.02  # No arrow for what is less, beside the largest force of th
 ACTUAL, DESIRED, FORCE, IMPACT = "#1f3fbf", "#2e9d4a", "#d12b1f", "#ffb000"
 """Colors of the path so far, of the one that is wanted, of forces, and of impacts."""
 
-_PLACES = 12  # So many states of a run tell how much room it takes.
+_LABEL = np.array([34.0, 14.0])
+"""The width and height that a label takes beside its middle, in pixels."""
 
 Pixels = NDArray[np.uint8]
 
@@ -143,7 +144,7 @@ class _Scene:
         model, links = course.model, course.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")
-        middle, self._size = _extent(course)
+        middle, self._size = run_extent(course, scene_graph)
         eye = middle + self._size * np.array([-1.55, -1.1, 0.8])
         self._camera = _Camera(eye, middle, 10.0 * self._size)
         self.notes = [""] * len(course.times)
@@ -161,19 +162,14 @@ class _Scene:
         builder.Connect(pose.get_output_port(), scene.get_source_pose_port(links.get_source_id()))
         self._frames = {}
         source = scene.RegisterSource("surroundings")
-        points = course.points[0]
-        for constraint, point in zip(course.acting.constraints, points, strict=True):
-            own = own_values(constraint, model.dae, course.parameters[0])
-            picture = constraint.picture(own, point, self._size)
-            if picture is None:
-                continue
+        touched = surroundings(
+            model, course.acting, course.points, course.parameters[0], self._size
+        )
+        for one in touched:
+            constraint, picture = one.constraint, one.picture
             frame = GeometryFrame(constraint.name)
             self._frames[constraint] = scene.RegisterFrame(source, frame)
-            seen = GeometryInstance(
-                constraint.placement(own).inverse() @ picture.pose,
-                _shape(picture.form),
-                constraint.name,
-            )
+            seen = GeometryInstance(picture.pose, _shape(picture.form), constraint.name)
             seen.set_perception_properties(_surface_properties())
             scene.RegisterGeometry(source, frame.id(), seen)
         if self._frames:
@@ -188,10 +184,13 @@ class _Scene:
 
     def draw(self, axis: Axes, number: int) -> None:
         """Draws the moment of that number, with the paths up to it."""
+        from matplotlib.patheffects import withStroke
+
         course = self._course
         axis.imshow(self._render(number), interpolation="nearest")
         axis.set_axis_off()
         load = course.loads[number]
+        taken: list[FloatArray] = []
         for row, force in enumerate(load.forces):
             for points, color in ((self._wanted, DESIRED), (self._points[: number + 1], ACTUAL)):
                 axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
@@ -200,9 +199,13 @@ class _Scene:
                 tail = load.points[row] - 0.25 * self._size * force / self._largest
                 head, tail = self._camera.project(np.array([load.points[row], tail]))
                 shape = {"color": FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
-                axis.annotate(
-                    f"{size:.1f} N", head, tail, color=FORCE, fontsize=11, arrowprops=shape
+                axis.annotate("", head, tail, arrowprops=shape)
+                place = _label_place(head, tail, taken)
+                taken.append(place)
+                told = axis.text(
+                    *place, f"{size:.1f} N", color=FORCE, fontsize=11, ha="center", va="center"
                 )
+                told.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
             if bright := course.flashes[number, row]:
                 x, y = self._camera.project(load.points[row])[0]
                 axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
@@ -227,14 +230,15 @@ class _Scene:
         return np.array(image.data[:, :, :3])
 
 
-def _extent(course: Course) -> tuple[FloatArray, float]:
-    """The middle and the size, in m, of the box around all places of the robot."""
-    some = course.states[:: max(1, len(course.states) // _PLACES)]
-    boxes = [scene_extent(course.model, course.acting, state) for state in some]
-    half = np.array([[size] for _, size in boxes]) / (2 * np.sqrt(3))
-    middles = np.array([middle for middle, _ in boxes])
-    low, high = (middles - half).min(axis=0), (middles + half).max(axis=0)
-    return (low + high) / 2, float(np.linalg.norm(high - low))
+def _label_place(head: FloatArray, tail: FloatArray, taken: list[FloatArray]) -> FloatArray:
+    """Where the label of an arrow stands, in pixels: behind its tail, and not on others."""
+    way = tail - head
+    length = float(np.linalg.norm(way))
+    way = way / length if length > 1.0 else np.array([0.0, 1.0])
+    place = tail + _LABEL * way
+    while any(np.all(np.abs(place - other) < _LABEL) for other in taken):
+        place = place + np.array([0.0, 5.0])
+    return np.clip(place, _LABEL, np.array([_WIDTH, _HEIGHT]) - _LABEL)
 
 
 def _shape(form: Shape | TriangleSurfaceMesh) -> Shape:

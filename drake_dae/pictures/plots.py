@@ -212,7 +212,10 @@ def plot_controls(record: Record, limits: FloatArray | None = None) -> Figure:
 
 
 def plot_paths(paths: Sequence[ContactPath]) -> Figure:
-    """The paths of points on their surfaces, over those that the references want."""
+    """The paths of points on their surfaces, over those that the references want.
+
+    They are drawn as they are seen from the free side.
+    """
     figure, axes = squares(
         [f"path on {labelled(Signal(path.name))}" for path in paths], ("desired", "actual", "start")
     )
@@ -227,7 +230,8 @@ def plot_paths(paths: Sequence[ContactPath]) -> Figure:
         both = np.vstack([path.actual, path.desired])
         middle = (np.min(both, axis=0) + np.max(both, axis=0)) / 2.0
         half = 0.55 * float(np.max(np.ptp(both, axis=0))) or 1e-3
-        axis.set_xlim(middle[0] - half, middle[0] + half)
+        right = -half if path.points_left else half
+        axis.set_xlim(middle[0] - right, middle[0] + right)
         axis.set_ylim(middle[1] - half, middle[1] + half)
         axis.set_xlabel("along the surface [m]", fontsize=10)
         axis.set_ylabel("across [m]", fontsize=10)

@@ -1,6 +1,7 @@
 """A constrained robot in Drake's Meshcat: its links, what it touches, and its constraint forces."""
 
 import errno
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.geometry import (
@@ -18,10 +19,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import ConstraintForceVisualizer, ForceArrows, path_of
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
-from drake_dae.robots.model import RobotModel
+from drake_dae.pictures.surroundings import Seen, scene_extent, surroundings
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.trace.functions import TracedFunction
 
 FRAME_RATE = 32.0
 """Frames per second of the live view and of the recording."""
@@ -69,7 +69,7 @@ def add_live_view(
     if plant.model is None:
         return
     period = 1.0 / FRAME_RATE
-    arrows = draw_scene(plant, meshcat)
+    arrows = draw_scene(plant, meshcat, scene_graph)
     forces = builder.AddSystem(
         ConstraintForceVisualizer(arrows, meshcat, plant.model, plant.exogenous_places, period)
     )
@@ -84,12 +84,15 @@ def add_live_view(
     plant.add_own_view(builder, meshcat)
 
 
-def draw_scene(plant: Plant, meshcat: Meshcat) -> ForceArrows:
+def draw_scene(
+    plant: Plant, meshcat: Meshcat, scene_graph: SceneGraph | None = None
+) -> ForceArrows:
     """Draws what does not move, and returns what draws the constraint forces.
 
     Args:
         plant: The robot.
         meshcat: Where to draw.
+        scene_graph: The geometry of its links, or None.
 
     Raises:
         ModelError: The plant is no robot.
@@ -97,11 +100,22 @@ def draw_scene(plant: Plant, meshcat: Meshcat) -> ForceArrows:
     model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
     loads = ConstraintWrenches(model)
-    draw_surroundings(meshcat, model, loads, state, dae.parameter_values)
-    # From behind, the side and a little above.
-    middle, size = scene_extent(model, loads, state)
-    meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
+    middle, size = scene_extent(model, loads, state, scene_graph)
+    points = loads(state, np.zeros(len(dae.force_signals))).points[None]
+    draw_surroundings(meshcat, surroundings(model, loads, points, dae.parameter_values, size))
+    look_at(meshcat, middle, size)
     return ForceArrows(meshcat, model, 0.2 * size)
+
+
+def look_at(meshcat: Meshcat, middle: FloatArray, size: float) -> None:
+    """Places the camera from behind, the side and a little above.
+
+    Args:
+        meshcat: Where it looks.
+        middle: What it looks at, m, shape (3,).
+        size: How large that is, in m.
+    """
+    meshcat.SetCameraPose(middle + size * np.array([-0.6, -0.85, 0.4]), middle)
 
 
 def view_of_links(
@@ -134,49 +148,15 @@ def view_of_links(
     return diagram
 
 
-def draw_surroundings(
-    meshcat: Meshcat,
-    model: RobotModel,
-    loads: ConstraintWrenches,
-    state: FloatArray,
-    parameters: FloatArray,
-) -> None:
-    """Draws what the robot touches, around where it touches.
+def draw_surroundings(meshcat: Meshcat, seen: Sequence[Seen]) -> None:
+    """Draws what a robot touches.
 
     Args:
         meshcat: Where to draw.
-        model: The robot.
-        loads: Its constraint loads, with these parameters.
-        state: x, or the link state (q, v) that it begins with.
-        parameters: Values of all parameters.
+        seen: What there is to see.
     """
-    _, size = scene_extent(model, loads, state)
-    points = loads(state, np.zeros(len(model.dae.force_signals))).points
-    for constraint, point in zip(loads.constraints, points, strict=True):
-        own = own_values(constraint, model.dae, parameters)
-        picture = constraint.picture(own, point, size)
-        if picture is not None:
-            path, stands = path_of(constraint, "surface"), constraint.placement(own)
-            meshcat.SetObject(f"{path}/form", picture.form, rgba=_SURFACE_COLOR)
-            meshcat.SetTransform(f"{path}/form", stands.inverse() @ picture.pose)
-            meshcat.SetTransform(path, stands)
-
-
-def scene_extent(
-    model: RobotModel, loads: ConstraintWrenches, state: FloatArray
-) -> tuple[FloatArray, float]:
-    """The middle and the size, in m, of the box around a robot and the points where it is held.
-
-    Args:
-        model: The robot.
-        loads: Its constraint loads.
-        state: x, or the link state (q, v) that it begins with.
-    """
-    links, dae = model.links, model.dae
-    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
-    landmarks = TracedFunction("landmarks", inputs, {"points": links.landmarks()})
-    held = loads(state, np.zeros(len(dae.force_signals))).points
-    own = landmarks(state[: links.q.numel()], dae.parameter_values)[0].reshape(3, -1, order="F").T
-    places = np.vstack([np.zeros((1, 3)), own, held])
-    low, high = places.min(axis=0), places.max(axis=0)
-    return (low + high) / 2, max(float(np.linalg.norm(high - low)), 1e-3)
+    for one in seen:
+        path = path_of(one.constraint, "surface")
+        meshcat.SetObject(f"{path}/form", one.picture.form, rgba=_SURFACE_COLOR)
+        meshcat.SetTransform(f"{path}/form", one.picture.pose)
+        meshcat.SetTransform(path, one.stands)

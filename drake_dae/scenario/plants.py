@@ -135,6 +135,11 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     The robot touches with a ball, and what it touches is as in its constraints. With points the
     force is stiffness times depth; with hydroelastic patches the ball is rigid, and what it touches
     has a pressure of modulus times depth / thickness.
+
+    Where the robot tilts by an angle a from its nominal position, the ball rolls: it touches
+    2 radius sin(a / 2) beside the point of the constraint, and that point is radius (1 - cos a)
+    off the surface. A stiffer contact does not come nearer to the ideal one there, a smaller
+    radius does. A tool that stays normal to its surface does not roll.
     """
 
     carries: ClassVar[bool] = True

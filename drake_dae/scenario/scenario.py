@@ -120,6 +120,8 @@ class Scenario:
             it gets them as they are.
         saturation: Whether the drives give no more than the effort limits of the robot's file.
         tolerances: How large errors may be; a run that leaves them ends there, with the reason.
+        may_diverge: Whether a run goes on whose errors or states leave all measure; otherwise it
+            ends there, with what grew.
         references: Name -> reference, where a number is a constant. A name is that of an output,
             tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
             "tool.y, elbow". Outputs that complete others may be without; they hold what they start
@@ -157,6 +159,7 @@ class Scenario:
     encoders: Encoders | None = None
     saturation: bool = False
     tolerances: Tolerances | None = None
+    may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
     task: Task | None = None
     start: parts.Start = field(default_factory=parts.Start)

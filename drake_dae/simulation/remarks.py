@@ -44,6 +44,21 @@ def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
     )
 
 
+def ball_remarks(radius: float | None) -> list[str]:
+    """What the ball of Drake's own contact does that a point does not.
+
+    Args:
+        radius: The radius of the ball in m; None where there is none.
+    """
+    if radius is None:
+        return []
+    return [
+        f"Drake's own contact is that of a ball of {1e3 * radius:.3g} mm. Where the robot tilts by "
+        "an angle a the ball rolls,\nand touches 2 * radius * sin(a / 2) beside the point of the "
+        "constraint; no stiffness changes that, a smaller\nplant.radius does."
+    ]
+
+
 def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]:
     """That a task has ended its run, where it has; no failure and no signal did.
 

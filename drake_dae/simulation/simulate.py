@@ -26,7 +26,9 @@ from pydrake.systems.primitives import Integrator
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import show_state
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.interruption import Ending, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
@@ -69,8 +71,11 @@ def simulate(
     config: SimulatorConfig,
     progress: bool = False,
     after_step: Callable[[Context], None] | None = None,
+    may_diverge: bool = False,
 ) -> RunStatistics:
     """Runs a diagram from a context; the context is the end state afterwards, on the manifold.
+
+    A run of a `Plant` that diverges ends, with what grew and since when: see `DivergenceWatch`.
 
     Ctrl-C, SIGTERM and SIGHUP end the run after the current step, a second one at once with a
     KeyboardInterrupt. Logs keep what they have, as they do when the run fails with an exception.
@@ -82,6 +87,7 @@ def simulate(
         config: Drake's integrator settings. The run begins at its start_time.
         progress: Shows simulated time and speed on stderr.
         after_step: Called with the context after each step, such as `RecordWriter.update`.
+        may_diverge: Whether a run that diverges goes on.
 
     Warns:
         UserWarning: The largest step allowed is so small that the run takes hours.
@@ -89,7 +95,7 @@ def simulate(
     Raises:
         ModelError: The duration or the settings make no sense.
         InconsistentStateError: The start state is not on the manifold.
-        SimulationError: The run cannot go on; the exception has time and state.
+        SimulationError: The run cannot go on, or diverges; the exception has time and state.
     """
     check_duration(duration)
     check_config(config)
@@ -102,6 +108,7 @@ def simulate(
     start, going_on = context.get_time(), EventStatus.DidNothing()
     ending = Ending()
     began: float | None = None
+    watch: DivergenceWatch | None = None
 
     def stop(number: signal.Signals) -> None:
         ending(number)
@@ -115,6 +122,8 @@ def simulate(
                 shown.update(current.get_time() - start)
             if after_step is not None:
                 after_step(current)
+            if watch is not None:
+                watch.look(current)
             if ending.signal is not None:
                 return EventStatus.ReachedTermination(diagram, "interrupted")
             return going_on
@@ -122,8 +131,12 @@ def simulate(
         try:
             simulator.Initialize()
             began = time.perf_counter()
+            if not may_diverge:
+                found = DivergenceWatch(diagram, context, duration)
+                watch = found if found.sees else None
             # A monitor in Python takes a tenth of a short step: without need there is none.
-            if progress or after_step is not None or ending.signal is not None:
+            is_needed = progress or watch is not None or after_step is not None
+            if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
             simulator.AdvanceTo(start + duration)
             elapsed = time.perf_counter() - began
@@ -135,7 +148,7 @@ def simulate(
             state = context.get_continuous_state_vector().CopyToVector()
             raise SimulationError(
                 f"the simulation cannot go on at t = {context.get_time():.6g} s, state "
-                f"{np.array2string(state, precision=4, separator=', ')}: "
+                f"{show_state(state)}: "
                 f"{str(error).rstrip('.')}. Where the state grows without bound or a reference "
                 "leaves what the robot can reach, change these; otherwise choose other integrator "
                 "settings",

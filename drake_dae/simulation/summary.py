@@ -10,6 +10,7 @@ import numpy as np
 from drake_dae.analysis.tables import Table
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.robots.clearances import LinkBehind
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.open_contacts import contact_notes
 from drake_dae.simulation.records.record import Record
@@ -71,6 +72,7 @@ def summary(
     failure: str = "",
     accuracy: float | None = None,
     reasons: Sequence[str] = (),
+    behind: Sequence[LinkBehind] = (),
 ) -> str:
     """What a run did, in plain text, and whether that is as theory predicts.
 
@@ -85,6 +87,7 @@ def summary(
         failure: Why it failed.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
         reasons: Why a run may be off its prediction, such as "the law is sampled".
+        behind: Links that went behind a surface.
     """
     limits = limits or Limits()
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
@@ -109,7 +112,7 @@ def summary(
         ended = f"The run ended early, at {record.time[-1]:.4g} s"
         reasons = ["of what ended it, see above"]
     words = in_words(judge(record, predicted, accuracy), accuracy, reasons, ended)
-    beware = _beware(record, limits)
+    beware = [*_beware(record, limits), *map(str, behind)]
     verdict = [fill(f"{words} But {'; '.join(beware)}." if beware else words, _WIDTH)]
     return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
 

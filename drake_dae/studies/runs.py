@@ -251,7 +251,13 @@ def _stepped(
     """What Drake's Simulator makes of a run: its record, how many steps it took, why it failed."""
     steps, failure = 0, None
     try:
-        run = simulate(loop.diagram, context, scenario.duration, scenario.integrator)
+        run = simulate(
+            loop.diagram,
+            context,
+            scenario.duration,
+            scenario.integrator,
+            may_diverge=scenario.may_diverge,
+        )
         steps = run.steps
         if run.interrupted:
             raise KeyboardInterrupt(run.interrupted)

@@ -37,7 +37,8 @@ from drake_dae import (
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import ForceArrows, GrowingPaths
 from drake_dae.pictures.course import contact_paths, follow, frame_times
-from drake_dae.pictures.view import FRAME_RATE, draw_scene, scene_extent
+from drake_dae.pictures.surroundings import scene_extent
+from drake_dae.pictures.view import FRAME_RATE, draw_scene
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.surfaces import surfaces
 from drake_dae.robots.surfaces.surface import tangents
@@ -131,7 +132,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     head = things[f"{path}/arrow/head"]["geometries"][0]
     nominal = loop.plant.structure.manifold.project(loop.plant.dae.nominal_state)
     model = loop.plant.model
-    _, size = scene_extent(model, ConstraintWrenches(model), nominal)
+    _, size = scene_extent(model, ConstraintWrenches(model), nominal, loop.scene_graph)
     assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
     assert middle - shaft["height"] / 2 == pytest.approx(0.0, abs=1e-9)

@@ -101,6 +101,10 @@ class Links(Frames, Protocol):
     def landmarks(self) -> ca.SX:
         """Points of the robot that show where it is, in m, shape (3, k): for a view of it."""
 
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """The names of the frames whose origins the landmarks are, k of them."""
+
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
         """The frames in motion, in which constraints are written.
 

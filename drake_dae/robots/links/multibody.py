@@ -130,6 +130,11 @@ class MultibodyExpressions:
         """The origins of all bodies, in m, shape (3, k)."""
         return ca.horzcat(*[self.position(body.body_frame()) for body in _bodies(self.plant)])
 
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """The names of all bodies, in the order of the landmarks."""
+        return tuple(body.name() for body in _bodies(self.plant))
+
     def kinematics(self, acceleration: ca.SX | None = None) -> TreeKinematics:
         """The frames in motion with v' = `acceleration`, a symbol if None."""
         if acceleration is None:

@@ -133,6 +133,11 @@ class LinkExpressions:
         """The origins of all frames, in m, shape (3, k)."""
         return ca.horzcat(ca.SX(3, 1), *[self.position(frame) for frame in self.frames])
 
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """The names of all frames, in the order of the landmarks."""
+        return ("world", *self.frames)
+
     def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
         """The frames in motion with v' = `acceleration`, a symbol if None."""
         if acceleration is None:

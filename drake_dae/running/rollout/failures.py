@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arrays import FloatArray, show_state
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run
@@ -44,8 +44,8 @@ def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
             return no_step_leads_on(name, run.time, state, trial, str(trial))
         case Ending.STUCK:
             return SimulationError(
-                f"the simulation cannot go on at t = {run.time:.6g} s, state {show(state)}: no "
-                "step, however short, is as accurate as it should be. Where the state grows "
+                f"the simulation cannot go on at t = {run.time:.6g} s, state {show_state(state)}: "
+                "no step, however short, is as accurate as it should be. Where the state grows "
                 "without bound or a reference leaves what the robot can reach, change these; "
                 "otherwise choose a lower accuracy",
                 run.time,

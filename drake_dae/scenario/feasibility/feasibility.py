@@ -13,6 +13,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
+from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
@@ -82,8 +83,16 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     analysis = analyze(
         model.dae, reference=reference, times=times, start=start, exogenous=exogenous
     )
+    motion = analysis.motion
+    behind: tuple[LinkBehind, ...] = ()
+    if motion is not None:
+        behind = links_behind(model, motion.times, motion.states, motion.parameters)
     return Feasibility(
-        analysis, scenario.duration, is_resolved=is_resolved, **_ranges(analysis, model)
+        analysis,
+        scenario.duration,
+        is_resolved=is_resolved,
+        behind=behind,
+        **_ranges(analysis, model),
     )
 
 

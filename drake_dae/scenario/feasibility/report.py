@@ -1,7 +1,7 @@
 """What a scenario's reference takes: values, tables, and what is wrong."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,12 @@ import numpy as np
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
+from drake_dae.robots.clearances import LinkBehind
+
+WRONG_SIDE = (
+    ": turn its normal around if its free side is the other one, or choose another posture or place"
+)
+"""What to do about a link behind a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +74,7 @@ class Feasibility:
         joints: Positions and velocities of the joints that have limits.
         is_resolved: Whether the times follow the reference; if not, it varies faster than they do,
             and the values between them are not known.
+        behind: Links that go behind a surface that the robot touches; see `links_behind`.
     """
 
     analysis: Analysis
@@ -77,6 +84,7 @@ class Feasibility:
     constraint_forces: tuple[SignalRange, ...] = ()
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
+    behind: tuple[LinkBehind, ...] = ()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -86,6 +94,7 @@ class Feasibility:
             *map(_exceeded, _beyond((*self.controls, *self.joint_forces))),
             *map(_pulling, _beyond(self.constraint_forces)),
             *map(_left, _beyond(self.joints)),
+            *(f"{one}{WRONG_SIDE}" for one in self.behind),
         )
 
     def __repr__(self) -> str:
@@ -109,6 +118,7 @@ class Feasibility:
                 key: [r.to_dict() for r in getattr(self, key)]
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
             },
+            "behind": [asdict(one) for one in self.behind],
             "problems": list(self.problems),
         }
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray, show
+from drake_dae.arrays import FloatArray, show_state
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.contacts import jam
@@ -34,7 +34,7 @@ def simulation_error(
         state: The state, shape (n,).
         signals: Name of an input -> names of its entries; the name of the input serves otherwise.
     """
-    where = f"at t = {time:.6g} s, state {show(state)}"
+    where = f"at t = {time:.6g} s, state {show_state(state)}"
     bad = ", ".join(
         signals[name][i].name if name in signals else name
         for name, entries in failure.inputs.items()
@@ -139,7 +139,7 @@ def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError)
         reason: What the projection said.
     """
     return SimulationError(
-        f"the state left the constraint too far at t = {time:.6g} s, state {show(state)}: "
+        f"the state left the constraint too far at t = {time:.6g} s, state {show_state(state)}: "
         f"{reason}. Take smaller steps or a better accuracy",
         time,
         state,
@@ -147,7 +147,7 @@ def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError)
 
 
 def _at(state: FloatArray) -> str:
-    return f", state {show(state)}," if state.size else ""
+    return f", state {show_state(state)}," if state.size else ""
 
 
 def off_start(name: str, manifold: Manifold, residual: FloatArray) -> InconsistentStateError:
@@ -184,7 +184,7 @@ def assembled_otherwise(
     worst = int(np.argmax(np.abs(residual)))
     signal = left_out.residual_signals[worst]
     return InconsistentStateError(
-        f"{name}: the constraints that stay hold at state {show(state)}, but not "
+        f"{name}: the constraints that stay hold at state {show_state(state)}, but not "
         f"the redundant '{signal.name}', which was left out: {residual[worst]:.3g} "
         f"{signal.unit}. The robot is assembled in another way there, or a parameter moves "
         "one of these constraints and not the others; start nearer to where all hold",
@@ -230,7 +230,7 @@ def jammed_contact(
     outcome = f". What becomes of it is {found.value}" if found else ""
     return JammedContactError(
         f"{dae.name}: friction jams the contact of {names} at t = {error.time:.6g} s, "
-        f"state {show(error.state)} (Painleve): a principal minor of A(x) has come to "
+        f"state {show_state(error.state)} (Painleve): a principal minor of A(x) has come to "
         f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
         "other way, or hold the robot less steeply to the surface",
         error.time,

@@ -26,6 +26,11 @@ class ContactMaterial:
     force is stiffness times depth; with hydroelastic patches the ball is rigid, and what it touches
     has a pressure of modulus times depth / thickness.
 
+    Where the robot tilts by an angle a from its nominal position, the ball rolls: it touches
+    2 radius sin(a / 2) beside the point of the constraint, and that point is radius (1 - cos a)
+    off the surface. A stiffer contact does not come nearer to the ideal one there, a smaller
+    radius does. A tool that stays normal to its surface does not roll.
+
     Attributes:
         time_step: The step of the plant, s.
         contact_model: "point" or "hydroelastic".
@@ -35,7 +40,8 @@ class ContactMaterial:
         dissipation: Of Hunt and Crossley, s/m.
         friction: The coefficient of friction of all contacts; None for those of the constraints.
         radius: Of the ball, m. It touches the surface where the point of the constraint is while
-            the robot holds it as at its nominal positions, and rolls on it otherwise.
+            the robot holds it as at its nominal positions, and rolls on it otherwise: the
+            difference from an ideal contact is proportional to it, whatever the stiffness.
 
     Raises:
         ModelError: A number makes no sense.

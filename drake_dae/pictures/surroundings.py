@@ -1,0 +1,137 @@
+"""What a robot touches, as it is drawn, and how much room a robot takes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import SceneGraph, Shape
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import BodyIndex
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
+from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.model import RobotModel
+from drake_dae.robots.surfaces.picture import Picture
+from drake_dae.trace.functions import TracedFunction
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is to be seen of a surface that a constraint, or some of them, touch.
+
+    Attributes:
+        constraint: The first of them.
+        stands: Where their parameters put it.
+        picture: The surface, relative to that.
+    """
+
+    constraint: Constraint
+    stands: RigidTransform
+    picture: Picture
+
+
+def surroundings(
+    model: RobotModel,
+    acting: ConstraintWrenches,
+    points: FloatArray,
+    parameters: FloatArray,
+    size: float,
+) -> list[Seen]:
+    """The surfaces that a robot touches, each once: two that coincide would flicker.
+
+    A surface without an end is drawn around the middle of what is touched of it, and as large as
+    that at least.
+
+    Args:
+        model: The robot.
+        acting: Its constraint wrenches.
+        points: Where its constraints act along a run, m, shape (k, constraints, 3).
+        parameters: The values of all parameters.
+        size: How large a piece of a surface to draw if it has no end, m.
+    """
+
+    def seen(row: int, touched: FloatArray) -> Seen | None:
+        constraint = acting.constraints[row]
+        own = own_values(constraint, model.dae, parameters)
+        low, high = touched.min(axis=0), touched.max(axis=0)
+        nearest = np.argmin(np.linalg.norm(touched - (low + high) / 2, axis=1))
+        extent = max(size, 1.2 * float(np.linalg.norm(high - low)))
+        picture = constraint.picture(own, touched[nearest], extent)
+        if picture is None:
+            return None
+        stands = constraint.placement(own)
+        return Seen(constraint, stands, picture.moved(stands.inverse()))
+
+    found: list[tuple[list[int], Seen]] = []
+    for row, constraint in enumerate(acting.constraints):
+        one = seen(row, points[:, row])
+        if one is None:
+            continue
+        moves = any(parameter.exogenous for parameter in constraint.parameters)
+        for number, (rows, other) in enumerate(found):
+            if moves or any(parameter.exogenous for parameter in other.constraint.parameters):
+                continue
+            touched = points[:, [*rows, row]].reshape(-1, 3)
+            first, second = seen(rows[0], touched), seen(row, touched)
+            if first is not None and second is not None and _coincide(first, second):
+                found[number] = ([*rows, row], first)
+                break
+        else:
+            found.append(([row], one))
+    return [one for _, one in found]
+
+
+def _coincide(first: Seen, second: Seen) -> bool:
+    """Whether two pictures show the same."""
+    poses = [one.stands @ one.picture.pose for one in (first, second)]
+    if not poses[0].IsNearlyEqualTo(poses[1], 1e-9):
+        return False
+    one, other = first.picture.form, second.picture.form
+    if isinstance(one, Shape) or isinstance(other, Shape):
+        return repr(one) == repr(other)
+    corners = [np.array(form.vertices()) for form in (one, other)]
+    return corners[0].shape == corners[1].shape and np.allclose(*corners, rtol=0.0, atol=1e-9)
+
+
+def scene_extent(
+    model: RobotModel,
+    loads: ConstraintWrenches,
+    state: FloatArray,
+    scene_graph: SceneGraph | None = None,
+) -> tuple[FloatArray, float]:
+    """The middle and the size, in m, of the box around a robot and the points where it is held.
+
+    Args:
+        model: The robot.
+        loads: Its constraint loads.
+        state: x, or the link state (q, v) that it begins with.
+        scene_graph: The geometry of its links, or None: then each link is but its origin.
+    """
+    links, dae = model.links, model.dae
+    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+    landmarks = TracedFunction("landmarks", inputs, {"points": links.landmarks()})
+    held = loads(state, np.zeros(len(dae.force_signals))).points
+    own = landmarks(state[: links.q.numel()], dae.parameter_values)[0].reshape(3, -1, order="F").T
+    places = np.vstack([np.zeros((1, 3)), own, held, _corners(model, state, scene_graph)])
+    low, high = places.min(axis=0), places.max(axis=0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)), 1e-3)
+
+
+def _corners(model: RobotModel, state: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
+    """The corners of the boxes around what is to be seen of the links, m, shape (k, 3)."""
+    drawn = model.links.plant
+    if scene_graph is None or drawn is None or drawn.get_source_id() is None:
+        return np.zeros((0, 3))
+    inspector, context = scene_graph.model_inspector(), drawn.CreateDefaultContext()
+    drawn.SetPositions(context, state[: drawn.num_positions()])
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1)
+    found = []
+    for number in range(1, drawn.num_bodies()):
+        body = drawn.get_body(BodyIndex(number))
+        pose = drawn.EvalBodyPoseInWorld(context, body)
+        for geometry in drawn.GetVisualGeometriesForBody(body):
+            box = inspector.GetObbInGeometryFrame(geometry)
+            if box is not None:
+                stands = pose @ inspector.GetPoseInFrame(geometry) @ box.pose()
+                found.append(stands.multiply(signs * box.half_width()[:, None]).T)
+    return np.vstack(found) if found else np.zeros((0, 3))

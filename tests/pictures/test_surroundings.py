@@ -1,0 +1,84 @@
+"""What robots touch, as it is drawn: once, around the whole run, with all of the robot in sight."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from drake_dae.pictures.course import contact_paths, follow, run_extent
+from drake_dae.pictures.plots import plot_paths
+from drake_dae.pictures.surroundings import surroundings
+from drake_dae.scenario.build import build_scenario
+from drake_dae.simulation.simulate import simulate
+from tests.support.runs import scenario
+
+
+@cache
+def course(name, *settings):
+    """A short run of a shipped scenario, and its loop."""
+    case = scenario(name, *settings)
+    loop, context = build_scenario(case)
+    simulate(loop.diagram, context, case.duration, case.integrator)
+    return follow(loop, loop.record(context), context, 8.0), loop
+
+
+def seen(run):
+    return surroundings(run.model, run.acting, run.points, run.parameters[0], 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "names"),
+    [
+        ("biped", ["front"]),  # Two feet on one floor.
+        ("cart_wall", ["wall"]),  # What wheels roll on is not drawn.
+        ("three_fingers", None),  # Each finger on its own side.
+    ],
+)
+def test_each_surface_is_drawn_once(name, names):
+    run, _ = course(name, "duration=0.5")
+    found = seen(run)
+    if names is not None:
+        assert [one.constraint.name for one in found] == names
+    places = [(one.stands @ one.picture.pose).GetAsMatrix4() for one in found]
+    pairs = [(a, b) for i, a in enumerate(places) for b in places[:i]]
+    assert not any(np.allclose(a, b, atol=1e-9) for a, b in pairs)
+
+
+@pytest.mark.slow
+def test_a_wall_is_as_long_as_the_way_along_it():
+    """The cart goes 1.2 m in 4 s, more than the 0.5 m that are asked for."""
+    run, _ = course("cart_wall", "duration=4.0")
+    (one,) = seen(run)
+    touched = run.points[:, 0]
+    local = (one.stands @ one.picture.pose).inverse().multiply(touched.T)
+    half = np.array([one.picture.form.width(), one.picture.form.depth()]) / 2
+    assert np.ptp(touched[:, 0]) > 0.5
+    assert np.all(np.abs(local[:2]) <= half[:, None])
+
+
+@pytest.mark.slow
+def test_the_head_of_the_biped_is_in_sight():
+    """Its hip is at 0.7 m, and the trunk and the head stand 0.6 m above it."""
+    run, loop = course("biped", "duration=0.5")
+    middle, size = run_extent(run, loop.scene_graph)
+    assert middle[2] + size / 2 >= 1.3
+    links_alone, small = run_extent(run, None)
+    assert links_alone[2] + small / 2 < middle[2] + size / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["seven_joint_wall", "seven_joint_writing", "cart_wall"])
+def test_paths_are_seen_from_the_free_side(name):
+    """Who looks against the normal n, with e up, has e x n to the right."""
+    run, _ = course(name, "duration=0.5")
+    path = contact_paths(run)[0]
+    row = next(i for i, c in enumerate(run.acting.constraints) if c.name == path.name)
+    constraint = run.acting.constraints[row]
+    normal = np.array(constraint.surface.normal)
+    up = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(up, normal)
+    across = (run.points[:, row] - run.points[0, row]) @ right
+    axis = plot_paths([path]).axes[0]
+    to_pixels = axis.transData.transform(path.actual)[:, 0]
+    assert np.sign(to_pixels[-1] - to_pixels[0]) == np.sign(across[-1])

@@ -1,0 +1,137 @@
+"""Runs that diverge end with what grew; those that do something violent go on."""
+
+import warnings
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import SimulatorConfig
+
+from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
+from drake_dae.arrays import show_state
+from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
+from drake_dae.scenario.build import build_scenario
+from drake_dae.simulation.simulate import simulate
+from tests.support.runs import scenario
+
+
+def run(name, *settings):
+    """Simulates a shipped scenario with settings."""
+    case = scenario(name, *settings)
+    loop, context = build_scenario(case)
+    return simulate(
+        loop.diagram, context, case.duration, case.integrator, may_diverge=case.may_diverge
+    )
+
+
+LATE = "sampling={period: %g, delay: %g}"
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "grew"),
+    [
+        # Read late: the law answers an error of long ago.
+        (
+            "two_link_wall",
+            ("gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001)),
+            "error of wall.force",
+        ),
+        pytest.param(
+            "five_bar",
+            ("gains=!Poles {all: [-1500.0]}", LATE % (0.002, 0.002)),
+            "error of pin.f",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "seven_joint_dome",
+            ("gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004)),
+            "error of dome.force",
+            marks=pytest.mark.slow,
+        ),
+        # Springs behind Drake's contact, with a load that the law does not know.
+        pytest.param(
+            "wall_flexible_contact",
+            ("plant_payloads=[{frame: tool, mass: 0.5}]", "duration=1.0"),
+            "joint6_motor.velocity",
+            marks=[pytest.mark.slow, pytest.mark.thorough],
+        ),
+    ],
+)
+def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings, grew):
+    with pytest.raises(SimulationError, match=r"the run diverges: .* has grown since") as caught:
+        run(name, *settings)
+    text = str(caught.value)
+    assert grew in text
+    assert "may_diverge" in text
+    assert "gains" in text
+    # Far before numbers end: what is told can be read.
+    assert np.isfinite(caught.value.state).all()
+    assert caught.value.time < 1.0
+
+
+@pytest.mark.slow
+def test_a_run_may_diverge_where_that_is_asked_for():
+    late = ("two_link_wall", "gains=!Poles {all: [-300.0]}", LATE % (0.005, 0.005))
+    short = "duration=0.05"
+    with pytest.raises(SimulationError, match="diverges"):
+        run(*late, short)
+    assert run(*late, short, "may_diverge=true").simulated_time == pytest.approx(0.05)
+
+
+def unstable_inside(size, period):
+    """A loop whose output is held while x_2' = x_2 / period - x_1 runs off, with its context.
+
+    Lengths are counted in 1 / size m, and times in period s.
+    """
+    system = DaeSystem.from_functions(
+        ["a", "b"],
+        f=lambda x: [0, (x[1] - x[0]) / period],
+        h=lambda x: [1 / period, 0],
+        l=lambda x: [x[0]],
+        nominal_state=[0.1 * size, 0.1 * size],
+        state_scale=[size, size],
+        name="runaway",
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonMinimumPhaseWarning)
+        law = TrackingLaw(system, poles(-2.0 / period))
+        loop = make_closed_loop(DaePlant(system), law, {"z0": 0.1 * size})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, [0.1 * size, 0.1 * size * (1.0 + 1e-3)])
+    return loop, context
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "period"), [(1.0, 1.0), (1e3, 1.0), (1e-3, 60.0), (1e6, 1e-3)])
+def test_when_it_ends_does_not_depend_on_units(size, period):
+    """b - a = 1e-4 size e^(t / period) is 1e9 size after 13 ln 10 = 29.9 periods.
+
+    It is looked at every eighth step, of period / 50 here.
+    """
+    loop, context = unstable_inside(size, period)
+    config = SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=period / 50.0, use_error_control=False
+    )
+    with pytest.raises(SimulationError, match=r"b is .* it has grown since") as caught:
+        simulate(loop.diagram, context, 40.0 * period, config)
+    expected = 13.0 * np.log(10.0)
+    assert expected <= caught.value.time / period <= expected + 9 / 50
+
+
+def test_a_start_far_away_is_no_divergence():
+    """The error begins at a thousand times the reference, and decays."""
+    system = DaeSystem.from_functions(
+        ["a"], f=lambda x: [0], h=lambda x: [1], l=lambda x: [x[0]], name="far"
+    )
+    law = TrackingLaw(system, poles(-2.0))
+    loop = make_closed_loop(DaePlant(system), law, {"z0": 1.0})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, [1e3])
+    simulate(loop.diagram, context, 10.0, SimulatorConfig())
+    # Of 999 e^-20 = 2e-6 that is left.
+    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    assert state == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_state_that_left_all_measure_is_told_by_its_size():
+    assert show_state([1.0, -0.25]) == "[ 1.  , -0.25]"
+    assert show_state([1.0, -3e192, np.inf]) == "grown to 3e+192"
