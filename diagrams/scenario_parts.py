@@ -109,6 +109,10 @@ Actuators = Annotated[
 """Which joints are driven: "all", names, or name -> effort limit."""
 
 
+LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
+"""What a scenario may leave out of a robot's file."""
+
+
 @dataclass(frozen=True)
 class Robot:
     """A robot that Drake's Parser reads, and what its file does not say of it.
@@ -138,9 +142,9 @@ class Robot:
             those that the file gives actuators.
         leave_out: What the file has and the equations have not, which without this is refused:
             joint_friction, which is Coulomb friction; inertia that no body can have, in whose place
-            Drake takes that of a ball of water of the same mass; constraints, all those that the
-            file has beside its joints, as <equality> of MJCF, which are then written under
-            `constraints`.
+            the nearest possible one is taken; empty_limits, the position limits of joints that
+            they leave no room, 0 to 0 for example; constraints, all those that the file has beside
+            its joints, as <equality> of MJCF, which are then written under `constraints`.
         payloads: Masses that it carries, which plant and law have both.
     """
 
@@ -150,9 +154,7 @@ class Robot:
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
-    leave_out: list[Literal["joint_friction", "inertia", "constraints"]] = field(
-        default_factory=list
-    )
+    leave_out: list[LeftOut] = field(default_factory=list)
     description: str = ""
     payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
 

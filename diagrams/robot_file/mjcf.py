@@ -1,18 +1,23 @@
-"""The meshes of an MJCF file that Drake cannot read, left out of it."""
+"""An MJCF file without what Drake cannot read: meshes that are no .obj, and bodies of mass 0."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 from drake_dae.errors import ModelError
 
 _MESH = re.compile(r"<mesh\b([^>]*?)(?:/>|>\s*</mesh\s*>)")
-_GEOM = re.compile(r"<geom\b([^>]*?)(?:/>|>\s*</geom\s*>)")
+_GEOM = re.compile(r"<geom\b([^>]*?)(?:/>|>\s*</geom\s*>|>)")
+_INERTIAL = re.compile(r"<inertial\b[^>]*?(?:/>|>\s*</inertial\s*>)")
 _READ = ".obj"
 
 
 def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
     """A file without its meshes that are no .obj, and without the geometry that is made of them.
+
+    A body whose <inertial> has mass 0 has none, and its geometry weighs nothing: MuJoCo takes such
+    bodies where they do not move, or move with others.
 
     Args:
         text: The text of the file, without comments.
@@ -23,12 +28,13 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         and the meshes that are left out.
 
     Raises:
-        ModelError: A body has its mass from such a mesh.
+        ModelError: A body that can move has its mass from such a mesh.
     """
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return text, []  # Drake says what is wrong.
+    whole, text = text, _without_mass(text, root)
     folder = file.resolve().parent
     for compiler in root.iter("compiler"):
         folder = file.resolve().parent / compiler.get("meshdir", compiler.get("assetdir", ""))
@@ -37,7 +43,7 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         for mesh in root.iter("mesh")
         if mesh.get("file") and Path(mesh.get("file", "")).suffix.lower() != _READ
     }
-    if not refused:
+    if not refused and text == whole:
         return text, []
     _check_masses(root, refused)
 
@@ -56,10 +62,57 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
     return _GEOM.sub(geometry, _MESH.sub(asset, text)), list(refused.values())
 
 
+def _without_mass(text: str, root: ElementTree.Element) -> str:
+    """Bodies of mass 0 as Drake reads them: without <inertial>, of geometry that weighs nothing."""
+    if _takes_geometry(root):
+        return text
+    empty = {
+        child
+        for body in root.iter("body")
+        if _weighs_nothing(body.find("inertial"))
+        for child in body
+        if child.tag in ("inertial", "geom")
+    }
+    inertials, geoms = root.iter("inertial"), root.iter("geom")
+
+    def inertial(found: re.Match[str]) -> str:
+        return "\n" * found[0].count("\n") if next(inertials) in empty else found[0]
+
+    def geom(found: re.Match[str]) -> str:
+        if next(geoms) not in empty:
+            return found[0]
+        return re.sub(r"\bmass\s*=\s*[\"'][^\"']*[\"']", "", found[0]).replace(
+            "<geom", '<geom mass="0"', 1
+        )
+
+    return _GEOM.sub(geom, _INERTIAL.sub(inertial, text)) if empty else text
+
+
+def _takes_geometry(root: ElementTree.Element) -> bool:
+    """Whether masses are those of the geometry also where there is an <inertial>."""
+    return any(one.get("inertiafromgeom") == "true" for one in root.iter("compiler"))
+
+
+def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
+    try:
+        return inertial is not None and float(inertial.get("mass", "")) == 0.0
+    except ValueError:
+        return False  # Drake tells it.
+
+
+def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementTree.Element]:
+    """The bodies in an element that joints move."""
+    for child in body.iterfind("body"):
+        own = moves or child.find("joint") is not None or child.find("freejoint") is not None
+        if own:
+            yield child
+        yield from _moving(child, own)
+
+
 def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
-    """Refuses a body that weighs what its meshes do."""
-    always = any(one.get("inertiafromgeom") == "true" for one in root.iter("compiler"))
-    for body in root.iter("body"):
+    """Refuses a body that moves and weighs what its meshes do."""
+    always = _takes_geometry(root)
+    for body in (body for world in root.iter("worldbody") for body in _moving(world)):
         if body.find("inertial") is not None and not always:
             continue
         for geom in body.iterfind("geom"):
