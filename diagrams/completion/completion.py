@@ -226,7 +226,7 @@ def _with_start(
     ):
         return Completed(scenario)
     if is_given:
-        best = best_posture(postures, rows, wanted, _guesses(task, postures, guess))
+        best = best_posture(postures, rows, wanted, list(_guesses(task, postures, guess)))
         if best is None:  # Whoever starts the robot tells it.
             return Completed(scenario)
         return Completed(_started(scenario, task, best), (_start_note(task, best),))

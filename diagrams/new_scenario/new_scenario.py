@@ -49,8 +49,8 @@ def new_scenario(
     The base is what nothing in the file holds; the chain of joints is the longest that neither
     mimics nor grasps nor rolls, or that to `tip`; all other joints are locked. The surface stands
     where the tip reaches it with its axis along the normal and the task's directions are most
-    independent. A tip that its own joint does not move is the far end of its link. Outputs and start
-    are those of `complete_scenario`. Circle and force leave room to the joints' limits, and
+    independent. A tip that its own joint does not move is the far end of its link. Outputs and
+    start are those of `complete_scenario`. Circle and force leave room to the joints' limits, and
     `find_feasibility` finds no problem, or none but states beside the reference where B(x) is
     singular; the text then says so.
 
