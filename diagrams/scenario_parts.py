@@ -130,9 +130,11 @@ class Robot:
         packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Those
             of which a package.xml lies in a folder above the file that names them, or beside such a
             folder under their name, and those in ROS_PACKAGE_PATH are found without it.
-        free: Names of bodies that no joint holds, "object" or "puck::object": they get a joint in
-            roll, pitch and yaw, with the positions "object_qx", "_qy", "_qz", "_x", "_y", "_z".
-        base: What is welded to the world, where the file does not do it.
+        free: Names of bodies that no joint holds, "object" or "puck::object", or that the file
+            fixes to the world: they get a joint in roll, pitch and yaw, with the positions
+            "object_qx", "_qy", "_qz", "_x", "_y", "_z". A "floating" joint of the file has such
+            positions as well, in the place of a quaternion.
+        base: What is welded to the world, where the file does not do it, or elsewhere than it does.
         locked: Joint name -> position in rad or m where it stays, for joints that turn or slide; a
             joint that is coupled to it stays as well. Such joints are none in the rest of the
             scenario.

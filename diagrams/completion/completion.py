@@ -13,6 +13,7 @@ from drake_dae.diagrams.completion.candidates import Candidates, merged
 from drake_dae.diagrams.completion.choice import best_joints, first_independent
 from drake_dae.diagrams.completion.postures import Posture, Postures
 from drake_dae.diagrams.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.diagrams.completion.shortage import check_independent, why_none
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.robots.contact import Constraint
@@ -97,6 +98,8 @@ def complete(
     )
     # Rows that references name are known before the posture is: by the normal near the guess.
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
+    if near is not None:
+        check_independent(names, near)
     movable = _movable(postures) if missing else []
     along = [row for row in candidates.points(near) if row in movable] if near else []
     try:
@@ -107,7 +110,8 @@ def complete(
         raise
     if missing == 0:
         return _with_start(scenario, task, postures, guess)
-    return _with_outputs(scenario, task, postures, guess)
+    every = [signal.name for signal in bound.force_signals]
+    return _with_outputs(scenario, task, postures, guess, every)
 
 
 class _Task:
@@ -235,9 +239,13 @@ def _with_start(
 
 
 def _with_outputs(
-    scenario: Scenario, task: _Task, postures: Postures, guess: FloatArray
+    scenario: Scenario,
+    task: _Task,
+    postures: Postures,
+    guess: FloatArray,
+    forces: Sequence[str],
 ) -> Completed:
-    """The scenario with all outputs and a start."""
+    """The scenario with all outputs and a start; `forces` names those of the constraints."""
     candidates, referred = task.candidates, task.referred
     posture, is_normal = _posture(task, postures, referred, guess)
     # What completes the outputs, in the order of their worth.
@@ -254,12 +262,15 @@ def _with_outputs(
     free = [row for row in candidates.joints if row not in rows]
     joints = best_joints(postures, posture, rows, free, room - len(held), np.array(wanted))
     if joints is None:
+        why = why_none(posture, rows, free, task.missing, task.given, forces)
+        if why is not None:
+            raise ScenarioError(why)
         names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
         raise ScenarioError(
             (
                 "outputs",
                 f"{task.missing} are missing, and no positions of joints beside {names} leave "
-                "B(x) regular; name them",
+                "B(x) regular; name others under outputs",
             )
         )
     chosen, resting = [*referred[task.given :], *along, *held, *joints], [*along, *held, *joints]

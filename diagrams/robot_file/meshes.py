@@ -20,7 +20,9 @@ from pydrake.multibody.parsing import (
 
 from drake_dae.diagrams.robot_file.inertias import RepairedInertia, possible_inertias
 from drake_dae.diagrams.robot_file.mjcf import without_assets
+from drake_dae.diagrams.robot_file.placing import released, world_links
 from drake_dae.diagrams.robot_file.urdf import as_meant, blank
+from drake_dae.errors import ModelError
 
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _COLLISION = re.compile(r"<collision\b[^<]*?(?:/>|>.*?</collision\s*>)", re.DOTALL)
@@ -37,12 +39,14 @@ class Copies:
 
     Attributes:
         leave_out: What the scenario says of it.
+        placed: The links that the scenario welds or sets free, "base" or "left::base".
         originals: A copy -> the file that it is a copy of, with the same lines.
         left_out: The meshes that are left out.
         repaired: The inertias that no body can have.
     """
 
     leave_out: Collection[str]
+    placed: Collection[str] = ()
     originals: dict[Path, Path] = field(default_factory=dict)
     left_out: list[Path] = field(default_factory=list)
     repaired: list[RepairedInertia] = field(default_factory=list)
@@ -73,17 +77,30 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
     packages = parser.package_map()
     has_geometry = parser.plant().geometry_source_is_registered()
     if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
-        parser.AddModels(str(_readable(file, packages, folder, copies, has_geometry)))
+        own, _ = _readable(file, packages, folder, copies, has_geometry, copies.placed)
+        parser.AddModels(str(own))
         return {"": file}
     directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
+    welds = (directive.add_weld for directive in directives.directives)
+    placed = [*copies.placed, *(weld.child for weld in welds if weld is not None)]
     models: dict[str, Path] = {}
+    standing: dict[Path, str] = {}
     for directive in directives.directives:
         if directive.add_model is not None:
-            model = Path(packages.ResolveUrl(directive.add_model.file))
-            models[directive.add_model.name] = model
-            own = _readable(model, packages, folder, copies, has_geometry)
+            name = directive.add_model.name
+            models[name] = model = Path(packages.ResolveUrl(directive.add_model.file))
+            links = [link.removeprefix(f"{name}::") for link in placed]
+            own, held = _readable(model, packages, folder, copies, has_geometry, links)
             if own != model:
                 directive.add_model.file = own.as_uri()
+            if held and model in standing:
+                raise ModelError(
+                    f"models '{standing[model]}' and '{name}' stand in one place: '{model.name}' "
+                    f"fixes its link '{held[0]}' to the world. Say where another one stands by "
+                    f"add_weld: {{parent: world, child: {name}::{held[0]}, X_PC: ...}}, in the "
+                    "place of the joint in the file"
+                )
+            standing.update({model: name} if held else {})
     if copies.originals:
         ProcessModelDirectives(directives, parser)
     else:
@@ -92,13 +109,19 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
 
 
 def _readable(
-    file: Path, packages: PackageMap, folder: Path, copies: Copies, has_geometry: bool
-) -> Path:
-    """The file, or a copy as Drake can read it."""
+    file: Path,
+    packages: PackageMap,
+    folder: Path,
+    copies: Copies,
+    has_geometry: bool,
+    placed: Collection[str],
+) -> tuple[Path, list[str]]:
+    """The file, or a copy as Drake can read it, and the links that it fixes to the world."""
     if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
-        return file
-    original = file.read_text("utf-8", errors="replace")
-    text = plain = _COMMENT.sub(blank, original)
+        return file, []
+    plain = _COMMENT.sub(blank, file.read_text("utf-8", errors="replace"))
+    text = released(plain, file, placed)
+    held = world_links(text, file)
     if file.suffix == ".urdf":
         text = as_meant(text, "empty_limits" in copies.leave_out)
     text, repaired = possible_inertias(text, file)
@@ -109,7 +132,7 @@ def _readable(
     elif has_geometry:
         text, left_out = _without_collisions(text, file, packages)
     if text == plain:
-        return file
+        return file, held
     if not _is_mjcf(file):
         text = _with_absolute_names(text, file)
     copies.left_out.extend(left_out)
@@ -117,7 +140,7 @@ def _readable(
     copy.parent.mkdir()
     copy.write_text(text, "utf-8")
     copies.originals[copy] = file
-    return copy
+    return copy, held
 
 
 def _is_mjcf(file: Path) -> bool:

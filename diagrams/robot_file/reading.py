@@ -82,7 +82,8 @@ def read_into(
         raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
     parser = Parser(plant)
     missing: dict[str, str] = {}
-    copies = Copies(robot.leave_out)
+    placed = [robot.base.weld] if robot.base is not None else []
+    copies = Copies(robot.leave_out, [*placed, *robot.free])
     with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
