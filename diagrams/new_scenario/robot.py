@@ -18,6 +18,7 @@ from pydrake.multibody.tree import (
     QuaternionFloatingJoint,
     RevoluteJoint,
     RigidBody,
+    RpyFloatingJoint,
     WeldJoint,
 )
 from pydrake.systems.framework import Context
@@ -303,7 +304,8 @@ def _held(tree: _Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
         remarks["packages"] = "where package://<name>/ leads"
     if robot.leave_out:
         remarks["leave_out"] = "what the file has and the equations have not"
-    free = [j for j in tree.joints if isinstance(j, QuaternionFloatingJoint)]
+    floating = QuaternionFloatingJoint | RpyFloatingJoint
+    free = [j for j in tree.joints if isinstance(j, floating)]
     names = {body.index(): name for name, body in tree.bodies.items()}
     roots = [names[joint.child_body().index()] for joint in free]
     if len(roots) > 1:
@@ -313,7 +315,7 @@ def _held(tree: _Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
             "write robot.base or robot.free"
         )
     for joint in tree.joints:
-        kinds = WeldJoint | RevoluteJoint | PrismaticJoint | QuaternionFloatingJoint
+        kinds = WeldJoint | RevoluteJoint | PrismaticJoint | floating
         if not isinstance(joint, kinds):
             raise ModelError(
                 f"joint '{joint.name()}' ({joint.type_name()}) neither turns about one axis nor "
@@ -360,7 +362,11 @@ def _chain(tree: _Tree, tip: str) -> tuple[list[Joint], str]:
 def _why_none(tree: _Tree) -> str:
     """Why no joint works, and what to do about it."""
     text = "no joint turns or slides for itself, so that there is nothing to drive"
-    kinds = {joint.type_name() for joint in tree.joints} - {"weld", "quaternion_floating"}
+    kinds = {joint.type_name() for joint in tree.joints} - {
+        "weld",
+        "quaternion_floating",
+        "rpy_floating",
+    }
     if not kinds:
         return f"{text}: the file has no joints that move; take one of a robot that has"
     coupled = ", ".join(sorted(tree.coupled))

@@ -1,6 +1,5 @@
 """What a scenario changes about the robot of its file: base, locked joints, actuators, payloads."""
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Literal
@@ -15,7 +14,6 @@ from pydrake.multibody.tree import (
     Joint,
     JointActuator,
     PrismaticJoint,
-    QuaternionFloatingJoint,
     RevoluteJoint,
     RpyFloatingJoint,
     WeldJoint,
@@ -27,7 +25,7 @@ from drake_dae.diagrams.robot_file.efforts import Efforts, limits_of
 from drake_dae.diagrams.robot_file.payloads import add_payloads
 from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario_parts import Base, Robot
-from drake_dae.errors import DrakeDaeError, ModelError, RobotFileWarning
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots.contact.plant_constraints import Coupling, couplings_of
 from drake_dae.robots.links.frames import joint_names, unique_names
 
@@ -44,14 +42,11 @@ def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
         ScenarioError: Something does not fit; the message names its key.
     """
     couplings: Sequence[Coupling] = ()
-    floating = [joint for joint in _joints(plant) if isinstance(joint, QuaternionFloatingJoint)]
-    if plant.num_constraints() > 0 and (robot.locked or floating or robot.actuators == "all"):
+    if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
         couplings = _read_couplings(robot)
     with _told_by_drake():
         if robot.base is not None:
             weld_base(robot.base, plant)
-        if floating:
-            _turn_by_angles(floating, plant, couplings)
         if robot.locked:
             lock_joints(robot.locked, plant, couplings)
         add_free_joints(robot.free, plant)
@@ -196,31 +191,6 @@ def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -
         if coupling.follower in joints:
             pair = joints[coupling.follower], joints[coupling.leader]
             plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
-
-
-def _turn_by_angles(
-    floating: Sequence[QuaternionFloatingJoint],
-    plant: MultibodyPlant,
-    couplings: Sequence[Coupling],
-) -> None:
-    """Puts joints in roll, pitch and yaw in the place of those with a quaternion.
-
-    The length 1 of a quaternion is an equation that no force keeps: as a constraint it would have
-    no multiplier.
-    """
-    with _without_constraints(plant, couplings):
-        for joint in floating:
-            name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
-            damping = joint.default_angular_damping(), joint.default_translational_damping()
-            plant.RemoveJoint(joint)
-            plant.AddJoint(RpyFloatingJoint(name, inboard, outboard, *damping))
-            warnings.warn(
-                f"joint '{name}' is floating: its positions are roll, pitch and yaw, {name}_qx, "
-                f"{name}_qy and {name}_qz, in the place of a quaternion; it must not pitch by 90 "
-                "degrees",
-                RobotFileWarning,
-                stacklevel=2,
-            )
 
 
 def _spread(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:

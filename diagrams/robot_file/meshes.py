@@ -18,9 +18,15 @@ from pydrake.multibody.parsing import (
     ProcessModelDirectives,
 )
 
+from drake_dae.diagrams.robot_file.converted import as_obj
 from drake_dae.diagrams.robot_file.inertias import RepairedInertia, possible_inertias
 from drake_dae.diagrams.robot_file.mjcf import without_assets
-from drake_dae.diagrams.robot_file.placing import released, world_links
+from drake_dae.diagrams.robot_file.placing import (
+    FloatingJoint,
+    floating_joints,
+    released,
+    world_links,
+)
 from drake_dae.diagrams.robot_file.urdf import as_meant, blank
 from drake_dae.errors import ModelError
 
@@ -31,6 +37,15 @@ _FILE = {
     ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
 }
 """Per kind of file: what stands before a mesh's name, the name, and what stands after it."""
+
+_MESH = {
+    ".urdf": re.compile(r"(<mesh\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
+    ".sdf": re.compile(r"(<mesh\b[^>]*>(?:(?!</mesh).)*?<uri>\s*)([^<]*?)(\s*</uri>)", re.DOTALL),
+}
+"""The same of meshes alone."""
+
+DRAWN = (".obj", ".gltf", ".dae")
+"""The kinds of mesh that Drake's Meshcat draws."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +58,7 @@ class Copies:
         originals: A copy -> the file that it is a copy of, with the same lines.
         left_out: The meshes that are left out.
         repaired: The inertias that no body can have.
+        floating: Model instance, or "", -> the floating joints of its file.
     """
 
     leave_out: Collection[str]
@@ -50,6 +66,7 @@ class Copies:
     originals: dict[Path, Path] = field(default_factory=dict)
     left_out: list[Path] = field(default_factory=list)
     repaired: list[RepairedInertia] = field(default_factory=list)
+    floating: dict[str, list[FloatingJoint]] = field(default_factory=dict)
 
     def named(self, text: str) -> str:
         """A message of Drake's parser, about the files that the user has."""
@@ -77,7 +94,7 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
     packages = parser.package_map()
     has_geometry = parser.plant().geometry_source_is_registered()
     if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
-        own, _ = _readable(file, packages, folder, copies, has_geometry, copies.placed)
+        own, _ = _readable(file, packages, folder, copies, has_geometry, "", copies.placed)
         parser.AddModels(str(own))
         return {"": file}
     directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
@@ -90,7 +107,7 @@ def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict
             name = directive.add_model.name
             models[name] = model = Path(packages.ResolveUrl(directive.add_model.file))
             links = [link.removeprefix(f"{name}::") for link in placed]
-            own, held = _readable(model, packages, folder, copies, has_geometry, links)
+            own, held = _readable(model, packages, folder, copies, has_geometry, name, links)
             if own != model:
                 directive.add_model.file = own.as_uri()
             if held and model in standing:
@@ -114,6 +131,7 @@ def _readable(
     folder: Path,
     copies: Copies,
     has_geometry: bool,
+    instance: str,
     placed: Collection[str],
 ) -> tuple[Path, list[str]]:
     """The file, or a copy as Drake can read it, and the links that it fixes to the world."""
@@ -122,6 +140,8 @@ def _readable(
     plain = _COMMENT.sub(blank, file.read_text("utf-8", errors="replace"))
     text = released(plain, file, placed)
     held = world_links(text, file)
+    text, floating = floating_joints(text, file)
+    copies.floating[instance] = [joint for joint in floating if joint.child not in placed]
     if file.suffix == ".urdf":
         text = as_meant(text, "empty_limits" in copies.leave_out)
     text, repaired = possible_inertias(text, file)
@@ -131,6 +151,7 @@ def _readable(
         text, left_out = without_assets(text, file)
     elif has_geometry:
         text, left_out = _without_collisions(text, file, packages)
+        text = _with_visuals(text, file, packages)
     if text == plain:
         return file, held
     if not _is_mjcf(file):
@@ -158,6 +179,19 @@ def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[st
         return blank(collision) if refused else collision[0]
 
     return _COLLISION.sub(kept, text), left_out
+
+
+def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
+    """A text whose meshes that cannot be drawn are copies that can, as far as there are any."""
+
+    def drawn(found: re.Match[str]) -> str:
+        mesh = _resolved(found[2], file, packages)
+        if mesh is None or mesh.suffix.lower() in DRAWN:
+            return found[0]
+        copy = as_obj(mesh)
+        return found[0] if copy is None else f"{found[1]}{copy}{found[3]}"
+
+    return _MESH[file.suffix].sub(drawn, text)
 
 
 def _with_absolute_names(text: str, file: Path) -> str:

@@ -1,10 +1,11 @@
-"""An MJCF file without what Drake cannot read: meshes that are no .obj, and bodies of mass 0."""
+"""An MJCF file as Drake can read it: meshes as .obj, and bodies of mass 0."""
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
+from drake_dae.diagrams.robot_file.converted import as_obj
 from drake_dae.errors import ModelError
 
 _MESH = re.compile(r"<mesh\b([^>]*?)(?:/>|>\s*</mesh\s*>)")
@@ -14,7 +15,7 @@ _READ = ".obj"
 
 
 def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
-    """A file without its meshes that are no .obj, and without the geometry that is made of them.
+    """A file with its meshes as .obj, without others and the geometry that is made of them.
 
     A body whose <inertial> has mass 0 has none, and its geometry weighs nothing: MuJoCo takes such
     bodies where they do not move, or move with others.
@@ -24,8 +25,8 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         file: Where it is.
 
     Returns:
-        The text, with the same lines and names of the other meshes that lead there from anywhere;
-        and the meshes that are left out.
+        The text, with the same lines and names of the meshes that lead there from anywhere; and the
+        meshes that are left out.
 
     Raises:
         ModelError: A body that can move has its mass from such a mesh.
@@ -38,12 +39,14 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
     folder = file.resolve().parent
     for compiler in root.iter("compiler"):
         folder = file.resolve().parent / compiler.get("meshdir", compiler.get("assetdir", ""))
-    refused = {
+    named = {
         mesh.get("name", Path(mesh.get("file", "")).stem): folder / mesh.get("file", "")
         for mesh in root.iter("mesh")
         if mesh.get("file") and Path(mesh.get("file", "")).suffix.lower() != _READ
     }
-    if not refused and text == whole:
+    copies = {mesh: as_obj(mesh) for mesh in named.values()}
+    refused = {name: mesh for name, mesh in named.items() if copies[mesh] is None}
+    if not named and text == whole:
         return text, []
     _check_masses(root, refused)
 
@@ -51,9 +54,10 @@ def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
         name = _attribute(found[1], "file")
         if name is None:
             return found[0]
-        if Path(name).suffix.lower() != _READ:
+        place = copies.get(folder / name, folder / name)
+        if place is None:
             return "\n" * found[0].count("\n")
-        return found[0].replace(name, str(folder / name))
+        return found[0].replace(name, str(place))
 
     def geometry(found: re.Match[str]) -> str:
         is_gone = _attribute(found[1], "mesh") in refused
@@ -121,7 +125,8 @@ def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
                 name = body.get("name", "")
                 raise ModelError(
                     f"body '{name}' has its mass from the mesh '{mesh.name}', which Drake cannot "
-                    f"read; give the body an <inertial>, or the mesh as {_READ}"
+                    f"read; give the body an <inertial>, or the mesh as {_READ}, or let trimesh "
+                    "read it, by pip install 'drake_dae[meshes]'"
                 )
 
 

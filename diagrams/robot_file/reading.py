@@ -18,8 +18,9 @@ from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.resources import check_resources, package_folder
 from drake_dae.diagrams.robot_file.descriptions import find_description
 from drake_dae.diagrams.robot_file.efforts import Efforts, limit_joints, read_efforts
-from drake_dae.diagrams.robot_file.meshes import Copies, add_models
+from drake_dae.diagrams.robot_file.meshes import DRAWN, Copies, add_models
 from drake_dae.diagrams.robot_file.packages import add_packages, explained, find_packages
+from drake_dae.diagrams.robot_file.placing import add_floating_joints
 from drake_dae.diagrams.scenario_parts import Robot
 from drake_dae.diagrams.shipped import FOLDER
 from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning, ScenarioError
@@ -31,9 +32,6 @@ _IDLE = {
     *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
 }
 """What MJCF has and Drake leaves out that no equation of ours has."""
-
-_DRAWN = (".obj", ".gltf", ".dae")
-"""The kinds of mesh that Drake's Meshcat draws."""
 
 
 def read_robot(
@@ -92,6 +90,8 @@ def read_into(
             file = Path(packages.ResolveUrl(name) if is_url else name)
             _check_one_robot(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
+            for instance, joints in copies.floating.items():
+                add_floating_joints(plant, instance, joints)
         except (ScenarioError, ModelError):
             raise
         except (RuntimeError, ValueError, SystemExit) as error:
@@ -193,11 +193,11 @@ def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
     ]
     meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
     sources = [Path(mesh.source().path()) for mesh in meshes if mesh.source().is_path()]
-    hidden = [source for source in sources if source.suffix.lower() not in _DRAWN]
+    hidden = [source for source in sources if source.suffix.lower() not in DRAWN]
     if hidden:
         warnings.warn(
             f"geometry that Meshcat cannot draw is left out of the picture: {_listed(hidden)}; it "
-            f"draws {', '.join(_DRAWN)}",
+            f"draws {', '.join(DRAWN)}, and with pip install 'drake_dae[meshes]' .stl as well",
             GeometryWarning,
             stacklevel=2,
         )
