@@ -1,11 +1,11 @@
-"""Robots as vendors wrote them, from `drake-dae new` to a finished run: python vendors.py
+"""Robots as vendors wrote them, from `drake-dae new` to a finished run: python real_robots.py
 
 It takes those of the packages example-robot-data, pybullet_data and robosuite that are installed.
 pybullet builds for minutes, and robosuite needs much; their files alone are enough:
 
     pip download --no-deps --no-binary pybullet pybullet && tar xzf pybullet-*.tar.gz
     pip download --no-deps robosuite && unzip robosuite-*.whl 'robosuite/models/assets/*'
-    PYTHONPATH=<folder of pybullet_data>:<folder of robosuite> python tests/campaign/vendors.py
+    PYTHONPATH=<folder of pybullet_data>:<folder of robosuite> python tests/campaign/real_robots.py
 """
 
 import argparse
