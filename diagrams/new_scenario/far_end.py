@@ -1,5 +1,6 @@
 """The far end of the last link of a chain, where a file has no frame."""
 
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +13,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.robot_file.changes import finalize
 from drake_dae.diagrams.robot_file.reading import read_robot
 from drake_dae.diagrams.scenario_parts import Robot
+from drake_dae.errors import GeometryWarning, RobotFileWarning
 from drake_dae.robots.contact.surface import Vector
 
 
@@ -31,7 +33,10 @@ def far_end(robot: Robot, body: RigidBody, last: Joint, size: float) -> Vector |
         The point; None if there is none off the axis of the joint.
     """
     scene_graph = SceneGraph()
-    plant, _ = read_robot(robot, scene_graph)
+    with warnings.catch_warnings():  # The run tells them.
+        warnings.simplefilter("ignore", GeometryWarning)
+        warnings.simplefilter("ignore", RobotFileWarning)
+        plant, _ = read_robot(robot, scene_graph)
     finalize(plant)
     name = body.scoped_name().get_full()
     link = GetScopedFrameByName(plant, name).body()
