@@ -43,6 +43,8 @@ class RepairedInertia:
 
     def __str__(self) -> str:
         was, now = (", ".join(f"{d:.3g}" for d in m) for m in (self.moments, self.possible))
+        if not any(self.possible):
+            return f"{self.owner}: without mass no body has the moments of inertia ({was}) kg m^2"
         return (
             f"{self.owner}: no body can have the moments of inertia ({was}) kg m^2: none is "
             f"negative or exceeds the sum of the others. The nearest possible are ({now}), the "

@@ -244,6 +244,19 @@ def test_a_negative_mass_is_refused_with_its_link(tmp_path):
         plant_of(written(tmp_path, text), leave_out=["inertia"])
 
 
+@pytest.mark.parametrize("name", ["robot.urdf", "robot.sdf"])
+def test_a_mass_of_0_has_no_inertia(name, tmp_path):
+    text = BODIES[name].format(1, 1, 1, 0, 0, 0).replace('value="2"', 'value="0"')
+    file = written(tmp_path, text.replace("<mass>2</mass>", "<mass>0</mass>"), name)
+    with pytest.raises(
+        ModelError, match=r"'arm': without mass no body has the moments .*\(1, 1, 1\)"
+    ):
+        plant_of(file, base=Base("arm"))
+    with pytest.warns(RobotFileWarning, match="without mass"):
+        plant = plant_of(file, base=Base("arm"), leave_out=["inertia"])
+    assert plant.GetBodyByName("arm").default_mass() == 0.0
+
+
 # What a URDF means.
 
 GREY = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
