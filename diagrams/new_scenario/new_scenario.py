@@ -1,5 +1,6 @@
 """A scenario for a robot of which nothing but its file is known."""
 
+import warnings
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -19,7 +20,7 @@ from drake_dae.diagrams.new_scenario.task import SurfaceKind, Task, circle
 from drake_dae.diagrams.new_scenario.text import scenario_text
 from drake_dae.diagrams.scenario import Scenario
 from drake_dae.diagrams.scenario_model import complete_scenario, robot_links
-from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.errors import DrakeDaeError, RobotFileWarning, ScenarioError
 from drake_dae.robots.contact import PointOnSurface
 from drake_dae.robots.contact.surface import Vector
 from drake_dae.robots.contact.surfaces import Plane
@@ -79,8 +80,10 @@ def new_scenario(
     for share, place in product(_SHARES, places):
         task = circle(place, surface, share)
         try:
-            whole = complete_scenario(_scenario(robot, task, links)).scenario
-            found = find_feasibility(whole)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RobotFileWarning)  # It is told of the links.
+                whole = complete_scenario(_scenario(robot, task, links)).scenario
+                found = find_feasibility(whole)
             problems = found.problems
             if usable is None and not set(problems) - set(_beside(found)):
                 usable = whole, task
