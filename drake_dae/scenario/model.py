@@ -1,18 +1,20 @@
 """The robot of a scenario, with what it touches and what it shall steer."""
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import QuaternionFloatingJoint
+from pydrake.multibody.tree import BodyIndex, QuaternionFloatingJoint
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
+from drake_dae.errors import GeometryWarning, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
 from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.constraints import Constraint
@@ -33,6 +35,9 @@ from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
 from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
 from drake_dae.scenario.scenario import Scenario
+
+_LARGE = 30.0
+"""So many times as long as the robot, a surface from a file seems to be in millimetres."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -152,6 +157,13 @@ def scenario_structure(model: RobotModel) -> Structure:
         AssumptionError: The robot violates an assumption of the theory.
         ScenarioError: The robot starts nowhere near its constraints.
     """
+    if model.dae.num_outputs == 0:
+        actuators = model.dae.num_controls
+        text = (
+            f"there are none, and nothing completes them without references or force outputs: name "
+            f"{actuators}, one for each actuator, or give references of some of them"
+        )
+        raise ScenarioError(("outputs", text))
     try:
         return find_structure(model.dae)
     except InconsistentStateError as error:
@@ -222,7 +234,9 @@ def robot_links(
 
 
 def _constraints(
-    forms: Sequence[Constraint | Written[Constraint]], loops: Sequence[Constraint], links: Links
+    forms: Sequence[Constraint | Written[Constraint]],
+    loops: Sequence[Constraint],
+    links: MultibodyExpressions,
 ) -> list[Constraint]:
     constraints = each("constraints", forms, lambda form: made(form, ()))
     each("constraints", constraints, lambda constraint: _try(constraint, links))
@@ -233,7 +247,28 @@ def _constraints(
             key = f"constraints.{index}.name"
             raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
         taken.append(name)
+        _compare_sizes(constraint, links)
     return [*constraints, *loops]
+
+
+def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
+    """Warns of a surface that ends far beyond the robot's reach: its file may be in millimetres."""
+    extent = getattr(getattr(constraint, "surface", None), "extent", None)
+    if extent is None:
+        return
+    plant = links.plant
+    context = plant.CreateDefaultContext()
+    bodies = (plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies()))
+    places = [plant.EvalBodyPoseInWorld(context, body).translation() for body in bodies]
+    robot = float(np.linalg.norm(np.ptp(places, axis=0)))
+    size = float(np.max(extent[1] - extent[0]))
+    if size > _LARGE * robot > 0.0:
+        warnings.warn(
+            f"the surface of '{constraint.name}' is {size:.3g} m long, and the robot "
+            f"{robot:.2g} m: if a unit of its file is a millimetre, write scale: 0.001",
+            GeometryWarning,
+            stacklevel=2,
+        )
 
 
 def _try(constraint: Constraint, links: Links) -> None:
