@@ -26,7 +26,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign unknowns friction peers house pictures clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -37,6 +37,7 @@ help:
 	@echo 'make processor   quick tests of numbers, rounded as on another processor; some minutes'
 	@echo 'make benchmark   speed, with ratios; beside peers where .[benchmark] is installed'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: half an hour'
+	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
 	@echo 'make unknowns    $(RUNS) runs in contact with what no law knows, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
@@ -72,6 +73,10 @@ campaign: $(VENV)/installed-dev
 	$(PYTEST) -m thorough
 	$(BIN)/python tests/support/woodpecker.py
 	$(BIN)/python tests/campaign/polish.py
+
+# Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
+robots: $(VENV)/installed-dev
+	$(BIN)/python tests/campaign/real_robots.py $(ARGS)
 
 # Friction, stiffness, place and tilt of the wall; masses, a push, sensors. A law that does not track
 # all the same ends its run, with the reason.

@@ -138,6 +138,10 @@ class GeometryWarning(UserWarning):
     """Geometry of a robot that is left out, since it cannot be read or drawn."""
 
 
+class RobotFileWarning(UserWarning):
+    """What of a robot's file the equations take otherwise than it is written."""
+
+
 def describe_os_error(error: OSError) -> str:
     """What a message says of a file that could not be read or written."""
     return f"{error.filename or 'output'}: {error.strerror or error}"

@@ -49,8 +49,8 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.surfaces.surface import Surface
-from drake_dae.scenario.model import add_robot
 from drake_dae.scenario.plants import RobotToSimulate
+from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded

@@ -131,12 +131,15 @@ SECOND = """<transmission name="t2"><type>transmission_interface/SimpleTransmiss
 <joint name="j"/><actuator name="m2"/></transmission>"""
 
 ROBOTS = {
-    "a mass below zero": ({"mass": '<mass value="-6"/>'}, "link 'arm': mass or inertia of no body"),
-    "no mass": ({"mass": '<mass value="0"/>'}, "link 'arm': mass or inertia of no body"),
+    "a mass below zero": (
+        {"mass": '<mass value="-6"/>'},
+        "link 'arm': a mass is positive, got -6 kg",
+    ),
+    "no mass": ({"mass": '<mass value="0"/>'}, "link 'arm': without mass no body has the mom"),
     "a mass left out": ({"mass": ""}, "link 'arm': mass or inertia of no body"),
     "an impossible inertia": (
         {"inertia": '<inertia ixx="1" iyy="1" izz="5" ixy="0" ixz="0" iyz="0"/>'},
-        "link 'arm': mass or inertia of no body.*none exceeds the sum of the others",
+        "link 'arm': no body can have the moments of inertia .*exceeds the sum of the others",
     ),
     "no inertia at all": ({"mass": "", "inertia": ""}, "no link that moves has mass or inertia"),
     "an axis of two numbers": ({"axis": '<axis xyz="0 -1"/>'}, "Expected 3 values .* got 0 -1"),
@@ -180,7 +183,7 @@ def test_robots_that_drake_would_change_are_refused_by_name(tmp_path, what):
 
 
 def test_a_quiet_log_hides_no_refusal(tmp_path, caplog):
-    changes, message = ROBOTS["a mass below zero"]
+    changes, message = ROBOTS["a mass left out"]
     with caplog.at_level(logging.CRITICAL, "drake"), pytest.raises(ScenarioError, match=message):
         robot_of(tmp_path / "robot.urdf", changes)
 

@@ -35,6 +35,13 @@ def check_outputs(
     own, count = len(links.actuator_signals), len(positions)
     rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if own else 0
     nu = own + len(motors)
+    if nu == 0 and count + forces:
+        raise ModelError(
+            f"{name}: there are no actuators, so nothing can be steered, but {count} positions and "
+            f"{forces} constraint forces are outputs. To simulate it leave `positions` empty, and "
+            "`forces` out; to steer it give joints actuators, by plant.AddJointActuator before "
+            "Finalize or a <transmission> in its file"
+        )
     if is_chosen:
         if not 0 < count + forces < nu:
             raise ModelError(

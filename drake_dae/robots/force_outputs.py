@@ -101,7 +101,9 @@ class Squeeze(ForceOutput):
     opposite at j, whose sum is zero, and so is the sum of its moments, (p_i - p_j) x e_ij c / 2. So
     the row lies in the null space of the object's grasp map: what it commands squeezes the object
     and does not move it. Three contacts at the corners of a triangle have three such outputs, one
-    for each side, which are all of their internal forces.
+    for each side, which are all of their internal forces. Of the six between four contacts in one
+    plane only five are independent: what is left of their internal forces is normal to that plane,
+    up at two opposite ones and down at the others.
 
     For contacts that only push it tells the pressure between two, not that each one presses: see
     the table of a run. It is no force of a single contact; name that, or take a `ForceCombination`.

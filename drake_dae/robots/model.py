@@ -66,7 +66,7 @@ class RobotModel:
         name: The robot's name in messages.
         actuation: The stages from the joints toward the motor; none is rigid joints.
         forces: The force outputs z_2, in their order: names of constraint forces, and combinations
-            of forces, as a `Squeeze`; all constraint forces if None.
+            of forces, as a `Squeeze`; all constraint forces if None, none without actuators.
         exogenous: The names of parameters that move, "wall.position" for example, as signals w
             with known derivatives; see `DaeSystem`.
         loads: Known forces on frames, which are zero where nobody sets their parameters.
@@ -117,6 +117,8 @@ class RobotModel:
         self.name = name
         self.loads = tuple(loads)
         bound = ConstraintSet(self.constraints)
+        if forces is None and not (links.actuator_signals or bound.motors):
+            forces = ()  # Nothing steers them: the robot is only simulated.
         self.forces = force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)
         self._num_forces = S.shape[0]

@@ -1,5 +1,6 @@
 """Scenario files read, with changes at dotted keys, and written."""
 
+import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import fields, replace
@@ -46,6 +47,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     except (OSError, ValueError) as error:  # A null byte in the path.
         raise ScenarioError((str(path), str(error))) from None
+    _check_no_robot(path, text)
     data = load_yaml(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):
@@ -84,6 +86,26 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         exogenous=located(scenario.exogenous),
         task=None if task is None else replace(task, phases=located([*task.phases])),
     )
+
+
+_ROBOT = re.compile(r"<(?:robot|sdf|mujoco)\b|^directives\s*:", re.MULTILINE)
+
+
+def _check_no_robot(path: Path, text: str) -> None:
+    """Refuses a robot's file in the place of a scenario.
+
+    Raises:
+        ScenarioError: It is one; what makes a scenario of it.
+    """
+    is_markup = text.lstrip().startswith("<")
+    found = _ROBOT.search(text) if is_markup or "directives" in text else None
+    if found is None or is_markup == found[0].startswith("directives"):
+        return
+    told = (
+        f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, and "
+        "in one of your own it is robot.file"
+    )
+    raise ScenarioError((str(path), told))
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

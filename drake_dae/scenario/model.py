@@ -1,18 +1,19 @@
 """The robot of a scenario, with what it touches and what it shall steer."""
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import QuaternionFloatingJoint
+from pydrake.multibody.tree import BodyIndex
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
+from drake_dae.errors import GeometryWarning, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.actuation import Stage
 from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.constraints import Constraint
@@ -28,12 +29,12 @@ from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
 from drake_dae.scenario.forms.keys import at, each
 from drake_dae.scenario.parts.written import Written, made
-from drake_dae.scenario.robot_file.changes import change_robot, finalize
-from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
-from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
-from drake_dae.scenario.robot_file.reading import read_into, read_robot
-from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.robot_file.links import robot_links
+from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
+
+_LARGE = 30.0
+"""So many times as long as the robot, a surface from a file seems to be in millimetres."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -153,77 +154,23 @@ def scenario_structure(model: RobotModel) -> Structure:
         AssumptionError: The robot violates an assumption of the theory.
         ScenarioError: The robot starts nowhere near its constraints.
     """
+    if model.dae.num_outputs == 0:
+        actuators = model.dae.num_controls
+        text = (
+            f"there are none, and nothing completes them without references or force outputs: name "
+            f"{actuators}, one for each actuator, or give references of some of them"
+        )
+        raise ScenarioError(("outputs", text))
     try:
         return find_structure(model.dae)
     except InconsistentStateError as error:
         raise ScenarioError(("constraints or start.positions", str(error))) from error
 
 
-@at("robot.file")
-def add_robot(
-    robot: Robot,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    payloads: Sequence[Payload] = (),
-) -> None:
-    """Adds the robot of a scenario to a plant that is not finalized.
-
-    Args:
-        robot: The robot.
-        plant: The plant, registered in the scene graph.
-        scene_graph: The scene graph.
-        payloads: What the scenario has under `plant_payloads`.
-
-    Raises:
-        ScenarioError: Drake cannot read the file, or drops something of it; or what the scenario
-            says beside it does not fit.
-    """
-    change_robot(robot, plant, read_into(plant, robot, scene_graph))
-    add_payloads("plant_payloads", payloads, plant)
-    cut_loops(plant)
-
-
-@at("robot.file")
-def robot_links(
-    robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
-) -> tuple[MultibodyExpressions, list[Constraint]]:
-    """The links of a scenario's robot, and the constraints that those joints are which close loops.
-
-    Args:
-        robot: What the scenario has under `robot`.
-        scene_graph: Where its geometry is registered.
-        payloads: What the scenario has under `plant_payloads`, for the links of the plant.
-
-    Raises:
-        ScenarioError: Something does not fit; the message names its key.
-    """
-    plant, efforts = read_robot(robot, scene_graph)
-    change_robot(robot, plant, efforts)
-    add_payloads("plant_payloads", payloads, plant)
-    cuts = cut_loops(plant)
-    finalize(plant)
-    for index in plant.GetJointIndices():
-        joint = plant.get_joint(index)
-        if isinstance(joint, QuaternionFloatingJoint):
-            name = joint.child_body().name()
-            raise ModelError(
-                f"body '{name}' is free; weld it to the world by "
-                f"robot.base, as base: {{weld: {name}}}, or name it in robot.free, which gives it "
-                "a joint in roll, pitch and yaw. A quaternion is not supported: no force keeps its "
-                "length"
-            )
-    links = MultibodyExpressions(plant)
-    try:
-        plant_constraints(links)
-    except ModelError as error:
-        raise ModelError(
-            f"{error}. With leave_out: [constraints] under robot the file stays as it is"
-        ) from None
-    return links, loop_constraints(cuts, plant)
-
-
 def _constraints(
-    forms: Sequence[Constraint | Written[Constraint]], loops: Sequence[Constraint], links: Links
+    forms: Sequence[Constraint | Written[Constraint]],
+    loops: Sequence[Constraint],
+    links: MultibodyExpressions,
 ) -> list[Constraint]:
     constraints = each("constraints", forms, lambda form: made(form, ()))
     each("constraints", constraints, lambda constraint: _try(constraint, links))
@@ -234,7 +181,28 @@ def _constraints(
             key = f"constraints.{index}.name"
             raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
         taken.append(name)
+        _compare_sizes(constraint, links)
     return [*constraints, *loops]
+
+
+def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
+    """Warns of a surface that ends far beyond the robot's reach: its file may be in millimetres."""
+    extent = getattr(getattr(constraint, "surface", None), "extent", None)
+    if extent is None:
+        return
+    plant = links.plant
+    context = plant.CreateDefaultContext()
+    bodies = (plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies()))
+    places = [plant.EvalBodyPoseInWorld(context, body).translation() for body in bodies]
+    robot = float(np.linalg.norm(np.ptp(places, axis=0)))
+    size = float(np.max(extent[1] - extent[0]))
+    if size > _LARGE * robot > 0.0:
+        warnings.warn(
+            f"the surface of '{constraint.name}' is {size:.3g} m long, and the robot "
+            f"{robot:.2g} m: if a unit of its file is a millimetre, write scale: 0.001",
+            GeometryWarning,
+            stacklevel=2,
+        )
 
 
 def _try(constraint: Constraint, links: Links) -> None:

@@ -1,5 +1,7 @@
 """Where the runs of a scenario start."""
 
+from contextlib import suppress
+
 import numpy as np
 from pydrake.systems.framework import Context
 
@@ -11,6 +13,12 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
 from drake_dae.scenario.scenario import Scenario
+
+_SLACK = 1e-6
+"""How far beyond a limit a joint may start, rad or m: references may begin at the limit."""
+
+_NEAREST = np.array([0.0, -1.0, 1.0])
+"""The turns that are tried beside that which is nearest to a guess."""
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
@@ -112,9 +120,10 @@ def _wanted(errors: dict[str, float], loop: ClosedLoop, time: float) -> FloatArr
 def _configuration(
     model: RobotModel, positions: FloatArray, guess: FloatArray, parameters: FloatArray
 ) -> FloatArray:
-    """q with given position outputs, on the constraints."""
+    """q with given position outputs, on the constraints, without whole turns and within limits."""
     try:
-        return model.configuration(positions, guess, parameters)
+        found = model.configuration(positions, guess, parameters)
+        q = _unwound(model, positions, found, guess, parameters)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
@@ -124,3 +133,48 @@ def _configuration(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
+    low, high = model.links.position_limits
+    outside = [
+        f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
+        for signal, value, least, most in zip(
+            model.links.position_signals, q, low, high, strict=True
+        )
+        if not least - _SLACK <= value <= most + _SLACK
+    ]
+    if outside:
+        raise ModelError(
+            f"the robot cannot start outside of its limits, and the start near start.positions has "
+            f"{'; '.join(outside)}. Change the first values of the references, or give "
+            "start.positions of all joints near where they shall be"
+        )
+    return q
+
+
+def _unwound(
+    model: RobotModel,
+    positions: FloatArray,
+    found: FloatArray,
+    guess: FloatArray,
+    parameters: FloatArray,
+) -> FloatArray:
+    """A configuration whose joints are whole turns nearer to a guess, or within their limits.
+
+    Newton's method may turn a joint often. A turn stays where an output, a constraint or a limit
+    asks for it.
+    """
+    q, turn = found, 2 * np.pi
+    for index, signal in enumerate(model.links.position_signals):
+        if signal.unit != "rad":
+            continue
+        low, high = (limits[index] for limits in model.links.position_limits)
+        turns = q[index] - turn * np.round((q[index] - guess[index]) / turn) + turn * _NEAREST
+        inside = [value for value in turns if low - _SLACK <= value <= high + _SLACK]
+        nearest = min(inside, key=lambda value: abs(value - guess[index]), default=q[index])
+        if abs(nearest - q[index]) < 1.0:
+            continue
+        trial = q.copy()
+        trial[index] = nearest
+        with suppress(InconsistentStateError):
+            settled = model.configuration(positions, trial, parameters)
+            q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
+    return q

@@ -30,8 +30,8 @@ from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
 
 import drake_dae as dd
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.model import add_robot
 from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario

@@ -1,13 +1,14 @@
 """Surfaces of a user's own in scenarios: formulas, height maps and meshes, held as predicted."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
 from meshes import obj_of_grid
 from runs import run_scenario, scenario
 
-from drake_dae import load_scenario
+from drake_dae import complete_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import save_scenario
@@ -147,3 +148,23 @@ def test_wrong_surfaces_are_told_at_their_key(surface, key, words):
         scenario("two_link_wall", f"constraints.0.surface={surface}")
     ((found, _),) = [p for p in caught.value.problems if words in p[1]]
     assert found == f"constraints.0.surface{key}"
+
+
+@pytest.mark.parametrize(("scale", "is_told"), [(1.0, True), (1e-3, False), (1e-2, False)])
+def test_a_mesh_that_seems_to_be_in_millimetres_is_told(scale, is_told, tmp_path):
+    """A sheet of 400 by 400 units, and an arm of 1.5 m."""
+    rows = [f"v {x} {y} 0" for x in (0, 400) for y in (0, 400)]
+    (tmp_path / "sheet.obj").write_text("\n".join([*rows, "f 1 3 4", "f 1 4 2\n"]))
+    (tmp_path / "task.yaml").write_text(
+        "robot: {file: package://drake_dae_models/seven_joint_arm.urdf, base: {weld: base}}\n"
+        "constraints: [{frame: tool, name: part, surface: !MeshSurface {file: sheet.obj, "
+        f"point: [0.4, -0.2, 0.2], scale: {scale}}}}}]\n"
+        "references: {part.force: 10, tool.x: 0.6, tool.y: 0.0}\n"
+    )
+    scenario = load_scenario(tmp_path / "task.yaml")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        complete_scenario(scenario)
+    found = [str(one.message) for one in told if "millimetre" in str(one.message)]
+    assert found == ["the surface of 'part' is 400 m long, and the robot 1.5 m: if a unit of its "
+                     "file is a millimetre, write scale: 0.001"] * is_told  # fmt: skip

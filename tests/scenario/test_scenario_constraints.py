@@ -124,7 +124,7 @@ outputs:
 gains: !Poles {all: [-4.0]}
 references:
   tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [2.0]}
-  tool.z: 0.5
+  tool.z: 0.55
   joint3, joint7: 0.0
   wall.force: 20.0
   flush: !Constant {values: [0.0, 0.3]}

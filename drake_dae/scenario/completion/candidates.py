@@ -137,9 +137,9 @@ def merged(forms: Iterable[Output]) -> list[Output]:
         key = _JOINED[type(form)]
         own = getattr(form, key)
         if found and type(found[-1]) is type(form):
-            both = getattr(found[-1], key) + own
-            if replace(found[-1], **{key: both}) == replace(form, **{key: both}):
-                found[-1] = replace(form, **{key: both})
+            first = getattr(found[-1], key)
+            if replace(form, **{key: first}) == found[-1]:
+                found[-1] = replace(form, **{key: first + own})
                 continue
         found.append(form)
     return found

@@ -16,6 +16,7 @@ from drake_dae.scenario.completion.choice import best_joints, first_independent
 from drake_dae.scenario.completion.postures import Posture, Postures
 from drake_dae.scenario.completion.referred import ReferredRows, value_at
 from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.scenario.completion.shortage import check_independent, why_none
 from drake_dae.scenario.parts.written import made
 from drake_dae.scenario.scenario import Scenario
 
@@ -54,9 +55,9 @@ def complete(
     positions of joints, of which that set is taken that keeps B(x) best conditioned, and joints off
     their limits, along the reference. What has no reference holds the value that it starts with.
 
-    Without start.positions the robot starts where its default configuration leads by Newton's
-    method, or else, of 60 tries, in the posture of best `quality` with the first values of the
-    references.
+    The robot starts where its default configuration, with start.positions, leads by Newton's method
+    within its limits; or else, of 60 tries for the positions that are not given, in the posture of
+    best `quality` with the first values of the references.
 
     Args:
         scenario: The scenario.
@@ -84,7 +85,8 @@ def complete(
         return Completed(scenario)
     if np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals):
         return Completed(scenario)  # The model refuses it.
-    if missing < 0 or (missing == 0 and scenario.start.positions):
+    is_placed = len(scenario.start.positions) == len(links.position_signals)
+    if missing < 0 or (missing == 0 and is_placed):
         return Completed(scenario)
     candidates = Candidates(scenario, links, given, bound)
     postures = Postures(
@@ -92,12 +94,20 @@ def complete(
     )
     # Rows that references name are known before the posture is: by the normal near the guess.
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
+    if near is not None:
+        check_independent(names, near)
     movable = _movable(postures) if missing else []
     along = [row for row in candidates.points(near) if row in movable] if near else []
-    referred = ReferredRows(scenario, candidates, size, missing, names, along)
+    try:
+        referred = ReferredRows(scenario, candidates, size, missing, names, along)
+    except ScenarioError:
+        if missing == 0 and scenario.start.positions:
+            return Completed(scenario)  # Whoever wires the references tells more.
+        raise
     if missing == 0:
         return _with_start(scenario, referred, postures, guess)
-    return _with_outputs(scenario, referred, postures, guess)
+    every = [signal.name for signal in bound.force_signals]
+    return _with_outputs(scenario, referred, postures, guess, every)
 
 
 def _with_start(
@@ -107,19 +117,29 @@ def _with_start(
     rows = referred.rows
     wanted = referred.at_start(rows)
     near = near_posture(postures, rows, wanted, guess)
+    is_given = bool(scenario.start.positions)
     # The structure is found at the guess itself.
-    if near is not None and all(
-        posture.independence(rows) > REGULAR for posture in (near, postures.at(guess))
+    if near is not None and (
+        is_given or all(p.independence(rows) > REGULAR for p in (near, postures.at(guess)))
     ):
         return Completed(scenario)
+    if is_given:
+        best = best_posture(postures, rows, wanted, list(_guesses(referred, postures, guess)))
+        if best is None:  # Whoever starts the robot tells it.
+            return Completed(scenario)
+        return Completed(_started(scenario, referred, best), (_start_note(referred, best),))
     found = _found(referred, postures, rows, wanted, guess)
     return Completed(_started(scenario, referred, found), (_start_note(referred, found),))
 
 
 def _with_outputs(
-    scenario: Scenario, referred: ReferredRows, postures: Postures, guess: FloatArray
+    scenario: Scenario,
+    referred: ReferredRows,
+    postures: Postures,
+    guess: FloatArray,
+    forces: Sequence[str],
 ) -> Completed:
-    """The scenario with all outputs and a start."""
+    """The scenario with all outputs and a start; `forces` names those of the constraints."""
     candidates, named = referred.candidates, referred.rows
     posture, is_normal = _posture(referred, postures, named, guess)
     # What completes the outputs, in the order of their worth.
@@ -136,12 +156,15 @@ def _with_outputs(
     free = [row for row in candidates.joints if row not in rows]
     joints = best_joints(postures, posture, rows, free, room - len(held), np.array(wanted))
     if joints is None:
+        why = why_none(posture, rows, free, referred.missing, referred.given, forces)
+        if why is not None:
+            raise ScenarioError(why)
         names = ", ".join(candidates.signals[row].name for row in rows) or "the constraints"
         raise ScenarioError(
             (
                 "outputs",
                 f"{referred.missing} are missing, and no positions of joints beside {names} leave "
-                "B(x) regular; name them",
+                "B(x) regular; name others under outputs",
             )
         )
     chosen, resting = [*named[referred.given :], *along, *held, *joints], [*along, *held, *joints]
@@ -182,10 +205,17 @@ def _posture(
             if near is not None and near.independence(rows) > REGULAR:
                 return near, len(chosen) > len(rows)
     if candidates.tilts:
-        found = best_posture(postures, both, goal, [guess, *postures.guesses(TRIES)])
+        found = best_posture(postures, both, goal, [guess, *_guesses(referred, postures, guess)])
         if found is not None:
             return found, True
     return _found(referred, postures, rows, wanted, guess), False
+
+
+def _guesses(referred: ReferredRows, postures: Postures, guess: FloatArray) -> FloatArray:
+    """Configurations to try: random where start.positions give nothing, shape (TRIES, nq)."""
+    names = [referred.candidates.signals[row].name for row in referred.candidates.joints]
+    given = [name in referred.scenario.start.positions for name in names]
+    return np.where(given, guess, postures.guesses(TRIES))
 
 
 def _found(
@@ -200,7 +230,7 @@ def _found(
     Raises:
         ScenarioError: There is none; by how much each row misses its value at the nearest.
     """
-    guesses = [guess, *postures.guesses(TRIES)]
+    guesses = [guess, *_guesses(referred, postures, guess)]
     found = best_posture(postures, rows, wanted, guesses)
     if found is not None:
         return found

@@ -192,7 +192,10 @@ class Postures:
             gradients = np.vstack([found["constraint_slopes"], found["slopes"][chosen]])
             return shortest_steps(gradients, residual)
 
-        return self._turned_back(newton(guess, linearize, _STEPS)[0])
+        q = newton(guess, linearize, _STEPS)[0]
+        turned = self._turned_back(q)
+        # Where a row is the position of a joint, its turns count.
+        return turned if np.max(np.abs(residual(turned)), initial=0.0) < EXACT else q
 
     def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
         """What is left of the constraints and of wanted values of rows, shape (k + len(rows),)."""
@@ -206,7 +209,8 @@ class Postures:
             moved = turned + shift * self._turns
             is_better = (self._room(turned) < 0.0) & (self._room(moved) >= 0.0)
             turned = np.where(is_better, moved, turned)
-        return np.where(self._room(q) >= 0.0, q, turned)
+        is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
+        return np.where(is_fine, q, turned)
 
     def _room(self, q: FloatArray) -> FloatArray:
         """How far each position is from its nearer limit, shape (nq,)."""

@@ -1,5 +1,7 @@
 """A scenario for a robot of which nothing but its file is known."""
 
+import warnings
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from textwrap import shorten
@@ -9,7 +11,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
-from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.errors import DrakeDaeError, RobotFileWarning, ScenarioError
 from drake_dae.robots.constraints import PointOnSurface
 from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.links import Links
@@ -17,16 +19,20 @@ from drake_dae.robots.outputs import PointCoordinates
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.robots.surfaces.surfaces import Plane
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.model import complete_scenario, robot_links
+from drake_dae.scenario.feasibility.report import Feasibility
+from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.new.places import find_places
 from drake_dae.scenario.new.robot import NewRobot, new_robot
 from drake_dae.scenario.new.task import SurfaceKind, Task, circle
 from drake_dae.scenario.new.text import scenario_text
 from drake_dae.scenario.parts import parts as parts
+from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 
 _SHARES = (1.0, 0.5, 0.2)
 """Of the usual circle and force, what is tried at each place."""
+
+_BESIDE = "B(x) is singular beside the reference, not along it: `drake-dae analyze` says where"
 
 _PLACES = 4
 """So many places are tried."""
@@ -45,8 +51,10 @@ def new_scenario(
     The base is what nothing in the file holds; the chain of joints is the longest that neither
     mimics nor grasps nor rolls, or that to `tip`; all other joints are locked. The surface stands
     where the tip reaches it with its axis along the normal and the task's directions are most
-    independent. Outputs and start are those of `complete_scenario`. Circle and force leave room to
-    the joints' limits, and `find_feasibility` finds no problem.
+    independent. A tip that its own joint does not move is the far end of its link. Outputs and
+    start are those of `complete_scenario`. Circle and force leave room to the joints' limits, and
+    `find_feasibility` finds no problem, or none but states beside the reference where B(x) is
+    singular; the text then says so.
 
     Args:
         file: The robot's file, as a scenario has it.
@@ -68,12 +76,18 @@ def new_scenario(
     links, _ = robot_links(robot.robot, SceneGraph())
     _check_mass(links, robot)
     tried: list[str] = []
-    places = find_places(links, robot.tip, point)[:_PLACES]
+    usable: tuple[Scenario, Task] | None = None
+    places = find_places(links, robot.tip, robot.point)[:_PLACES]
     for share, place in product(_SHARES, places):
         task = circle(place, surface, share)
         try:
-            whole = complete_scenario(_scenario(robot, task, links)).scenario
-            problems = find_feasibility(whole).problems
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RobotFileWarning)  # It is told of the links.
+                whole = complete_scenario(_scenario(robot, task, links)).scenario
+                found = find_feasibility(whole)
+            problems = found.problems
+            if usable is None and not set(problems) - set(_beside(found)):
+                usable = whole, task
         except DrakeDaeError as error:
             problems = (str(error),)
         if not problems:
@@ -81,6 +95,10 @@ def new_scenario(
         x, y, z = task.center
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
         tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
+    if usable is not None:
+        whole, task = usable
+        robot = replace(robot, remarks={**robot.remarks, "outputs": _BESIDE})
+        return whole, scenario_text(whole, robot, task, Path(folder).resolve())
     raise ScenarioError(
         (
             "robot",
@@ -89,6 +107,15 @@ def new_scenario(
             + ". Give another tip, or copy a shipped scenario",
         )
     )
+
+
+def _beside(found: Feasibility) -> tuple[str, ...]:
+    """The problems with states near the start to which the reference does not lead."""
+    analysis = found.analysis
+    if analysis.structure is None or analysis.motion is None or analysis.motion.ending:
+        return ()
+    rank = (assumption for assumption in analysis.assumptions if assumption.number == 5)
+    return tuple(assumption.reason for assumption in rank)
 
 
 def _check_mass(links: Links, robot: NewRobot) -> None:

@@ -1,35 +1,35 @@
 """The robot of a new scenario: its base, the chain that works, its tip, and what is locked."""
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from pydrake.multibody.parsing import GetScopedFrameByName, PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
-    BodyIndex,
     Joint,
     PrismaticJoint,
     QuaternionFloatingJoint,
     RevoluteJoint,
-    RigidBody,
+    RpyFloatingJoint,
     WeldJoint,
 )
 
 from drake_dae.arrays import unknown_name
-from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.plant_constraints import couplings_of
-from drake_dae.robots.links.frames import joint_names, unique_names
+from drake_dae.errors import ModelError, RobotFileWarning
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.new.far_end import far_end
+from drake_dae.scenario.new.tree import Tree
 from drake_dae.scenario.robot_file.changes import finalize
+from drake_dae.scenario.robot_file.loops import closing_joints
 from drake_dae.scenario.robot_file.packages import find_packages
 from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import Base, Robot
+from drake_dae.scenario.robot_file.robot import Base, LeftOut, Robot
 
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
 """What grasps or rolls: joints with such names are locked, if others are left."""
@@ -37,12 +37,7 @@ _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", 
 # A hand may be the link that the last joint of an arm turns, a finger not.
 _FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
 
-_LEFT_OUT: tuple[tuple[Literal["joint_friction", "inertia"], ...], ...] = (
-    (),
-    ("joint_friction",),
-    ("inertia",),
-    ("joint_friction", "inertia"),
-)
+_LEFT_OUT: tuple[LeftOut, ...] = ("joint_friction", "inertia", "empty_limits")
 """What must be left out of a file is found by trying."""
 
 _TOOLS = [
@@ -86,8 +81,8 @@ def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewR
         ScenarioError: The file cannot be read, has no such tip, or nothing that can move it.
     """
     with at("robot.file"):
-        plant, robot = _read(file)
-        tree = _Tree(plant)
+        tree, robot = _read(file)
+        plant = tree.plant
         robot, remarks = _held(tree, robot)
         chain, end = _chain(tree, tip)
         remarks["tip"] = (
@@ -95,6 +90,11 @@ def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewR
             if tip
             else f"the end of the longest chain, of {_count(len(chain), 'joint')}"
         )
+        if not (tip or any(point)) and tree.directions(chain, end, point) < min(len(chain), 3):
+            point = far_end(robot, tree.bodies[end], chain[-1], tree.size) or point
+            remarks["point"] = "in that frame, m: its far end, where no frame of the file is"
+        remarks.setdefault("point", "in that frame, m")
+        _check_reach(tree, chain, end, point)
         locked = _locked(tree, chain)
         if locked:
             remarks["locked"] = "m or rad; all that is not of the chain, or mimics"
@@ -119,78 +119,96 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _read(file: str) -> tuple[MultibodyPlant, Robot]:
-    """The finalized plant, and the robot with what must be left out of its file."""
-    problem: ModelError | None = None
-    packages = _folders_above(file)
-    for leave_out in _LEFT_OUT:
-        robot = Robot(file, packages, actuators="all", leave_out=list(leave_out))
+def _read(file: str) -> tuple[Tree, Robot]:
+    """The robot with what must be left out of its file, and its bodies and joints."""
+    everything = Robot(file, _folders_above(file), actuators="all", leave_out=list(_LEFT_OUT))
+
+    def left_out(*kinds: LeftOut) -> Robot:
+        return replace(everything, leave_out=list(kinds))
+
+    with warnings.catch_warnings():  # The scenario's own robot tells it.
+        warnings.simplefilter("ignore", RobotFileWarning)
         try:
-            plant, _ = read_robot(robot)
+            tree = Tree(_finished(left_out()))
+            if tree.works or not tree.empty:
+                return tree, left_out()
+            return Tree(_finished(left_out("empty_limits"))), left_out("empty_limits")
         except ModelError as error:
-            problem = problem or error
-            continue
-        finalize(plant)
-        return plant, robot
-    assert problem is not None
-    raise problem
+            problem = error
+        try:
+            _finished(everything)
+        except ModelError:
+            raise problem from None
+        needed: list[LeftOut] = []
+        for kind in _LEFT_OUT:
+            try:
+                _finished(left_out(*(other for other in _LEFT_OUT if other != kind)))
+            except ModelError:
+                needed.append(kind)
+        return Tree(_finished(left_out(*needed))), left_out(*needed)
+
+
+def _finished(robot: Robot) -> MultibodyPlant:
+    """The finalized plant of a robot.
+
+    Raises:
+        ModelError: It cannot be read, or has loops.
+    """
+    plant, _ = read_robot(robot)
+    closing = closing_joints(plant)
+    if closing:
+        names = ", ".join(joint.name() for joint in closing)
+        raise ModelError(
+            f"joints close loops ({names}), and a new scenario has none; write one by hand, as the "
+            "shipped five_bar: joints that close loops become constraints there by themselves"
+        )
+    finalize(plant)
+    return plant
 
 
 def _folders_above(file: str) -> dict[str, str]:
-    """Packages that are found nowhere else -> folders of that name above the file."""
+    """Packages that are found nowhere else -> folders of that name above the file or beside it."""
     with suppress(RuntimeError, ValueError, OSError):  # Whoever reads the file tells it.
         _, missing = find_packages(file, PackageMap())
+        above = list(Path(file).resolve().parents)
         return {
             name: str(folder)
             for name in missing
-            for folder in [one for one in Path(file).resolve().parents if one.name == name][:1]
+            for folder in [
+                *(one for one in above if one.name == name),
+                *(one / name for one in above[:2] if (one / name).is_dir()),
+            ][:1]
         }
     return {}
 
 
-class _Tree:
-    """The bodies and joints of a plant, from the world outward."""
+def _check_reach(tree: Tree, chain: Sequence[Joint], tip: str, point: Vector) -> None:
+    """Refuses a tip that cannot both press and move along.
 
-    def __init__(self, plant: MultibodyPlant) -> None:
-        self.plant = plant
-        self.joints: list[Joint] = [plant.get_joint(i) for i in plant.GetJointIndices()]
-        self.above = {joint.child_body().index(): joint for joint in self.joints}
-        self.names = {joint.index(): name for name, joint in joint_names(plant).items()}
-        self.couplings = couplings_of(plant) if plant.num_constraints() else []
-        bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-        self.bodies: dict[str, RigidBody] = dict(
-            zip(unique_names(plant, bodies), bodies, strict=True)
-        )
-
-    def path(self, body: RigidBody) -> list[Joint]:
-        """The joints from the world to a body."""
-        found: list[Joint] = []
-        while body.index() in self.above:
-            found.append(self.above[body.index()])
-            body = found[-1].parent_body()
-        return found[::-1]
-
-    @property
-    def coupled(self) -> set[str]:
-        """Names of joints that follow or lead others."""
-        return {name for one in self.couplings for name in (one.follower, one.leader)}
-
-    def can_work(self, joint: Joint) -> bool:
-        """Whether a joint turns or slides for itself."""
-        if not isinstance(joint, RevoluteJoint | PrismaticJoint):
-            return False
-        low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-        return self.names[joint.index()] not in self.coupled and bool(high > low)
+    Raises:
+        ModelError: It moves in one direction, or not at all.
+    """
+    directions = tree.directions(chain, tip, point)
+    if directions > 1:
+        return
+    names = ", ".join(tree.names[joint.index()] for joint in chain)
+    way = "in one direction alone" if directions else "nowhere"
+    raise ModelError(
+        f"the tip '{tip}' moves {way} by {_count(len(chain), 'joint')} ({names}), and a contact "
+        "takes one direction to press and another to move along; give another tip, as "
+        "--tip LINK:x,y,z, at the end of two joints or more"
+    )
 
 
-def _held(tree: _Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
+def _held(tree: Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
     """The robot with a base that the world holds, and remarks."""
     remarks: dict[str, str] = {}
     if robot.packages:
         remarks["packages"] = "where package://<name>/ leads"
     if robot.leave_out:
         remarks["leave_out"] = "what the file has and the equations have not"
-    free = [j for j in tree.joints if isinstance(j, QuaternionFloatingJoint)]
+    floating = QuaternionFloatingJoint | RpyFloatingJoint
+    free = [j for j in tree.joints if isinstance(j, floating)]
     names = {body.index(): name for name, body in tree.bodies.items()}
     roots = [names[joint.child_body().index()] for joint in free]
     if len(roots) > 1:
@@ -200,7 +218,7 @@ def _held(tree: _Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
             "write robot.base or robot.free"
         )
     for joint in tree.joints:
-        kinds = WeldJoint | RevoluteJoint | PrismaticJoint | QuaternionFloatingJoint
+        kinds = WeldJoint | RevoluteJoint | PrismaticJoint | floating
         if not isinstance(joint, kinds):
             raise ModelError(
                 f"joint '{joint.name()}' ({joint.type_name()}) neither turns about one axis nor "
@@ -212,7 +230,7 @@ def _held(tree: _Tree, robot: Robot) -> tuple[Robot, dict[str, str]]:
     return robot, remarks
 
 
-def _chain(tree: _Tree, tip: str) -> tuple[list[Joint], str]:
+def _chain(tree: Tree, tip: str) -> tuple[list[Joint], str]:
     """The joints that work, and the name of the frame at their end."""
     if tip:
         try:
@@ -232,7 +250,7 @@ def _chain(tree: _Tree, tip: str) -> tuple[list[Joint], str]:
         ]
         return max(paths, key=len, default=[])
 
-    works = [joint for joint in tree.joints if tree.can_work(joint)]
+    works = tree.works
     arms = [
         joint
         for joint in works
@@ -240,11 +258,27 @@ def _chain(tree: _Tree, tip: str) -> tuple[list[Joint], str]:
     ]
     chain = longest(arms) or longest(works)
     if not chain:
-        raise ModelError("no joint turns or slides for itself, so that there is nothing to drive")
+        raise ModelError(_why_none(tree))
     return chain, _tip(tree, chain)
 
 
-def _tip(tree: _Tree, chain: Sequence[Joint]) -> str:
+def _why_none(tree: Tree) -> str:
+    """Why no joint works, and what to do about it."""
+    text = "no joint turns or slides for itself, so that there is nothing to drive"
+    kinds = {joint.type_name() for joint in tree.joints} - {
+        "weld",
+        "quaternion_floating",
+        "rpy_floating",
+    }
+    if not kinds:
+        return f"{text}: the file has no joints that move; take one of a robot that has"
+    coupled = ", ".join(sorted(tree.coupled))
+    if coupled:
+        text += f"; mimic joints and those that they follow are not driven: {coupled}"
+    return f"{text}; write a scenario by hand, in which robot.actuators names what is driven"
+
+
+def _tip(tree: Tree, chain: Sequence[Joint]) -> str:
     """The frame that a vendor means by the end of a chain, or else what is farthest out."""
     last, moving = chain[-1], {joint.index() for joint in chain}
     context = tree.plant.CreateDefaultContext()
@@ -261,7 +295,7 @@ def _tip(tree: _Tree, chain: Sequence[Joint]) -> str:
     return max(distances, key=lambda name: distances[name])
 
 
-def _locked(tree: _Tree, chain: Sequence[Joint]) -> dict[str, float]:
+def _locked(tree: Tree, chain: Sequence[Joint]) -> dict[str, float]:
     """Where each joint that is not of the chain stays; those that follow others follow."""
     moving = {joint.index() for joint in chain}
     followers = {one.follower for one in tree.couplings}

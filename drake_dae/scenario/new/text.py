@@ -64,14 +64,15 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: Task) -> Iterator[str
     yield f"- name: {_flow(task.name)}"
     yield from _said(f"  frame: {_flow(robot.tip)}", robot.remarks["tip"])
     if any(robot.point):
-        yield from _said(f"  point: {_flow(list(robot.point))}", "in that frame, m")
+        yield from _said(f"  point: {_flow(list(robot.point))}", robot.remarks["point"])
     (constraint,) = data["constraints"]
     free = (
         f"where {task.place.directions} directions of motion are free of each other by "
         f"{task.place.quality:.2g}: 1 is best, 0 singular"
     )
     yield from _said(f"  surface: {_flow(_short(constraint['surface']))}", free)
-    yield "outputs:"
+    singular = robot.remarks.get("outputs")
+    yield from _said("outputs:", singular) if singular else ["outputs:"]
     for output in data["outputs"]:
         yield from _said(f"- {_flow(_short(output))}", _WHY[output[TAG]])
     if data["tool_axis"] != "normal":

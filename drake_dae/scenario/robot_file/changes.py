@@ -149,11 +149,6 @@ def lock_joints(
             contradicts a coupling, or the file has other constraints.
     """
     joints = _movable(plant)
-    if plant.num_constraints() > len(couplings):
-        raise ModelError(
-            "the file has constraints other than mimic joints, which Drake loses when a joint is "
-            "locked; take them out of it, and write them under constraints"
-        )
     positions = dict(locked)
     _spread(positions, couplings)
     for name, value in positions.items():
@@ -169,11 +164,29 @@ def lock_joints(
                 f"{name} = {value:g} {unit}{given} is outside its limits, {low:g} to {high:g} "
                 f"{unit}"
             )
-    # Drake removes joints only where there are no constraints.
+    with _without_constraints(plant, couplings):
+        for name, value in positions.items():
+            _weld_joint(joints[name], value, plant)
+
+
+@contextmanager
+def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -> Iterator[None]:
+    """Takes the constraints out of a plant, and puts them back between joints that are left.
+
+    Drake removes joints only where there are no constraints.
+
+    Raises:
+        ModelError: The plant has others than these couplings.
+    """
+    if plant.num_constraints() > len(couplings):
+        raise ModelError(
+            "the file has constraints other than mimic joints, which Drake loses when a joint is "
+            "locked; take them out of it, and write them under constraints"
+        )
     for key in plant.GetConstraintIds():
         plant.RemoveConstraint(key)
-    for name, value in positions.items():
-        _weld_joint(joints.pop(name), value, plant)
+    yield
+    joints = _movable(plant)
     for coupling in couplings:
         if coupling.follower in joints:
             pair = joints[coupling.follower], joints[coupling.leader]

@@ -1,4 +1,4 @@
-"""Effort limits that a URDF has for joints without a transmission, which Drake does not keep."""
+"""Effort limits of a robot's files that Drake does not keep, or keeps in another unit."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -36,6 +36,25 @@ def read_efforts(models: Mapping[str, Path]) -> Efforts:
             if 0.0 < effort < np.inf:  # Many write 0 for what they do not know.
                 found[instance, joint.get("name", "")] = effort
     return found
+
+
+def limit_joints(plant: MultibodyPlant, models: Mapping[str, Path]) -> None:
+    """Makes limits of the motors in MJCF files those of their joints.
+
+    A motor of MJCF puts gear times its control on the joint. Drake has the limit of the control,
+    and its control is what the joint feels.
+
+    Args:
+        plant: The robot, not finalized; changed.
+        models: Model instance, or "", -> file that Drake has read.
+    """
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        instance = plant.GetModelInstanceName(actuator.model_instance())
+        file = models.get(instance, models.get("", Path()))
+        limit, gear = actuator.effort_limit(), actuator.default_gear_ratio()
+        if file.suffix == ".xml" and np.isfinite(limit) and gear != 0.0:
+            actuator.set_effort_limit(abs(gear) * limit)
 
 
 def limits_of(plant: MultibodyPlant, efforts: Efforts) -> dict[str, float]:

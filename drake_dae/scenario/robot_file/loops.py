@@ -49,6 +49,15 @@ def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
     """
     driven = {a.joint().index(): a for a in _actuators(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    return [
+        _cut(joint, names.get(joint.index(), joint.name()), driven.get(joint.index()), plant)
+        for joint in closing_joints(plant)
+    ]
+
+
+def closing_joints(plant: MultibodyPlant) -> list[Joint]:
+    """The joints of a plant that is not finalized without which the others form a tree."""
+    driven = {a.joint().index() for a in _actuators(plant)}
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     joints.sort(key=lambda joint: _reluctance(joint, joint.index() in driven), reverse=True)
     groups = {index: index for index in range(plant.num_bodies())}
@@ -65,8 +74,7 @@ def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
         )
         groups[first] = second
         if first == second:
-            actuator = driven.get(joint.index())
-            found.append(_cut(joint, names.get(joint.index(), joint.name()), actuator, plant))
+            found.append(joint)
     return found
 
 

@@ -9,16 +9,18 @@ from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 from pydrake.geometry import Mesh, Role, SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
+from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning, ScenarioError
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.descriptions import find_description
-from drake_dae.scenario.robot_file.efforts import Efforts, read_efforts
-from drake_dae.scenario.robot_file.meshes import Copies, add_models
+from drake_dae.scenario.robot_file.efforts import Efforts, limit_joints, read_efforts
 from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
+from drake_dae.scenario.robot_file.readable.meshes import DRAWN, Copies, add_models
+from drake_dae.scenario.robot_file.readable.placing import add_floating_joints
 from drake_dae.scenario.robot_file.resources import check_resources, package_folder
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import FOLDER
@@ -30,9 +32,6 @@ _IDLE = {
     *("cone", "impratio", "contype", "conaffinity", "condim", "group", "priority"),
 }
 """What MJCF has and Drake leaves out that no equation of ours has."""
-
-_DRAWN = (".obj", ".gltf", ".dae")
-"""The kinds of mesh that Drake's Meshcat draws."""
 
 
 def read_robot(
@@ -81,7 +80,8 @@ def read_into(
         raise ModelError(f"no file '{name}'; a relative path starts in the scenario's folder")
     parser = Parser(plant)
     missing: dict[str, str] = {}
-    copies = Copies({}, [])
+    placed = [robot.base.weld] if robot.base is not None else []
+    copies = Copies(robot.leave_out, [*placed, *robot.free])
     with TemporaryDirectory() as scratch, _drake_log(copies) as dropped:
         try:
             packages = parser.package_map()
@@ -90,13 +90,18 @@ def read_into(
             file = Path(packages.ResolveUrl(name) if is_url else name)
             _check_one_robot(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
-        except ScenarioError:
+            for instance, joints in copies.floating.items():
+                add_floating_joints(plant, instance, joints)
+        except (ScenarioError, ModelError):
             raise
         except (RuntimeError, ValueError, SystemExit) as error:
             # Drake has all of them: SystemExit for what an assertion of its own finds.
             text = copies.named(str(error))
             unknown = {name: origin for name, origin in missing.items() if name in text}
-            raise ModelError(explained(unknown) if unknown else text) from None
+            raise ModelError(explained(unknown) if unknown else _with_remedy(text)) from None
+    limit_joints(plant, models)
+    _tell_repairs(copies, robot)
+    _take_empty_limits(plant, "empty_limits" in robot.leave_out)
     if "constraints" in robot.leave_out:
         for key in plant.GetConstraintIds():
             plant.RemoveConstraint(key)
@@ -111,6 +116,25 @@ def read_into(
     return read_efforts(models)
 
 
+_REMEDIES = {
+    r"unrecognized type": "the joints of a URDF are revolute, continuous, prismatic, planar, "
+    "floating and fixed; write a ball as three revolute joints, or the robot in SDFormat",
+    r"Joint type \((gearbox|ball|revolute2)\)": "take this joint out of the file; two joints that "
+    "turn together are a !JointCoupler under constraints",
+    r"\$[({]": "this is a template: xacro writes the URDF of it, as xacro FILE -o robot.urdf",
+    r"coordinate=global": "MuJoCo up to 2.3.2 reads it, and saves it with local coordinates",
+    r"pos_lower_limits": "the lower limit of a joint is above its upper limit; mend them in the "
+    "file",
+}
+"""What Drake's message has -> what to do about it."""
+
+
+def _with_remedy(text: str) -> str:
+    """A message of Drake's, and what to do."""
+    remedies = (remedy for known, remedy in _REMEDIES.items() if re.search(known, text))
+    return "; ".join([text.rstrip("."), *remedies]) if text else text
+
+
 def _is_answered(warning: str, robot: Robot) -> bool:
     """Whether the scenario says what to do about a warning of Drake's parser."""
     if "effort limit" in warning:
@@ -120,6 +144,39 @@ def _is_answered(warning: str, robot: Robot) -> bool:
     if "equality" in warning or "mimic" in warning:
         return "constraints" in robot.leave_out
     return "friction" in warning and "joint_friction" in robot.leave_out
+
+
+def _tell_repairs(copies: Copies, robot: Robot) -> None:
+    """Names the inertias that no body can have, and what is taken for them."""
+    if not copies.repaired:
+        return
+    if "inertia" not in robot.leave_out:
+        raise ModelError(
+            "; ".join(map(str, copies.repaired)) + ". Mend them in the file, or write leave_out: "
+            "[inertia] under robot, which takes the nearest possible"
+        )
+    for repaired in copies.repaired:
+        warnings.warn(str(repaired), RobotFileWarning, stacklevel=2)
+
+
+def _take_empty_limits(plant: MultibodyPlant, of_positions: bool) -> None:
+    """Takes limits from joints that leave them at one place, and limits of 0 of their speed.
+
+    Many write 0 for what they do not know, as they do for effort limits.
+
+    Args:
+        plant: The robot, not finalized; changed.
+        of_positions: Whether limits of positions are taken.
+    """
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        unlimited = np.full(1, np.inf)
+        if joint.num_positions() != 1:
+            continue
+        if of_positions and joint.position_lower_limits() == joint.position_upper_limits():
+            joint.set_position_limits(-unlimited, unlimited)
+        if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
+            joint.set_velocity_limits(-unlimited, unlimited)
 
 
 def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
@@ -136,11 +193,11 @@ def _tell_what_is_left_out(unread: list[Path], scene_graph: SceneGraph) -> None:
     ]
     meshes = [shape for shape in shapes if isinstance(shape, Mesh)]
     sources = [Path(mesh.source().path()) for mesh in meshes if mesh.source().is_path()]
-    hidden = [source for source in sources if source.suffix.lower() not in _DRAWN]
+    hidden = [source for source in sources if source.suffix.lower() not in DRAWN]
     if hidden:
         warnings.warn(
             f"geometry that Meshcat cannot draw is left out of the picture: {_listed(hidden)}; it "
-            f"draws {', '.join(_DRAWN)}",
+            f"draws {', '.join(DRAWN)}, and with pip install 'drake_dae[meshes]' .stl as well",
             GeometryWarning,
             stacklevel=2,
         )
@@ -189,13 +246,13 @@ class _Dropped(logging.Filter):
 
 def _explained(warning: str) -> str:
     """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint."""
-    place, text = warning.split(": warning: ", 1)
+    place, _, text = warning.rpartition("warning: ")
+    place = place.removesuffix(": ") or "the file"
     kind = "link" if "inertia" in text else "joint"
     if "inertia" in text:
         text = (
             "mass or inertia of no body: a mass is positive, moments of inertia are positive and "
-            "none exceeds the sum of the others. Mend it, or write leave_out: [inertia] under "
-            "robot, which takes a ball of water of that mass in its place"
+            "none exceeds the sum of the others. Mend it, or write leave_out: [inertia] under robot"
         )
     elif "friction" in text:
         text = (

@@ -16,6 +16,7 @@ from pydrake.common import GetDrakePath
 from pydrake.geometry import Role, SceneGraph
 
 from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.readable.converted import ORIGINALS
 
 # Generous, since readers of these formats are: options and line ends may stand before a name.
 _MATERIAL_LIBRARY = re.compile(r"mtllib\s+([^\r\n]+)")
@@ -62,6 +63,7 @@ def check_resources(scene_graph: SceneGraph, folders: Iterable[Path]) -> None:
             if properties is not None and properties.HasProperty("phong", "diffuse_map"):
                 files.append(Path(properties.GetProperty("phong", "diffuse_map")))
         for file in files:
+            file = ORIGINALS.get(file, file)
             if not _is_within(file, allowed):
                 raise ModelError(f"link '{body}' names the file '{file}', {_OUTSIDE}")
             _check_references(body, file, allowed)

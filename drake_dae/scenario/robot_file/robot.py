@@ -81,6 +81,10 @@ Actuators = Annotated[
 """Which joints are driven: "all", names, or name -> effort limit."""
 
 
+LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
+"""What a scenario may leave out of a robot's file."""
+
+
 @dataclass(frozen=True)
 class Robot:
     """A robot that Drake's Parser reads, and what its file does not say of it.
@@ -98,9 +102,11 @@ class Robot:
         packages: Name -> folder, relative to the scenario, for other "package://<name>/...". Those
             of which a package.xml lies in a folder above the file that names them, or beside such a
             folder under their name, and those in ROS_PACKAGE_PATH are found without it.
-        free: Names of bodies that no joint holds, "object" or "puck::object": they get a joint in
-            roll, pitch and yaw, with the positions "object_qx", "_qy", "_qz", "_x", "_y", "_z".
-        base: What is welded to the world, where the file does not do it.
+        free: Names of bodies that no joint holds, "object" or "puck::object", or that the file
+            fixes to the world: they get a joint in roll, pitch and yaw, with the positions
+            "object_qx", "_qy", "_qz", "_x", "_y", "_z". A "floating" joint of the file has such
+            positions as well, in the place of a quaternion.
+        base: What is welded to the world, where the file does not do it, or elsewhere than it does.
         locked: Joint name -> position in rad or m where it stays, for joints that turn or slide; a
             joint that is coupled to it stays as well. Such joints are none in the rest of the
             scenario.
@@ -110,9 +116,9 @@ class Robot:
             those that the file gives actuators.
         leave_out: What the file has and the equations have not, which without this is refused:
             joint_friction, which is Coulomb friction; inertia that no body can have, in whose place
-            Drake takes that of a ball of water of the same mass; constraints, all those that the
-            file has beside its joints, as <equality> of MJCF, which are then written under
-            `constraints`.
+            the nearest possible one is taken; empty_limits, the position limits of joints that
+            they leave no room, 0 to 0 for example; constraints, all those that the file has beside
+            its joints, as <equality> of MJCF, which are then written under `constraints`.
         payloads: Masses that it carries, which plant and law have both.
     """
 
@@ -122,9 +128,7 @@ class Robot:
     base: Annotated[Base, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
-    leave_out: list[Literal["joint_friction", "inertia", "constraints"]] = field(
-        default_factory=list
-    )
+    leave_out: list[LeftOut] = field(default_factory=list)
     description: str = ""
     payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
 

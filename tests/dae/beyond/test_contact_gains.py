@@ -106,14 +106,12 @@ def test_positions_that_are_sampled_late_come_to_rest(sample_time):
 
 
 def test_stiff_contact_that_samples_cannot_damp_gets_no_damping():
-    """At w T = 1.3 what is held is late by more than a quarter of a swing."""
-    with pytest.warns(AdviceWarning, match="does not come to rest"):
-        found = contact_gains((1.3e3) ** 2 / 0.03, 0.03, 1e-3)
     """At w T = 1.3 what is held is late by more than a quarter of a swing.
 
     Then the force is changed as slowly as with a damping of half the rate w, five times slower.
     """
-    found = contact_gains((1.3e3) ** 2 / 0.03, 0.03, 1e-3)
+    with pytest.warns(AdviceWarning, match="does not come to rest"):
+        found = contact_gains((1.3e3) ** 2 / 0.03, 0.03, 1e-3)
     assert found.constraint_damping == 0.0
     assert found.force_gain == pytest.approx(0.2 * found.position_rate / 1.5)
 

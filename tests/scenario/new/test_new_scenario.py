@@ -151,7 +151,7 @@ def test_fingers_and_wheels_are_locked_and_what_mimics_follows(tmp_path):
                 joint("hip", "foot", "lever", "0 1 0"),
             ),
             {},
-            "robot: no place was found where 'lever' can move along a plane",
+            "robot.file: the tip 'lever' moves in one direction alone by 1 joint (hip)",
         ),
     ],
 )

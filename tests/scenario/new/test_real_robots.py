@@ -28,6 +28,7 @@ ROBOTS = {
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),
+    pytest.mark.filterwarnings("ignore::drake_dae.errors.RobotFileWarning"),
 ]
 
 

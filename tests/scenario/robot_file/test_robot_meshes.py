@@ -1,5 +1,6 @@
 """Meshes that Drake cannot read or draw are left out by name; the rest of a robot is as it was."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,11 @@ def count(scene_graph: SceneGraph, role: Role) -> int:
 
 def read(file: Path, scene_graph: SceneGraph, **more: object):
     return read_robot(Robot(str(file), **more), scene_graph)[0]
+
+
+@pytest.fixture
+def without_trimesh(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
 
 
 def test_collision_meshes_are_left_out_by_name_and_the_rest_stays(tmp_path: Path):
@@ -131,6 +137,7 @@ def test_sdformat_is_read_so_too(tmp_path: Path):
     assert count(scene_graph, Role.kIllustration) == 1
 
 
+@pytest.mark.usefixtures("without_trimesh")
 def test_what_meshcat_cannot_draw_is_named(tmp_path: Path):
     file = write_ur5(tmp_path)
     text = file.read_text().replace("link.dae", "link.stl")
@@ -222,6 +229,7 @@ def write_mjcf(folder: Path, text: str = MJCF) -> Path:
     return folder / "arm.yaml"
 
 
+@pytest.mark.usefixtures("without_trimesh")
 def test_an_mjcf_robot_runs_without_the_meshes_that_drake_cannot_read(tmp_path: Path):
     """Its masses are those of the file; the accuracy of a step, 1e-6, is in the prediction."""
     path = write_mjcf(tmp_path)
@@ -236,6 +244,7 @@ def test_an_mjcf_robot_runs_without_the_meshes_that_drake_cannot_read(tmp_path: 
     np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-5)
 
 
+@pytest.mark.usefixtures("without_trimesh")
 @pytest.mark.parametrize("head", ['meshdir="assets"', 'meshdir="assets" inertiafromgeom="true"'])
 def test_an_mjcf_body_that_weighs_what_its_mesh_does_is_refused(head: str, tmp_path: Path):
     text = MJCF.replace('meshdir="assets"', head)

@@ -31,7 +31,7 @@ from drake_dae import (
 )
 from drake_dae.diagrams.parts import log_steps
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.model import add_robot
+from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.runs import Outcome

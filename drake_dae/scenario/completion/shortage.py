@@ -1,0 +1,88 @@
+"""Why positions cannot complete some outputs: dependent force outputs, or too few."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.completion.choice import INDEPENDENT, first_independent
+from drake_dae.scenario.completion.postures import Posture
+
+_ZERO = 1e-6
+"""A singular value of S(q) below it, relative to the largest, is zero; rows are of order one."""
+
+
+def check_independent(names: Sequence[str], posture: Posture) -> None:
+    """Refuses force outputs z_2 = S lambda that depend on each other.
+
+    Args:
+        names: Their names.
+        posture: A configuration on the constraints.
+
+    Raises:
+        ScenarioError: They do; it names those that do, and how many are independent.
+    """
+    if not len(posture.forces):
+        return
+    left, values, _ = np.linalg.svd(posture.forces)
+    rank = int(np.count_nonzero(values > _ZERO * values[0]))
+    if rank == len(names):
+        return
+    weights = np.linalg.norm(left[:, rank:], axis=1)
+    dependent = [name for name, weight in zip(names, weights, strict=True) if weight > _ZERO]
+    text = (
+        f"{', '.join(dependent)} depend on each other at the start: of {len(names)} force outputs "
+        f"only {rank} are independent. Leave out {dependent[-1]}"
+    )
+    if rank < len(names) - 1:
+        text += f" and {len(names) - rank - 1} more"
+    text += (
+        "; what squeezes between contacts of one plane cannot do is a force across it, as a "
+        "!ForceCombination of the forces that are normal to it"
+    )
+    raise ScenarioError(("forces", text))
+
+
+def why_none(
+    posture: Posture,
+    rows: Sequence[int],
+    joints: Sequence[int],
+    missing: int,
+    given: int,
+    forces: Sequence[str],
+) -> tuple[str, str] | None:
+    """The key and the text for outputs that must be forces, since positions are too few.
+
+    Args:
+        posture: The start.
+        rows: The rows of positions that are given, named or chosen.
+        joints: The rows of positions of joints.
+        missing: How many outputs are missing.
+        given: How many positions the scenario gives.
+        forces: The names of the constraint forces.
+
+    Returns:
+        None if there are positions enough.
+    """
+    ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
+    lacking = given + missing - ways
+    if lacking <= 0:
+        return None
+    chosen = [*rows, *first_independent(posture, rows, joints, ways - len(rows))]
+    named: list[str] = []
+    for place, name in enumerate(forces):
+        row = np.eye(len(forces))[[place]]
+        more = replace(posture, forces=np.vstack([posture.forces.reshape(-1, len(forces)), row]))
+        if len(named) < lacking and more.independence(chosen) > INDEPENDENT:
+            posture, named = more, [*named, name]
+    text = (
+        f"{given + missing} outputs more are needed, one for each actuator that is left, but "
+        f"on its constraints the robot moves in {ways} ways: at most {ways} can be positions, and "
+        f"{lacking} more must be forces"
+    )
+    if len(named) == lacking:
+        text += f". Name them under forces, for example {', '.join(named)}"
+    else:
+        text += "; fewer are independent there, so leave actuators out by robot.actuators"
+    return "forces", text

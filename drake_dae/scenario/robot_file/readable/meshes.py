@@ -1,0 +1,224 @@
+"""A robot's files as Drake can read them: without some meshes, with inertias of bodies.
+
+Vendors write collisions in .stl or .dae, which MultibodyPlant refuses as soon as it has a
+SceneGraph, and MJCF has .stl for all. The equations need none: what remains is read and drawn.
+"""
+
+import re
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydrake.geometry import Mesh
+from pydrake.multibody.parsing import (
+    FlattenModelDirectives,
+    LoadModelDirectives,
+    PackageMap,
+    Parser,
+    ProcessModelDirectives,
+)
+
+from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.readable.converted import as_obj
+from drake_dae.scenario.robot_file.readable.inertias import RepairedInertia, possible_inertias
+from drake_dae.scenario.robot_file.readable.mjcf import without_assets
+from drake_dae.scenario.robot_file.readable.placing import (
+    FloatingJoint,
+    floating_joints,
+    released,
+    world_links,
+)
+from drake_dae.scenario.robot_file.readable.urdf import as_meant, blank
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_COLLISION = re.compile(r"<collision\b[^<]*?(?:/>|>.*?</collision\s*>)", re.DOTALL)
+_FILE = {
+    ".urdf": re.compile(r"(<(?:mesh|texture)\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
+    ".sdf": re.compile(r"(<uri>\s*)([^<]*?)(\s*</uri>)"),
+}
+"""Per kind of file: what stands before a mesh's name, the name, and what stands after it."""
+
+_MESH = {
+    ".urdf": re.compile(r"(<mesh\b[^>]*?\bfilename\s*=\s*[\"']\s*)([^\"']+)()"),
+    ".sdf": re.compile(r"(<mesh\b[^>]*>(?:(?!</mesh).)*?<uri>\s*)([^<]*?)(\s*</uri>)", re.DOTALL),
+}
+"""The same of meshes alone."""
+
+DRAWN = (".obj", ".gltf", ".dae")
+"""The kinds of mesh that Drake's Meshcat draws."""
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Files that Drake reads in the place of those of the user.
+
+    Attributes:
+        leave_out: What the scenario says of it.
+        placed: The links that the scenario welds or sets free, "base" or "left::base".
+        originals: A copy -> the file that it is a copy of, with the same lines.
+        left_out: The meshes that are left out.
+        repaired: The inertias that no body can have.
+        floating: Model instance, or "", -> the floating joints of its file.
+    """
+
+    leave_out: Collection[str]
+    placed: Collection[str] = ()
+    originals: dict[Path, Path] = field(default_factory=dict)
+    left_out: list[Path] = field(default_factory=list)
+    repaired: list[RepairedInertia] = field(default_factory=list)
+    floating: dict[str, list[FloatingJoint]] = field(default_factory=dict)
+
+    def named(self, text: str) -> str:
+        """A message of Drake's parser, about the files that the user has."""
+        for copy, original in self.originals.items():
+            text = text.replace(str(copy), str(original))
+        return text
+
+
+def add_models(file: Path, parser: Parser, folder: Path, copies: Copies) -> dict[str, Path]:
+    """Adds the models of a file to a plant, without the meshes that Drake cannot read.
+
+    Args:
+        file: A file that Drake's Parser reads.
+        parser: It knows the packages, and the plant.
+        folder: An empty one, where copies of files are written.
+        copies: Without any; the copies are added, also where the files are refused then.
+
+    Returns:
+        The file of each model instance of directives, or the file itself under "".
+
+    Raises:
+        ModelError: A body has its mass from a mesh that Drake cannot read.
+        RuntimeError: Drake refuses the files; the message names copies.
+    """
+    packages = parser.package_map()
+    has_geometry = parser.plant().geometry_source_is_registered()
+    if not file.name.endswith((".dmd.yaml", ".dmd.yml")):
+        own, _ = _readable(file, packages, folder, copies, has_geometry, "", copies.placed)
+        parser.AddModels(str(own))
+        return {"": file}
+    directives = FlattenModelDirectives(LoadModelDirectives(str(file)), packages)
+    welds = (directive.add_weld for directive in directives.directives)
+    placed = [*copies.placed, *(weld.child for weld in welds if weld is not None)]
+    models: dict[str, Path] = {}
+    standing: dict[Path, str] = {}
+    for directive in directives.directives:
+        if directive.add_model is not None:
+            name = directive.add_model.name
+            models[name] = model = Path(packages.ResolveUrl(directive.add_model.file))
+            links = [link.removeprefix(f"{name}::") for link in placed]
+            own, held = _readable(model, packages, folder, copies, has_geometry, name, links)
+            if own != model:
+                directive.add_model.file = own.as_uri()
+            if held and model in standing:
+                raise ModelError(
+                    f"models '{standing[model]}' and '{name}' stand in one place: '{model.name}' "
+                    f"fixes its link '{held[0]}' to the world. Say where another one stands by "
+                    f"add_weld: {{parent: world, child: {name}::{held[0]}, X_PC: ...}}, in the "
+                    "place of the joint in the file"
+                )
+            standing.update({model: name} if held else {})
+    if copies.originals:
+        ProcessModelDirectives(directives, parser)
+    else:
+        parser.AddModels(str(file))
+    return models
+
+
+def _readable(
+    file: Path,
+    packages: PackageMap,
+    folder: Path,
+    copies: Copies,
+    has_geometry: bool,
+    instance: str,
+    placed: Collection[str],
+) -> tuple[Path, list[str]]:
+    """The file, or a copy as Drake can read it, and the links that it fixes to the world."""
+    if not (file.suffix in _FILE or _is_mjcf(file)) or not file.is_file():
+        return file, []
+    plain = _COMMENT.sub(blank, file.read_text("utf-8", errors="replace"))
+    text = released(plain, file, placed)
+    held = world_links(text, file)
+    text, floating = floating_joints(text, file)
+    copies.floating[instance] = [joint for joint in floating if joint.child not in placed]
+    if file.suffix == ".urdf":
+        text = as_meant(text, "empty_limits" in copies.leave_out)
+    text, repaired = possible_inertias(text, file)
+    copies.repaired.extend(repaired)
+    left_out: list[Path] = []
+    if _is_mjcf(file):  # Of MJCF Drake reads the meshes also where they are not registered.
+        text, left_out = without_assets(text, file)
+    elif has_geometry:
+        text, left_out = _without_collisions(text, file, packages)
+        text = _with_visuals(text, file, packages)
+    if text == plain:
+        return file, held
+    if not _is_mjcf(file):
+        text = _with_absolute_names(text, file)
+    copies.left_out.extend(left_out)
+    copy = folder / str(len(copies.originals)) / file.name
+    copy.parent.mkdir()
+    copy.write_text(text, "utf-8")
+    copies.originals[copy] = file
+    return copy, held
+
+
+def _is_mjcf(file: Path) -> bool:
+    return file.suffix == ".xml"
+
+
+def _without_collisions(text: str, file: Path, packages: PackageMap) -> tuple[str, list[Path]]:
+    """A URDF or SDFormat file without the collision meshes that Drake cannot read, and these."""
+    name, left_out = _FILE[file.suffix], []
+
+    def kept(collision: re.Match[str]) -> str:
+        meshes = [_resolved(found[2], file, packages) for found in name.finditer(collision[0])]
+        refused = [mesh for mesh in meshes if mesh is not None and _is_refused(mesh)]
+        left_out.extend(refused)
+        return blank(collision) if refused else collision[0]
+
+    return _COLLISION.sub(kept, text), left_out
+
+
+def _with_visuals(text: str, file: Path, packages: PackageMap) -> str:
+    """A text whose meshes that cannot be drawn are copies that can, as far as there are any."""
+
+    def drawn(found: re.Match[str]) -> str:
+        mesh = _resolved(found[2], file, packages)
+        if mesh is None or mesh.suffix.lower() in DRAWN:
+            return found[0]
+        copy = as_obj(mesh)
+        return found[0] if copy is None else f"{found[1]}{copy}{found[3]}"
+
+    return _MESH[file.suffix].sub(drawn, text)
+
+
+def _with_absolute_names(text: str, file: Path) -> str:
+    """A copy lies elsewhere: relative names would lead nowhere."""
+    name = _FILE[file.suffix]
+    return name.sub(lambda found: found[1] + _absolute(found[2], file) + found[3], text)
+
+
+def _absolute(name: str, file: Path) -> str:
+    return name if re.match(r"[A-Za-z]\w*:", name) else str(file.parent.resolve() / name)
+
+
+def _resolved(name: str, file: Path, packages: PackageMap) -> Path | None:
+    """Where a mesh is, or None where its name leads nowhere, which Drake tells better."""
+    name = _absolute(name, file)
+    try:
+        return Path(packages.ResolveUrl(name) if "://" in name else name)
+    except RuntimeError:
+        return None
+
+
+def _is_refused(mesh: Path) -> bool:
+    """Whether Drake, asked for the convex hull that a collision needs, says no."""
+    if not mesh.is_file():
+        return False
+    try:
+        Mesh(str(mesh)).GetConvexHull()
+    except RuntimeError:
+        return True
+    return False

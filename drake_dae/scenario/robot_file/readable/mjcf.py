@@ -1,0 +1,135 @@
+"""An MJCF file as Drake can read it: meshes as .obj, and bodies of mass 0."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.readable.converted import as_obj
+
+_MESH = re.compile(r"<mesh\b([^>]*?)(?:/>|>\s*</mesh\s*>)")
+_GEOM = re.compile(r"<geom\b([^>]*?)(?:/>|>\s*</geom\s*>|>)")
+_INERTIAL = re.compile(r"<inertial\b[^>]*?(?:/>|>\s*</inertial\s*>)")
+_READ = ".obj"
+
+
+def without_assets(text: str, file: Path) -> tuple[str, list[Path]]:
+    """A file with its meshes as .obj, without others and the geometry that is made of them.
+
+    A body whose <inertial> has mass 0 has none, and its geometry weighs nothing: MuJoCo takes such
+    bodies where they do not move, or move with others.
+
+    Args:
+        text: The text of the file, without comments.
+        file: Where it is.
+
+    Returns:
+        The text, with the same lines and names of the meshes that lead there from anywhere; and the
+        meshes that are left out.
+
+    Raises:
+        ModelError: A body that can move has its mass from such a mesh.
+    """
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return text, []  # Drake says what is wrong.
+    whole, text = text, _without_mass(text, root)
+    folder = file.resolve().parent
+    for compiler in root.iter("compiler"):
+        folder = file.resolve().parent / compiler.get("meshdir", compiler.get("assetdir", ""))
+    named = {
+        mesh.get("name", Path(mesh.get("file", "")).stem): folder / mesh.get("file", "")
+        for mesh in root.iter("mesh")
+        if mesh.get("file") and Path(mesh.get("file", "")).suffix.lower() != _READ
+    }
+    copies = {mesh: as_obj(mesh) for mesh in named.values()}
+    refused = {name: mesh for name, mesh in named.items() if copies[mesh] is None}
+    if not named and text == whole:
+        return text, []
+    _check_masses(root, refused)
+
+    def asset(found: re.Match[str]) -> str:
+        name = _attribute(found[1], "file")
+        if name is None:
+            return found[0]
+        place = copies.get(folder / name, folder / name)
+        if place is None:
+            return "\n" * found[0].count("\n")
+        return found[0].replace(name, str(place))
+
+    def geometry(found: re.Match[str]) -> str:
+        is_gone = _attribute(found[1], "mesh") in refused
+        return "\n" * found[0].count("\n") if is_gone else found[0]
+
+    return _GEOM.sub(geometry, _MESH.sub(asset, text)), list(refused.values())
+
+
+def _without_mass(text: str, root: ElementTree.Element) -> str:
+    """Bodies of mass 0 as Drake reads them: without <inertial>, of geometry that weighs nothing."""
+    if _takes_geometry(root):
+        return text
+    empty = {
+        child
+        for body in root.iter("body")
+        if _weighs_nothing(body.find("inertial"))
+        for child in body
+        if child.tag in ("inertial", "geom")
+    }
+    inertials, geoms = root.iter("inertial"), root.iter("geom")
+
+    def inertial(found: re.Match[str]) -> str:
+        return "\n" * found[0].count("\n") if next(inertials) in empty else found[0]
+
+    def geom(found: re.Match[str]) -> str:
+        if next(geoms) not in empty:
+            return found[0]
+        return re.sub(r"\bmass\s*=\s*[\"'][^\"']*[\"']", "", found[0]).replace(
+            "<geom", '<geom mass="0"', 1
+        )
+
+    return _GEOM.sub(geom, _INERTIAL.sub(inertial, text)) if empty else text
+
+
+def _takes_geometry(root: ElementTree.Element) -> bool:
+    """Whether masses are those of the geometry also where there is an <inertial>."""
+    return any(one.get("inertiafromgeom") == "true" for one in root.iter("compiler"))
+
+
+def _weighs_nothing(inertial: ElementTree.Element | None) -> bool:
+    try:
+        return inertial is not None and float(inertial.get("mass", "")) == 0.0
+    except ValueError:
+        return False  # Drake tells it.
+
+
+def _moving(body: ElementTree.Element, moves: bool = False) -> Iterator[ElementTree.Element]:
+    """The bodies in an element that joints move."""
+    for child in body.iterfind("body"):
+        own = moves or child.find("joint") is not None or child.find("freejoint") is not None
+        if own:
+            yield child
+        yield from _moving(child, own)
+
+
+def _check_masses(root: ElementTree.Element, refused: dict[str, Path]) -> None:
+    """Refuses a body that moves and weighs what its meshes do."""
+    always = _takes_geometry(root)
+    for body in (body for world in root.iter("worldbody") for body in _moving(world)):
+        if body.find("inertial") is not None and not always:
+            continue
+        for geom in body.iterfind("geom"):
+            mesh = refused.get(geom.get("mesh", ""))
+            if mesh is not None and geom.get("mass") not in ("0", "0.0"):
+                name = body.get("name", "")
+                raise ModelError(
+                    f"body '{name}' has its mass from the mesh '{mesh.name}', which Drake cannot "
+                    f"read; give the body an <inertial>, or the mesh as {_READ}, or let trimesh "
+                    "read it, by pip install 'drake_dae[meshes]'"
+                )
+
+
+def _attribute(attributes: str, name: str) -> str | None:
+    found = re.search(rf"\b{name}\s*=\s*[\"']([^\"']*)", attributes)
+    return found and found[1]

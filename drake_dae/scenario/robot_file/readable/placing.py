@@ -1,0 +1,185 @@
+"""Links that a robot's file holds in the world, or lets float.
+
+Those it holds are set free where the user says where they stand. Those it lets float have no joint
+in Drake, which leaves them free with a quaternion: its length 1 is an equation that no force keeps.
+They get one in roll, pitch and yaw.
+"""
+
+import re
+import warnings
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RpyFloatingJoint
+
+from drake_dae.errors import ModelError, RobotFileWarning
+from drake_dae.scenario.robot_file.readable.urdf import blank
+
+_JOINT = re.compile(r"<joint\b[^>]*(?<!/)>.*?</joint\s*>", re.DOTALL)
+_BODY = re.compile(r"<body\b[^>]*?\bname\s*=\s*[\"']([^\"']*)[\"'][^>]*(?<!/)>")
+_HOLDING = ("fixed", "floating")
+"""Joints to the world in whose place another one can stand."""
+
+
+def world_links(text: str, file: Path) -> list[str]:
+    """The names of the links that a file fixes to the world.
+
+    Args:
+        text: A URDF, SDFormat or MJCF file without comments.
+        file: Its name tells which it is.
+    """
+    if file.suffix == ".xml":
+        return [body.get("name", "") for body in _fixed_bodies(text)]
+    held = (_held(joint[0]) for joint in _JOINT.finditer(text))
+    return [link for kind, link in held if kind == "fixed"]
+
+
+def released(text: str, file: Path, links: Collection[str]) -> str:
+    """A file's text in which no joint of it leads from the world to some links, same lines.
+
+    The arguments are those of `world_links`, and the names of the links.
+    """
+    if not links:
+        return text
+    if file.suffix == ".xml":
+        fixed = {body.get("name", "") for body in _fixed_bodies(text)} & set(links)
+        return _BODY.sub(lambda b: b[0] + "<freejoint/>" * (b[1] in fixed), text)
+
+    def kept(joint: re.Match[str]) -> str:
+        kind, link = _held(joint[0])
+        return blank(joint) if kind in _HOLDING and link in links else joint[0]
+
+    return _JOINT.sub(kept, text)
+
+
+@dataclass(frozen=True)
+class FloatingJoint:
+    """A joint that holds nothing.
+
+    Attributes:
+        name: Its name.
+        parent: The link in which its positions are; "world" for the world.
+        child: The link that floats.
+        origin: Its place in the parent, m, and roll, pitch and yaw there, rad.
+    """
+
+    name: str
+    parent: str
+    child: str
+    origin: tuple[tuple[float, ...], tuple[float, ...]]
+
+
+def floating_joints(text: str, file: Path) -> tuple[str, list[FloatingJoint]]:
+    """The text of a file without its floating joints, with the same lines, and these.
+
+    Drake reads those of MJCF as bodies that are free; they stay in the text.
+
+    Raises:
+        ModelError: The origin of one is no six numbers.
+    """
+    if file.suffix == ".xml":
+        return text, list(_free_joints(text))
+    found: list[FloatingJoint] = []
+
+    def kept(joint: re.Match[str]) -> str:
+        kind, child, parent, name = _ends(joint[0])
+        if kind != "floating":
+            return joint[0]
+        origin = ElementTree.fromstring(joint[0]).find("origin")
+        given = {} if origin is None else origin.attrib
+        pose = _triple(given.get("xyz", ""), name), _triple(given.get("rpy", ""), name)
+        found.append(FloatingJoint(name, parent, child, pose))
+        return blank(joint)
+
+    return _JOINT.sub(kept, text), found
+
+
+def _triple(text: str, name: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(map(float, text.split())) or (0.0, 0.0, 0.0)
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3:
+        raise ModelError(f"joint '{name}': its origin needs three numbers, got '{text}'")
+    return numbers
+
+
+def _free_joints(text: str) -> Iterator[FloatingJoint]:
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return  # Drake says what is wrong.
+    for body in root.iterfind("worldbody/body"):
+        joints = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
+        for joint in joints[:1]:
+            child = body.get("name", "")
+            nowhere = (0.0, 0.0, 0.0)
+            yield FloatingJoint(joint.get("name", child), "world", child, (nowhere, nowhere))
+
+
+def add_floating_joints(
+    plant: MultibodyPlant, instance: str, joints: Iterable[FloatingJoint]
+) -> None:
+    """Adds floating joints in roll, pitch and yaw, and says so.
+
+    Args:
+        plant: The robot, not finalized; changed.
+        instance: The model instance of the file; "" where it is the only one.
+        joints: Its floating joints, of links that no other joint holds.
+    """
+    models = [plant.GetModelInstanceByName(instance)] if instance else []
+    for joint in joints:
+        is_world = joint.parent == "world"
+        parent = plant.world_body() if is_world else plant.GetBodyByName(joint.parent, *models)
+        body = plant.GetBodyByName(joint.child, *models)
+        start = plant.GetDefaultFloatingBaseBodyPose(body)
+        where = RigidTransform(RollPitchYaw(joint.origin[1]), joint.origin[0])
+        frame = plant.AddFrame(
+            FixedOffsetFrame(
+                f"{joint.name}_origin", parent.body_frame(), where, body.model_instance()
+            )
+        )
+        added = plant.AddJoint(RpyFloatingJoint(joint.name, frame, body.body_frame()))
+        if is_world:
+            added.SetDefaultPose(start)
+        warnings.warn(
+            f"joint '{joint.name}' is floating: its positions are roll, pitch and yaw, "
+            f"{joint.name}_qx, {joint.name}_qy and {joint.name}_qz, in the place of a quaternion; "
+            "it must not pitch by 90 degrees",
+            RobotFileWarning,
+            stacklevel=2,
+        )
+
+
+def _held(joint: str) -> tuple[str, str]:
+    """The kind of a joint from the world and the link that it holds; empty for other joints."""
+    kind, child, parent, _ = _ends(joint)
+    return (kind, child) if parent == "world" else ("", "")
+
+
+def _ends(joint: str) -> tuple[str, str, str, str]:
+    """The kind of a joint, its child, its parent and its name; empty if it cannot be read."""
+    try:
+        element = ElementTree.fromstring(joint)
+    except ElementTree.ParseError:
+        return "", "", "", ""
+    parent, child = (
+        "" if end is None else end.get("link", (end.text or "").strip())
+        for end in (element.find("parent"), element.find("child"))
+    )
+    return element.get("type", ""), child, parent, element.get("name", "")
+
+
+def _fixed_bodies(text: str) -> Iterator[ElementTree.Element]:
+    """The bodies that stand in the world of an MJCF file without a joint."""
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return  # Drake says what is wrong.
+    for body in root.iterfind("worldbody/body"):
+        if body.find("joint") is None and body.find("freejoint") is None:
+            yield body

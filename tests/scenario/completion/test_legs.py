@@ -1,0 +1,101 @@
+"""Outputs of robots on legs: dependent force outputs, and too few of them."""
+
+import pytest
+from vendors import joint, link, robot
+
+from drake_dae import build_scenario, complete_scenario, load_scenario
+from drake_dae.errors import ScenarioError
+from drake_dae.scenario.model import scenario_model
+
+LEGS = """
+robot: {{file: {folder}/legs.urdf, free: [trunk], actuators: all}}
+constraints:
+{feet}
+gains: !Poles {{all: [-4.0]}}
+{rest}
+"""
+
+
+def names(completed):
+    return [s.name for s in scenario_model(completed.scenario).position_signals]
+
+
+def refusal(scenario):
+    with pytest.raises(ScenarioError) as caught:
+        complete_scenario(scenario)
+    return str(caught.value)
+
+
+def legs(folder, rest, point=True):
+    """Four legs of three joints on a trunk of which nothing holds, with feet that stand."""
+    parts, joints, feet = [link("trunk", 4.0)], [], []
+    for name, x, y in (("a", 0.2, 0.1), ("b", 0.2, -0.1), ("c", -0.2, 0.1), ("d", -0.2, -0.1)):
+        parts += [link(f"{name}{k}", 0.5) for k in (1, 2, 3)]
+        joints += [
+            joint(f"{name}_roll", "trunk", f"{name}1", "1 0 0", (x, y, 0.0)),
+            joint(f"{name}_hip", f"{name}1", f"{name}2", "0 1 0", (0.0, 0.0, -0.05)),
+            joint(f"{name}_knee", f"{name}2", f"{name}3", "0 1 0", (0.0, 0.0, -0.3)),
+        ]
+        place = f"frame_b: {name}3, point_b: [0, 0, -0.3]"
+        stands = f"!CoincidentPoints {{frame_a: world, point_a: [{x}, {y}, -0.6], {place}, "
+        plane = "surface: !Plane {point: [0, 0, -0.6], normal: [0, 0, 1]}"
+        slides = f"{{frame: {name}3, point: [0, 0, -0.3], {plane}, "
+        feet.append(f"- {stands if point else slides}name: {name}}}")
+    (folder / "legs.urdf").write_text(robot("legs", *parts, *joints))
+    text = LEGS.format(folder=folder, feet="\n".join(feet), rest=rest)
+    (folder / "legs.yaml").write_text(text)
+    return load_scenario(folder / "legs.yaml")
+
+
+PAIRS = ("ab", "ac", "ad", "bc", "bd", "cd")
+BENT = ", ".join(f"{leg}_hip: 0.6, {leg}_knee: -1.2" for leg in "abcd")
+START = f"start: {{positions: {{{BENT}}}}}"
+
+
+def squeezes(pairs):
+    return "forces:\n" + "\n".join(
+        f"- !Squeeze {{frame: world, first: {one}, second: {two}, name: {one}{two}}}"
+        for one, two in pairs
+    )
+
+
+@pytest.mark.slow
+def test_six_squeezes_of_feet_in_one_plane_are_told_to_be_five(tmp_path):
+    """Six bars between four points of a plane bear one state of stress without any load."""
+    held = ", ".join(f"{pair}: 1.0" for pair in PAIRS)
+    rest = f"{squeezes(PAIRS)}\nreferences: {{{held}}}\n{START}"
+    message = refusal(legs(tmp_path, rest))
+    assert message.startswith("forces: ab, ac, ad, bc, bd, cd depend on each other at the start")
+    assert "of 6 force outputs only 5 are independent" in message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pairs", [PAIRS[:5], ()])
+def test_force_outputs_that_are_missing_can_be_named_as_the_message_does(pairs, tmp_path):
+    """The trunk moves in six ways; twelve motors steer six forces beside them."""
+    held = ", ".join([*(f"{pair}: 1.0" for pair in pairs), "trunk_z: 0.0"])
+    forces = squeezes(pairs) if pairs else "forces: []"
+    message = refusal(legs(tmp_path, f"{forces}\nreferences: {{{held}}}\n{START}"))
+    assert f"at most 6 can be positions, and {6 - len(pairs)} more must be forces" in message
+    named = message.partition("for example ")[2].split(", ")
+    assert len(named) == 6 - len(pairs)
+    more = "".join(f"\n- {name}" for name in named)
+    forces = (squeezes(pairs) if pairs else "forces:") + more
+    held += "".join(f", {name}: 5.0" for name in named)
+    done = complete_scenario(legs(tmp_path, f"{forces}\nreferences: {{{held}}}\n{START}"))
+    assert len(names(done)) == 6
+
+
+@pytest.mark.slow
+def test_a_free_base_whose_outputs_nothing_asks_for_says_so(tmp_path):
+    scenario = legs(tmp_path, "forces: []")
+    with pytest.raises(ScenarioError, match=r"outputs: there are none, and nothing completes them"):
+        build_scenario(scenario)
+
+
+@pytest.mark.slow
+def test_outputs_of_several_feet_are_merged_foot_by_foot(tmp_path):
+    """Names along a surface repeat with each foot: a.x, a.y, b.x, ..."""
+    forces = ", ".join(f"{name}.force: 10.0" for name in "abcd")
+    done = complete_scenario(legs(tmp_path, f"references: {{{forces}}}\n{START}", point=False))
+    assert len(names(done)) == 8

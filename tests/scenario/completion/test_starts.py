@@ -1,0 +1,55 @@
+"""Where a robot starts: within its limits, without whole turns."""
+
+import numpy as np
+import pytest
+from vendors import joint, link, robot
+
+from drake_dae import build_scenario, complete_scenario, load_scenario
+from drake_dae.errors import ScenarioError
+
+FAR = """
+robot: {{file: {folder}/far.urdf, base: {{weld: base}}, actuators: all}}
+constraints:
+- {{frame: hand, surface: !Plane {{point: [0.3, 0, 0], normal: [-1, 0, 0]}}, name: wall}}
+outputs: [!PointCoordinates {{frame: hand, axes: z}}]
+gains: !Poles {{all: [-4.0]}}
+references: {{hand.z: {z}, wall.force: 5.0}}
+start: {{positions: {positions}}}
+"""
+
+
+def reaching(folder, z, positions, kind="revolute"):
+    parts = [link(name, 1.0) for name in ("base", "upper", "lower", "hand")]
+    joints = [
+        joint("one", "base", "upper", "0 1 0", (0.0, 0.0, 0.0), kind),
+        joint("two", "upper", "lower", "0 1 0", (0.0, 0.0, 0.4), kind),
+        '<joint name="mount" type="fixed"><origin xyz="0 0 0.4"/><parent link="lower"/>'
+        '<child link="hand"/></joint>',
+    ]
+    (folder / "far.urdf").write_text(robot("far", *parts, *joints))
+    (folder / "far.yaml").write_text(FAR.format(folder=folder, z=z, positions=positions))
+    return load_scenario(folder / "far.yaml")
+
+
+@pytest.mark.parametrize("kind", ["revolute", "continuous"])
+@pytest.mark.parametrize("two", [1e-4, -2e-4, 0.003, 2.7])
+def test_a_start_near_a_singular_guess_stays_within_limits(kind, two, tmp_path):
+    """From a straight arm Newton's method goes far, and turns joints often."""
+    scenario = reaching(tmp_path, 0.4, f"{{two: {two}}}", kind)
+    completed = complete_scenario(scenario).scenario
+    loop, context = build_scenario(completed)
+    q = loop.plant.state(loop.plant.GetMyContextFromRoot(context))[:2]
+    assert np.all(np.abs(q) < 2.9 if kind == "revolute" else np.abs(q) < 2 * np.pi)
+    one, both = q[0], q.sum()
+    reached = 0.4 * np.array([np.sin(one) + np.sin(both), np.cos(one) + np.cos(both)])
+    np.testing.assert_allclose(reached, [0.3, 0.4], atol=1e-9)
+
+
+def test_a_start_outside_of_limits_is_refused(tmp_path):
+    """Both postures that reach it turn joint one beyond a limit of 0.2 rad."""
+    scenario = reaching(tmp_path, -0.4, "{one: 0.1, two: 0.1}")
+    text = (tmp_path / "far.urdf").read_text()
+    narrow = text.replace('lower="-2.9" upper="2.9"', 'lower="-0.2" upper="0.2"', 1)
+    (tmp_path / "far.urdf").write_text(narrow)
+    with pytest.raises(ScenarioError, match=r"start.*cannot start outside of its limits.*one = "):
+        build_scenario(scenario)

@@ -1,0 +1,507 @@
+"""Robots whose files Drake refuses or reads otherwise than their authors mean them."""
+
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import Mesh, Role, SceneGraph
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RotationalInertia
+from scipy.optimize import minimize
+from vendors import binary_stl, joint, link, robot
+
+from drake_dae import load_scenario
+from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
+from drake_dae.scenario.robot_file.changes import change_robot, finalize
+from drake_dae.scenario.robot_file.links import robot_links
+from drake_dae.scenario.robot_file.readable.inertias import nearest_inertia
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Base, Pose, Robot
+
+
+def plant_of(file: Path, scene_graph: SceneGraph | None = None, **more) -> MultibodyPlant:
+    """The finalized plant of a robot's file, as a scenario reads it."""
+    own = Robot(str(file), **more)
+    plant, efforts = read_robot(own, scene_graph)
+    change_robot(own, plant, efforts)
+    finalize(plant)
+    return plant
+
+
+def drakes(text: str, kind: str = ".urdf") -> MultibodyPlant:
+    """What Drake alone makes of a text that it reads, on its base."""
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString(text, kind)
+    plant.Finalize()
+    return plant
+
+
+def written(folder: Path, text: str, name: str = "robot.urdf") -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def mass_matrix(plant: MultibodyPlant, seed: int = 0) -> np.ndarray:
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.random.default_rng(seed).normal(size=plant.num_positions()))
+    return plant.CalcMassMatrix(context)
+
+
+# Bodies without mass.
+
+MJCF = """<mujoco model="arm"><compiler angle="radian"/><worldbody>
+<body name="base">{base}<geom type="box" size="0.1 0.1 0.1"/>
+<body name="upper" pos="0 0 0.3"><inertial pos="0.1 0 0" mass="2" diaginertia="0.02 0.03 0.04"/>
+<joint name="j1" axis="0 1 0"/>
+<body name="mark" pos="0.2 0 0">{mark}<geom type="sphere" size="0.05"/>
+<body name="lower" pos="0.2 0 0"><inertial pos="0.1 0 0" mass="1" diaginertia="0.02 0.01 0.01"/>
+<joint name="j2" axis="0 1 0"/></body></body></body></body></worldbody></mujoco>"""
+
+LIGHT = '<inertial pos="0 0 0" mass="1e-12" diaginertia="0 0 0"/>'
+NOTHING = '<inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>'
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"base": NOTHING, "mark": LIGHT},
+        {
+            "base": "",
+            "mark": '<inertial pos="1 0 0" mass="0.0" diaginertia="0 0 0" quat="1 0 0 0"/>',
+        },
+        {"base": NOTHING, "mark": NOTHING},
+    ],
+    ids=["base", "carried", "both"],
+)
+def test_an_mjcf_body_of_mass_0_weighs_nothing_and_neither_does_its_geometry(parts, tmp_path):
+    """A body of 1e-12 kg is the other route; it is below round-off of 1 kg."""
+    plant = plant_of(written(tmp_path, MJCF.format(**parts), "arm.xml"))
+    other = drakes(MJCF.format(base=LIGHT, mark=LIGHT), ".xml")
+    np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("has_trimesh", [True, False])
+def test_a_base_that_stands_needs_no_mass_and_a_link_has_that_of_its_mesh(
+    has_trimesh, tmp_path, monkeypatch
+):
+    """The tetrahedron of 0.1 m has the volume 1e-3 / 6 m^3, of 1000 kg/m^3 in MuJoCo."""
+    if not has_trimesh:
+        monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
+    (tmp_path / "part.stl").write_bytes(binary_stl())
+    mesh = '<asset><mesh name="part" file="part.stl"/></asset><worldbody>'
+    base = '<geom type="mesh" mesh="part"/>'
+    text = MJCF.format(base=base, mark=NOTHING).replace("<worldbody>", mesh)
+    plant = plant_of(written(tmp_path, text, "arm.xml"))
+    other = drakes(MJCF.format(base="", mark=LIGHT), ".xml")
+    np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
+    moving = text.replace(NOTHING, "").replace('<geom type="sphere" size="0.05"/>', base)
+    file = written(tmp_path, moving, "arm.xml")
+    if has_trimesh:
+        mass = plant_of(file).GetBodyByName("mark").default_mass()
+        assert mass == pytest.approx(1000 * 1e-3 / 6, rel=1e-6)
+    else:
+        with pytest.raises(ModelError, match=r"body 'mark' has its mass from the mesh 'part\.stl'"):
+            plant_of(file)
+
+
+# Limits.
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "wanted"),
+    [
+        ("continuous", 'lower="0" upper="0"', (-np.inf, np.inf)),
+        ("continuous", 'lower="-1" upper="1"', (-np.inf, np.inf)),
+        ("revolute", 'lower="-1" upper="1"', (-1.0, 1.0)),
+        ("revolute", 'lower="0" upper="0"', (0.0, 0.0)),
+        ("prismatic", 'lower="0" upper="0"', (0.0, 0.0)),
+    ],
+)
+def test_a_continuous_joint_has_no_limits_and_a_speed_limit_of_0_is_none(
+    kind, limit, wanted, tmp_path
+):
+    one = joint("j", "base", "arm", "0 1 0", kind=kind)
+    one = one.replace('lower="-2.9" upper="2.9"', limit).replace('velocity="2"', 'velocity="0"')
+    assert limit in one
+    assert 'velocity="0"' in one
+    plant = plant_of(written(tmp_path, robot("one", link("base", 1), link("arm", 1), one)))
+    found = plant.GetJointByName("j")
+    assert (found.position_lower_limits()[0], found.position_upper_limits()[0]) == wanted
+    assert found.velocity_upper_limits()[0] == np.inf
+
+
+@pytest.mark.parametrize("bounds", [("0", "0"), ("1", "-1"), ("-2", "-2")])
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_limits_that_leave_no_room_are_left_out_where_the_scenario_says_so(kind, bounds, tmp_path):
+    low, high = bounds
+    one = joint("j", "base", "arm", "0 1 0", kind=kind).replace(
+        'lower="-2.9" upper="2.9"', f'lower="{low}" upper="{high}"'
+    )
+    file = written(tmp_path, robot("one", link("base", 1), link("arm", 1), one))
+    found = plant_of(file, leave_out=["empty_limits"]).GetJointByName("j")
+    assert found.position_lower_limits()[0] == -np.inf
+    assert found.position_upper_limits()[0] == np.inf
+    if low > high:
+        with pytest.raises(ModelError, match=r"'j' has limits from 1 to -1.*\[empty_limits\]"):
+            plant_of(file)
+
+
+@pytest.mark.parametrize("gear", [1.0, 50.0, -20.0])
+def test_a_limit_of_an_mjcf_motor_is_that_of_its_joint(gear, tmp_path):
+    """In MuJoCo the joint feels gear times the control."""
+    motor = f'<actuator><motor name="m" joint="j1" gear="{gear}" ctrllimited="true" '
+    text = MJCF.format(base="", mark="").replace(
+        "</worldbody>", f'</worldbody>{motor} ctrlrange="-2 2"/></actuator>'
+    )
+    plant = plant_of(written(tmp_path, text, "arm.xml"))
+    assert plant.GetJointActuatorByName("m").effort_limit() == 2.0 * abs(gear)
+
+
+# Inertias.
+
+MOMENTS = [
+    ((2.0, 1.0, 0.1, 0, 0, 0), False),  # No triangle.
+    ((1.0, 0.0, 0.0, 0, 0, 0), False),  # Written in part.
+    ((0.1, -0.02, 0.1, 0, 0, 0), False),
+    ((0.1, 0.1, 0.1, 0.2, 0.0, 0.05), False),  # Swapped: what is beside the diagonal is larger.
+    ((0.3, 0.2, 0.1, 0.0, 0.0, 0.0), True),  # A sheet.
+    ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), True),  # A point.
+]
+
+
+def matrix(entries) -> np.ndarray:
+    xx, yy, zz, xy, xz, yz = entries
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
+
+
+@pytest.mark.parametrize("entries", [one for one, is_possible in MOMENTS if not is_possible])
+def test_the_nearest_inertia_is_nearest_of_all_that_bodies_have(entries):
+    """Those of bodies are tr(S) 1 - S with S = L L^T: SciPy searches L from several starts.
+
+    Its searches end some 1e-6 above the least distance.
+    """
+    wanted = matrix(entries)
+    found = nearest_inertia(wanted)
+    entries = [found[place] for place in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    assert RotationalInertia(*entries).CouldBePhysicallyValid()
+
+    def distance(factor: np.ndarray) -> float:
+        second = factor.reshape(3, 3) @ factor.reshape(3, 3).T
+        return float(np.sum((np.trace(second) * np.eye(3) - second - wanted) ** 2))
+
+    random = np.random.default_rng(0)
+    least = min(minimize(distance, random.normal(size=9)).fun for _ in range(6))
+    assert np.sum((found - wanted) ** 2) <= least + 1e-5
+
+
+URDF_INERTIA = '<inertia ixx="{0}" iyy="{1}" izz="{2}" ixy="{3}" ixz="{4}" iyz="{5}"/>'
+SDF_INERTIA = (
+    "<inertia><ixx>{0}</ixx><iyy>{1}</iyy><izz>{2}</izz>"
+    "<ixy>{3}</ixy><ixz>{4}</ixz><iyz>{5}</iyz></inertia>"
+)
+BODIES = {
+    "robot.urdf": '<robot name="r"><link name="arm">\n<inertial><origin xyz="0.1 0 0"/>'
+    f'<mass value="2"/>{URDF_INERTIA}</inertial></link></robot>',
+    "robot.sdf": '<sdf version="1.9"><model name="r"><link name="arm">\n<inertial><pose>0.1 0 0 '
+    f"0 0 0</pose><mass>2</mass>{SDF_INERTIA}</inertial></link></model></sdf>",
+    "robot.xml": '<mujoco model="r"><worldbody><body name="arm"><freejoint/>\n<inertial '
+    'pos="0.1 0 0" mass="2" fullinertia="{0} {1} {2} {3} {4} {5}"/></body></worldbody></mujoco>',
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize(("entries", "is_possible"), MOMENTS)
+def test_an_impossible_inertia_is_named_and_the_nearest_taken(name, entries, is_possible, tmp_path):
+    """Its mass and centre of mass stay; the rotation of the free body feels the nearest inertia."""
+    file = written(tmp_path, BODIES[name].format(*entries), name)
+    own = {"free": ["arm"]}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", RobotFileWarning)
+        plant = plant_of(file, leave_out=["inertia"], **own)
+    body = plant.GetBodyByName("arm")
+    assert body.default_mass() == 2.0
+    np.testing.assert_allclose(body.default_com(), [0.1, 0, 0], atol=1e-12)
+    wanted = matrix(entries) if is_possible else nearest_inertia(matrix(entries))
+    inertia = body.default_spatial_inertia().Shift([0.1, 0, 0]).CalcRotationalInertia()
+    np.testing.assert_allclose(inertia.CopyToFullMatrix3(), wanted, atol=1e-8)
+    assert len(told) == int(not is_possible)
+    if is_possible:
+        return
+    change = np.linalg.norm(wanted - matrix(entries)) / np.linalg.norm(matrix(entries))
+    assert "'arm': no body can have the moments of inertia" in str(told[0].message)
+    assert f"changed by {100 * change:.2g} %" in str(told[0].message)
+    with pytest.raises(ModelError, match=rf"{name}:2: \w+ 'arm': .*leave_out: \[inertia\]"):
+        plant_of(file, **own)
+
+
+def test_a_negative_mass_is_refused_with_its_link(tmp_path):
+    text = robot("r", link("base", 1), link("arm", -2), joint("j", "base", "arm", "0 0 1"))
+    with pytest.raises(ModelError, match=r"link 'arm': a mass is positive, got -2 kg"):
+        plant_of(written(tmp_path, text), leave_out=["inertia"])
+
+
+@pytest.mark.parametrize("name", ["robot.urdf", "robot.sdf"])
+def test_a_mass_of_0_has_no_inertia(name, tmp_path):
+    text = BODIES[name].format(1, 1, 1, 0, 0, 0).replace('value="2"', 'value="0"')
+    file = written(tmp_path, text.replace("<mass>2</mass>", "<mass>0</mass>"), name)
+    with pytest.raises(
+        ModelError, match=r"'arm': without mass no body has the moments .*\(1, 1, 1\)"
+    ):
+        plant_of(file, base=Base("arm"))
+    with pytest.warns(RobotFileWarning, match="without mass"):
+        plant = plant_of(file, base=Base("arm"), leave_out=["inertia"])
+    assert plant.GetBodyByName("arm").default_mass() == 0.0
+
+
+# What a URDF means.
+
+GREY = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
+BOX = "<visual><geometry><box size='1 1 1'/></geometry>{}</visual></link>"
+
+
+def colours(folder: Path, *materials: str, top: str = "") -> list[float]:
+    """The first component of the colours of links with materials, in their order."""
+    links = [link(f"l{k}", 1).replace("</link>", BOX.format(m)) for k, m in enumerate(materials)]
+    joints = [joint(f"j{k}", "l0", f"l{k}", "0 0 1") for k in range(1, len(materials))]
+    file = written(folder, robot("r", *links, *joints, top))
+    scene_graph = SceneGraph()
+    plant = plant_of(file, scene_graph, base=Base("l0"))
+    inspector = scene_graph.model_inspector()
+    found = []
+    for k in range(len(materials)):
+        frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(f"l{k}").index())
+        (geometry,) = inspector.GetGeometries(frame, Role.kIllustration)
+        properties = inspector.GetProperties(geometry, Role.kIllustration)
+        colour = properties.GetPropertyOrDefault("phong", "diffuse", None)
+        found.append(-1.0 if colour is None else colour.r())
+    return found
+
+
+def test_a_material_has_the_colour_that_its_name_has_anywhere(tmp_path):
+    bare, white = '<material name="grey"/>', GREY.replace("0.5", "1.0")
+    assert colours(tmp_path, bare, bare, GREY) == [0.5] * 3
+    assert colours(tmp_path, bare, GREY, white) == [0.5] * 3
+    assert colours(tmp_path, bare, white, top=GREY) == [1.0] * 2
+    assert colours(tmp_path, '<material name="none"/>', GREY) == [-1.0, 0.5]
+
+
+def test_a_fixed_joint_mimics_nothing_and_a_transmission_to_no_joint_drives_nothing(tmp_path):
+    arm = joint("a", "base", "arm", "0 0 1")
+    hand = (
+        '<joint name="b" type="fixed"><parent link="arm"/><child link="hand"/>'
+        '<mimic joint="a" multiplier="2"/></joint>'
+    )
+    drive = (
+        '<transmission name="t{0}"><type>transmission_interface/SimpleTransmission</type>'
+        '<joint name="{0}"/><actuator name="motor"/></transmission>'
+    )
+    links = [link(name, 1) for name in ("base", "arm", "hand", "tool")]
+    more = joint("c", "hand", "tool", "0 1 0")
+    drives = "".join(drive.format(name) for name in ("a", "gone", "c"))
+    plant = plant_of(written(tmp_path, robot("r", *links, arm, hand, more, drives)))
+    assert plant.num_constraints() == 0
+    found = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+    assert [(one.name(), one.joint().name()) for one in found] == [("motor", "a"), ("motor_2", "c")]
+
+
+@pytest.mark.parametrize("slashes", ["//", "///"])
+def test_a_package_with_three_slashes_is_that_with_two(slashes, tmp_path):
+    (tmp_path / "part.stl").write_bytes(binary_stl())
+    text = robot("r", link("base", 1, f"package:{slashes}own/part.stl"))
+    scene_graph = SceneGraph()
+    plant_of(written(tmp_path, text), scene_graph, packages={"own": str(tmp_path)})
+    assert scene_graph.model_inspector().num_geometries() == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        (
+            "r.urdf",
+            robot("r", link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1", kind="spherical")),
+            "write a ball as three revolute joints",
+        ),
+        ("r.urdf", robot("r", link("a", 1).replace("0.01 -0.02 0.12", "$(arg x)")), "xacro FILE"),
+        ("r.xml", '<mujoco model="m"><compiler coordinate="global"/></mujoco>', "MuJoCo up to"),
+    ],
+)
+def test_what_drake_cannot_read_is_told_with_what_to_do(name, text, words, tmp_path):
+    with pytest.raises(ModelError, match=words):
+        plant_of(written(tmp_path, text, name))
+
+
+# Meshes.
+
+
+@pytest.mark.parametrize("name", ["robot.urdf", "robot.sdf", "robot.xml"])
+def test_a_mesh_that_meshcat_does_not_draw_is_drawn_where_trimesh_is(name, tmp_path):
+    (tmp_path / "part.stl").write_bytes(binary_stl())
+    visual = (
+        "<visual name='v'><geometry><mesh><uri>part.stl</uri></mesh></geometry></visual></link>"
+    )
+    texts = {
+        "robot.urdf": robot("r", link("arm", 1, "part.stl")),
+        "robot.sdf": BODIES["robot.sdf"].format(1, 1, 1, 0, 0, 0).replace("</link>", visual),
+        "robot.xml": BODIES["robot.xml"]
+        .format(1, 1, 1, 0, 0, 0)
+        .replace("<worldbody>", '<asset><mesh file="part.stl"/></asset><worldbody>')
+        .replace("</body>", '<geom type="mesh" mesh="part" contype="0" conaffinity="0"/></body>'),
+    }
+    scene_graph = SceneGraph()
+    plant_of(written(tmp_path, texts[name], name), scene_graph, free=["arm"])
+    inspector = scene_graph.model_inspector()
+    (geometry,) = inspector.GetAllGeometryIds(Role.kIllustration)
+    shape = inspector.GetShape(geometry)
+    assert isinstance(shape, Mesh)
+    lines = Counter(line[0] for line in Path(shape.source().path()).read_text().splitlines())
+    assert lines == {"v": 4, "f": 4}
+    box = inspector.GetObbInGeometryFrame(geometry)
+    assert np.all(box.half_width() <= 0.1)
+
+
+# Where robots stand.
+
+HELD = {
+    "arm.urdf": robot(
+        "arm",
+        '<link name="world"/>',
+        link("base", 2),
+        link("tip", 1),
+        '<joint name="hold" type="fixed"><parent link="world"/><child link="base"/></joint>',
+        joint("a", "base", "tip", "0 1 0"),
+        # What mimics is a constraint, with which Drake removes no joint.
+        link("other", 1),
+        joint("b", "base", "other", "0 1 0", rest='<mimic joint="a"/>'),
+    ),
+    "arm.sdf": """<sdf version="1.9"><model name="arm"><link name="base"/><link name="tip">
+<pose>0 0 0.25 0 0 0</pose></link>
+<joint name="hold" type="fixed"><parent>world</parent><child>base</child></joint>
+<joint name="a" type="revolute"><parent>base</parent><child>tip</child><axis><xyz>0 1 0</xyz>
+</axis></joint></model></sdf>""",
+    "arm.xml": """<mujoco model="arm"><worldbody><body name="base">
+<geom type="sphere" size="0.1"/><body name="tip" pos="0 0 0.25"><geom type="sphere" size="0.1"/>
+<joint name="a" axis="0 1 0"/></body></body></worldbody></mujoco>""",
+}
+TWO = """directives:
+- add_model: {{name: left, file: "file://{0}"}}
+- add_model: {{name: right, file: "file://{0}"}}
+"""
+MOVED = "- add_weld: {parent: world, child: 'right::base', X_PC: {translation: [1, 2, 3]}}\n"
+
+
+def place(plant: MultibodyPlant, frame: str, model: str) -> np.ndarray:
+    context = plant.CreateDefaultContext()
+    body = plant.GetBodyByName(frame, plant.GetModelInstanceByName(model))
+    return plant.EvalBodyPoseInWorld(context, body).translation()
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_a_robot_that_its_file_holds_stands_where_the_user_says(name, tmp_path):
+    file = written(tmp_path, HELD[name], name)
+    two = written(tmp_path, TWO.format(file) + MOVED, "two.dmd.yaml")
+    plant = plant_of(two)
+    np.testing.assert_allclose(place(plant, "tip", "left"), [0, 0, 0.25], atol=1e-12)
+    np.testing.assert_allclose(place(plant, "tip", "right"), [1, 2, 3.25], atol=1e-12)
+    moved = Base("base", Pose((0.5, 0.0, 0.0), (0.0, 90.0, 0.0)))
+    np.testing.assert_allclose(
+        place(plant_of(file, base=moved), "tip", "arm"), [0.75, 0, 0], atol=1e-12
+    )
+    assert plant_of(file, free=["base"]).num_velocities() == plant_of(file).num_velocities() + 6
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_two_robots_in_one_place_are_refused(name, tmp_path):
+    two = written(tmp_path, TWO.format(written(tmp_path, HELD[name], name)), "two.dmd.yaml")
+    with pytest.raises(
+        ModelError, match=r"'left' and 'right' stand in one place.*child: right::base, X_PC"
+    ):
+        plant_of(two)
+
+
+# Joints that float.
+
+HULL = '<link name="{}"><inertial><mass value="{}"/>' + URDF_INERTIA.format(
+    *(0.1, 0.2, 0.25, 0.01, 0, 0)
+)
+FLOATING = {
+    "craft.urdf": robot(
+        "craft",
+        '<link name="world"/>',
+        HULL.format("hull", 2) + "</inertial></link>",
+        HULL.format("arm", 1) + "</inertial></link>",
+        '<joint name="root" type="floating"><parent link="world"/><child link="hull"/></joint>',
+        joint("a", "hull", "arm", "0 1 0"),
+    ),
+    "craft.xml": """<mujoco model="craft"><worldbody><body name="hull" pos="0 0 2">
+<freejoint name="root"/><inertial pos="0 0 0" mass="2" fullinertia="0.1 0.2 0.25 0.01 0 0"/>
+<body name="arm" pos="0 0 0.25"><joint name="a" axis="0 1 0"/>
+<inertial pos="0 0 0" mass="1" fullinertia="0.1 0.2 0.25 0.01 0 0"/></body></body></worldbody>
+</mujoco>""",
+}
+FLOATING["free.xml"] = FLOATING["craft.xml"].replace(
+    '<freejoint name="root"/>', '<joint name="root" type="free"/>'
+)
+
+
+@pytest.mark.parametrize("name", FLOATING)
+def test_a_floating_joint_moves_as_drakes_quaternion_does(name, tmp_path):
+    """The accelerations of both plants in one pose; twists and torques are the same numbers."""
+    file = written(tmp_path, FLOATING[name], name)
+    with pytest.warns(RobotFileWarning, match=r"joint 'root' is floating: .*root_qx.* pitch by 90"):
+        ours = plant_of(file)
+    theirs = MultibodyPlant(0.0)
+    Parser(theirs).AddModels(str(file))
+    theirs.Finalize()
+    assert ours.num_positions() == theirs.num_positions() - 1 == 7
+    starts = [
+        plant.EvalBodyPoseInWorld(plant.CreateDefaultContext(), plant.GetBodyByName("arm"))
+        for plant in (ours, theirs)
+    ]
+    assert starts[0].IsNearlyEqualTo(starts[1], 1e-12)
+    random = np.random.default_rng(1)
+    for _ in range(3):
+        pose = RigidTransform(RollPitchYaw(random.uniform(-1, 1, 3)), random.normal(size=3))
+        velocities = random.normal(size=7)
+        found = []
+        for plant in (ours, theirs):
+            context = plant.CreateDefaultContext()
+            hull = plant.GetBodyByName("hull")
+            if plant is theirs:
+                plant.SetFloatingBaseBodyPoseInWorldFrame(context, hull, pose)
+            else:
+                plant.GetJointByName("root").SetPose(context, pose)
+            plant.GetJointByName("a").set_angle(context, 0.3)
+            # Of the hull, and of the joint on it.
+            first = plant.GetJointByName("a").velocity_start()
+            own = [k for k in range(7) if k != first]
+            speeds = np.zeros(7)
+            speeds[own], speeds[first] = velocities[:6], velocities[6]
+            plant.SetVelocities(context, speeds)
+            rates = plant.EvalTimeDerivatives(context).CopyToVector()[-7:]
+            found.append([*rates[own], rates[first]])
+        np.testing.assert_allclose(*found, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", FLOATING)
+def test_a_floating_joint_can_be_welded(name, tmp_path):
+    plant = plant_of(written(tmp_path, FLOATING[name], name), base=Base("hull"))
+    assert plant.num_velocities() == 1
+    links, _ = robot_links(
+        Robot(str(tmp_path / name), base=Base("hull"), actuators="all"), SceneGraph()
+    )
+    assert [signal.name for signal in links.position_signals] == ["a"]
+
+
+# A robot in the place of a scenario.
+
+
+@pytest.mark.parametrize("name", [*HELD, "two.dmd.yaml"])
+def test_a_robot_in_the_place_of_a_scenario_is_told(name, tmp_path):
+    text = HELD.get(name) or TWO.format(written(tmp_path, HELD["arm.urdf"], "arm.urdf"))
+    file = written(tmp_path, text, name)
+    with pytest.raises(ScenarioError, match=r"this is a robot, not a scenario; `drake-dae new"):
+        load_scenario(file)
