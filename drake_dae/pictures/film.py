@@ -202,8 +202,9 @@ class _Scene:
                 axis.annotate("", head, tail, arrowprops=shape)
                 place = _label_place(head, tail, taken)
                 taken.append(place)
+                x, y = place
                 told = axis.text(
-                    *place, f"{size:.1f} N", color=FORCE, fontsize=11, ha="center", va="center"
+                    x, y, f"{size:.1f} N", color=FORCE, fontsize=11, ha="center", va="center"
                 )
                 told.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
             if bright := course.flashes[number, row]:

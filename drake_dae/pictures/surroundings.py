@@ -89,8 +89,10 @@ def _coincide(first: Seen, second: Seen) -> bool:
     one, other = first.picture.form, second.picture.form
     if isinstance(one, Shape) or isinstance(other, Shape):
         return repr(one) == repr(other)
-    corners = [np.array(form.vertices()) for form in (one, other)]
-    return corners[0].shape == corners[1].shape and np.allclose(*corners, rtol=0.0, atol=1e-9)
+    first_corners, second_corners = (np.array(form.vertices()) for form in (one, other))
+    return first_corners.shape == second_corners.shape and np.allclose(
+        first_corners, second_corners, rtol=0.0, atol=1e-9
+    )
 
 
 def scene_extent(
