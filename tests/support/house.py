@@ -46,6 +46,7 @@ WITHOUT_DRAKE = ("errors", "arrays", "arguments", "trace", "dae", "analysis")
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
     "system",
+    "kinetic_metric",
     "manifold",
     "derivatives",
     "elimination",

@@ -41,7 +41,7 @@ class Manifold:
         self.residual_function = self._residual.function
         self._first_steps = trace_first_steps(self._residual)
         self._search = Search(self._residual, self._first_steps)
-        self._settling = Settling(self._residual)
+        self._settling = Settling(system, self._residual)
 
     @property
     def dimension(self) -> int:

@@ -1,39 +1,72 @@
 """From a start that someone gave to N* level by level: positions first, then velocities."""
 
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.kinetic_metric import KineticMetric
 from drake_dae.dae.manifold.residual import Residual
 from drake_dae.dae.system.layout import Indices, Layout
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import Linearization, newton, shortest_steps, steps_along
 
 
 class Settling:
     """Newton's method on each order of derivatives, by the states that are new in it.
 
+    Where constraint forces do no work, as in a mechanism, its steps take the least kinetic energy,
+    see `KineticMetric`; else they are shortest relative to the scale of the states.
+
     Args:
+        system: The system.
         residual: What is zero on N*.
     """
 
-    def __init__(self, residual: Residual) -> None:
-        self._residual = residual
+    def __init__(self, system: DaeSystem, residual: Residual) -> None:
+        self._system, self._residual = system, residual
         self._levels = _levels(residual.layout, residual.gradient)
+
+    @cached_property
+    def _kinetic(self) -> KineticMetric:
+        return KineticMetric(self._system, self._residual.layout)
 
     def settled(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
         """A state next to one, to round-off on N*; None where that leads nowhere."""
+        kinetic = self._kinetic
+        if kinetic.does_no_work(start, parameters, self._residual.gradients(start, parameters)):
+            found = start.copy()
+            moves = (
+                _settle_level(self._residual, found, rows, columns, parameters, (kinetic, depth))
+                for rows, columns, depth in kinetic.levels
+            )
+            if all(moves):
+                return found
         found = start.copy()
-        for rows, columns in self._levels:
-            if not _settle_level(self._residual, found, rows, columns, parameters):
-                return None
-        return found
+        moves = (_settle_level(self._residual, found, *each, parameters) for each in self._levels)
+        return found if all(moves) else None
 
 
 def _settle_level(
-    residual: Residual, state: FloatArray, rows: Indices, columns: Indices, parameters: FloatArray
+    residual: Residual,
+    state: FloatArray,
+    rows: Indices,
+    columns: Indices,
+    parameters: FloatArray,
+    energy: tuple[KineticMetric, int] | None = None,
 ) -> bool:
-    """Moves some states so that some rows of the residual vanish, and says whether they do."""
+    """Moves some states so that some rows of the residual vanish, and says whether they do.
+
+    Args:
+        residual: What is zero on N*.
+        state: The state, which is changed.
+        rows, columns: The rows and the states.
+        parameters: Values of all parameters.
+        energy: The metric of kinetic energy, and how many derivatives are left until the constraint
+            inputs act; None for steps of least norm.
+    """
     scale = residual.scale[columns]
 
     def filled(z: FloatArray) -> FloatArray:
@@ -41,11 +74,17 @@ def _settle_level(
         x[columns] = scale * z
         return x
 
+    def left(z: FloatArray) -> FloatArray:
+        return residual.function(filled(z), parameters)[0][rows]
+
     def linearize(z: FloatArray) -> Linearization | None:
-        gradients = residual.gradients(filled(z), parameters)[np.ix_(rows, columns)]
-        return shortest_steps(
-            gradients * scale, lambda z: residual.function(filled(z), parameters)[0][rows]
-        )
+        x = filled(z)
+        gradients = residual.gradients(x, parameters)[np.ix_(rows, columns)]
+        if energy is None:
+            return shortest_steps(gradients * scale, left)
+        kinetic, depth = energy
+        directions = kinetic.directions(x, parameters, gradients, depth)
+        return steps_along(gradients * scale, directions / scale[:, None], left)
 
     z, converged = newton(state[columns] / scale, linearize)
     state[columns] = scale * z

@@ -74,6 +74,7 @@ class Violation:
             everywhere.
         singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
             if the rank is lost.
+        least: Below this it counts as lost, `DaeSystem.least_margin`.
         combinations: The constraints that follow from others there, if the rank of A(x) is lost.
         deciding: The parameters and signals that decide, where it is so at their defaults alone.
     """
@@ -86,6 +87,7 @@ class Violation:
     singular_value: float | None = None
     combinations: tuple[Combination, ...] = ()
     deciding: Deciding | None = None
+    least: float | None = None
 
     def __str__(self) -> str:
         text = f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
@@ -96,7 +98,7 @@ class Violation:
             Cause.NO_CONTROL: "the control acts",
         }
         regular = f"{'A' if self.assumption <= 3 else 'B'}(x) is regular"
-        return f"{text}. This hangs on numbers: {acts.get(self.cause, regular)} {self.deciding}"
+        return f"{text}. This depends on numbers: {acts.get(self.cause, regular)} {self.deciding}"
 
     def error(self) -> AssumptionError:
         """The exception to raise where the violation ends what was asked for."""
@@ -106,6 +108,9 @@ class Violation:
         names = ", ".join(f"'{name}'" for name in self.names)
         where = "" if self.state is None else f" at x = {show(self.state)}"
         value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
+        scaled = "rows and columns scaled"
+        if self.least is not None:
+            scaled += f"; below the system's least_margin of {self.least:.0e} it is lost"
         rows = "; ".join(map(str, self.combinations))
         match self.cause:
             case Cause.COUNT:
@@ -152,28 +157,27 @@ class Violation:
                     what = "rows of A(x)"
                 found = [f"{what}: {rows}"] if rows else []
                 if value:
-                    found.insert(0, f"smallest singular value {value} (rows and columns scaled)")
+                    found.insert(0, f"smallest singular value {value} ({scaled})")
                 return f"A(x) loses rank{where}: {'; '.join(found)}"
             case Cause.NUMBERS:
                 kind = "output" if self.assumption == 4 else "constraint"
                 inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
                 return (
-                    f"the relative degree of {kind} {names} hangs on numbers: the {inputs} on its "
-                    f"derivative {self.order} {self.deciding}"
+                    f"the relative degree of {kind} {names} depends on numbers: the {inputs} on "
+                    f"its derivative {self.order} {self.deciding}"
                 )
             case Cause.BOUNDS:
-                assert self.deciding is not None
                 matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
-                (number,), (bound,) = self.deciding.names, self.deciding.values
-                return (
-                    f"{matrix} loses rank within the bounds of '{number}', between its default "
-                    f"{self.deciding.defaults[0]:.6g} and {bound:.6g}"
-                )
+                found = [
+                    f" of '{name}', between its default {default:.6g} and {bound:.6g}"
+                    for name, bound, default in (self.deciding.pairs if self.deciding else ())
+                ]
+                return f"{matrix} loses rank within the bounds{','.join(found)}"
             case Cause.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "
                     f"{', '.join(self.names)} cannot be steered independently; smallest singular "
-                    f"value {value} (rows and columns scaled)"
+                    f"value {value} ({scaled})"
                 )
 
 
@@ -201,4 +205,10 @@ def rank_violation(
     if row is not None:
         return Violation(*vanishing, (signals[row].name,), degrees[row], margin.state)
     names = tuple(signal.name for signal in signals)
-    return Violation(*dependent, names, state=margin.state, singular_value=margin.relative)
+    return Violation(
+        *dependent,
+        names,
+        state=margin.state,
+        singular_value=margin.relative,
+        least=margin.least,
+    )

@@ -33,6 +33,12 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
             f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
         )
     check_choice(name, given["compiled"])
+    for key in ("least_margin", "negligible"):
+        if not 1e-15 <= given[key] < 1.0:
+            raise ModelError(
+                f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
+                f"{given[key]:g}"
+            )
     state = ca.vec(state)
     parameters = _parameters(name, given["parameters"])
     for contact in given["contacts"]:

@@ -24,6 +24,7 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +85,11 @@ class DaeSystem:
         compiled: Whether functions of the system that are called often become machine code, where a
             C compiler is found: True, from the first call on; False; or "auto", what the cache has,
             and else what was called so often that compiling it pays. See `trace.compiled`.
+        least_margin: A(x) and B(x) count as singular where their smallest singular value, rows and
+            columns scaled to about length one, is below this.
+        negligible: What is below this, relative to the other entries of its row or column, counts
+            as zero where relative degrees are decided: 1e-17 in place of a typed 0. What is smaller
+            and meant needs other units, or a smaller number here.
         contacts: Those constraint inputs that can only push, where friction acts on one of them:
             the motion makes sense only where they are sure to push, see `dae.contacts`.
 
@@ -116,6 +122,8 @@ class DaeSystem:
     free_control: ca.SX = None
     compiled: Compiled = "auto"
     contacts: tuple[Contact, ...] = ()
+    least_margin: float = SINGULAR
+    negligible: float = NEGLIGIBLE
 
     def __post_init__(self) -> None:
         given = {item.name: getattr(self, item.name) for item in fields(self)}
