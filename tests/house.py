@@ -47,6 +47,7 @@ PAPER = (
     "sharing",
     "system",
     "layout",
+    "kinetic_metric",
     "manifold",
     "derivatives",
     "elimination",

@@ -1,6 +1,6 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from math import isfinite
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
+from drake_dae.dae.kinetic_metric import KineticMetric
 from drake_dae.dae.layout import Indices, Layout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -23,6 +24,7 @@ from drake_dae.trace.newton import (
     newton,
     norm,
     shortest_steps,
+    steps_along,
 )
 from drake_dae.trace.round_off import positive
 
@@ -77,7 +79,7 @@ class Manifold:
         layout = Layout(tuple(len(chain) for chain in chains))
         self.residual_signals = layout.chain_signals(system.constraint_output_signals)
         gradient = ca.jacobian(residual, system.state)
-        self._levels = _levels(layout, gradient)
+        self._layout, self._levels = layout, _levels(layout, gradient)
         self.residual_function = system.trace("manifold", {"residual": residual})
         self._gradient = system.trace("manifold gradient", {"gradient": gradient}, often=False)
         self._scale = system.scale
@@ -284,20 +286,55 @@ class Manifold:
 
         The constraints are met first, by the states that they depend on; then their derivatives, by
         the states that are new in them, and so on: positions first, then velocities, so that no
-        velocity moves a position. Where that leads nowhere it is `project`, whose arguments, result
-        and exceptions it has.
+        velocity moves a position. Where constraint forces do no work, as in a mechanism, that takes
+        the least kinetic energy, see `KineticMetric`; else steps are shortest relative to the scale
+        of the states. Where that leads nowhere it is `project`, whose arguments, result and
+        exceptions it has.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
+        for found in self._settled(start, p):
+            if found is not None:
+                return self.project(found, p)
+        return self.project(start, p)
+
+    def _settled(self, start: FloatArray, p: FloatArray) -> Iterator[FloatArray | None]:
+        """A start settled in the metric of kinetic energy, where it is known, and in the plain one.
+
+        None where that leads nowhere.
+        """
+        kinetic = self._kinetic
+        if kinetic.does_no_work(start, p, self.gradients(start, p)):
+            found = start.copy()
+            moves = (
+                self._settle_level(found, rows, columns, p, depth)
+                for rows, columns, depth in kinetic.levels
+            )
+            yield found if all(moves) else None
         found = start.copy()
-        for rows, columns in self._levels:
-            if not self._settle_level(found, rows, columns, p):
-                return self.project(start, p)
-        return self.project(found, p)
+        moves = (self._settle_level(found, *level, p) for level in self._levels)
+        yield found if all(moves) else None
+
+    @cached_property
+    def _kinetic(self) -> KineticMetric:
+        return KineticMetric(self.system, self._layout)
 
     def _settle_level(
-        self, state: FloatArray, rows: Indices, columns: Indices, parameters: FloatArray
+        self,
+        state: FloatArray,
+        rows: Indices,
+        columns: Indices,
+        parameters: FloatArray,
+        depth: int | None = None,
     ) -> bool:
-        """Moves some states so that some rows of the residual vanish, and says whether they do."""
+        """Moves some states so that some rows of the residual vanish, and says whether they do.
+
+        Args:
+            state: The state, which is changed.
+            rows, columns: The rows and the states.
+            parameters: Values of all parameters.
+            depth: How many derivatives are left until the constraint inputs act, for steps in the
+                metric of kinetic energy; None for those of least norm.
+        """
         scale = self._scale[columns]
 
         def filled(z: FloatArray) -> FloatArray:
@@ -305,11 +342,16 @@ class Manifold:
             x[columns] = scale * z
             return x
 
+        def left(z: FloatArray) -> FloatArray:
+            return self.residual_function(filled(z), parameters)[0][rows]
+
         def linearize(z: FloatArray) -> Linearization | None:
-            gradients = self.gradients(filled(z), parameters)[np.ix_(rows, columns)]
-            return shortest_steps(
-                gradients * scale, lambda z: self.residual_function(filled(z), parameters)[0][rows]
-            )
+            x = filled(z)
+            gradients = self.gradients(x, parameters)[np.ix_(rows, columns)]
+            if depth is None:
+                return shortest_steps(gradients * scale, left)
+            directions = self._kinetic.directions(x, parameters, gradients, depth)
+            return steps_along(gradients * scale, directions / scale[:, None], left)
 
         z, converged = newton(state[columns] / scale, linearize)
         state[columns] = scale * z

@@ -149,6 +149,35 @@ def shortest_steps(
     )
 
 
+def steps_along(
+    gradients: FloatArray,
+    directions: FloatArray,
+    residual: Callable[[FloatArray], FloatArray],
+) -> Linearization | None:
+    """The steps D mu with C D mu = -residual(x); none where that leaves mu open.
+
+    Args:
+        gradients: C, shape (k, n).
+        directions: D, shape (n, k), such that C D is symmetric and positive definite.
+        residual: A function x -> residual of shape (k,).
+    """
+    matrix = gradients @ directions
+    size = np.sqrt(np.abs(np.diag(matrix)))
+    if not (np.all(np.isfinite(matrix)) and np.all(size > 0.0)):
+        return None
+    try:
+        factors = scipy.linalg.cho_factor(matrix / size / size[:, None])
+    except np.linalg.LinAlgError:
+        return None
+    if np.min(np.diag(factors[0])) <= DEPENDENT:
+        return None
+    along = directions / size
+    return Linearization(
+        lambda x: -along @ scipy.linalg.cho_solve(factors, residual(x) / size, check_finite=False),
+        True,
+    )
+
+
 def are_dependent(gradients: FloatArray) -> bool:
     """Whether rows, whose lengths do not matter, are linearly dependent."""
     if not np.all(np.isfinite(gradients)):

@@ -139,10 +139,21 @@ def run(level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_the_published_solution(level):
     """Ten digits of positions and six of forces, as many as the printed start determines.
 
-    Half the step changes the positions by 2e-11. Where positions are restricted, the first of them
-    move by the 2e-10 m that the printed digits leave, and not by what velocities lack.
+    Half the step changes the positions by 2e-11. Where positions are restricted, they move by the
+    2e-10 m that the printed digits leave, and not by what velocities lack: the block by most of it,
+    the rod that is heavier by a fifth, since that takes the least kinetic energy. Where velocities
+    are restricted no position moves, and forces have the 2e-10 m that positions are off.
     """
     state, forces, moved = run(level)
-    assert np.max(moved[:7]) < (2.1e-10 if level == 0 else 1e-9)
+    if level == 0:
+        # Two parts of one correction, as their masses: M_3, and 15/8 of the rod's modal mass.
+        rod = 15 / 8 * DENSITY * WIDTH**2 * L2
+        assert moved[6] / moved[2] == pytest.approx(M3 / rod, rel=1e-3)
+        assert moved[2] + moved[6] == pytest.approx(0.450016933 - L1 - L2 - START[6], rel=1e-3)
+    else:
+        assert not moved[:7].any()
+    # The rotation of the rod is printed with nine digits.
+    assert np.max(moved[7:]) < 4e-8
+    np.testing.assert_allclose(state[9:], END[9:], rtol=0, atol=(2e-7, 1e-6)[level])
     np.testing.assert_allclose(state[:7], END[:7], rtol=0, atol=2e-10)
-    np.testing.assert_allclose(forces, FORCES, rtol=5e-6)
+    np.testing.assert_allclose(forces, FORCES, rtol=(5e-6, 1e-5)[level])

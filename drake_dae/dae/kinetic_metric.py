@@ -1,0 +1,130 @@
+"""A projection onto N* in the metric of kinetic energy, where constraint forces do no work.
+
+A mechanical system E x' = f + g v has constraint forces along the gradients of its constraints. An
+impulse of them changes the velocities that are in the way and no others: dv = M^-1 J^T mu, the
+change of least kinetic energy. Positions move likewise, dq = N M^-1 N^T J_q^T mu with q' = N v. So
+what is heavy stays, in any units, and what no constraint force reaches stays as it is.
+"""
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.layout import Indices, Layout
+from drake_dae.dae.system import DaeSystem
+from drake_dae.trace.factorization import nonzeros
+
+ALONG = 1e-6
+"""Constraint forces do no work if they are along the gradients to this, as the sine of an angle."""
+
+
+class KineticMetric:
+    """Directions in which states move onto N* with least kinetic energy.
+
+    Args:
+        system: The system (1)-(3).
+        layout: The degrees of the constraints.
+    """
+
+    def __init__(self, system: DaeSystem, layout: Layout) -> None:
+        self._system = system
+        orders, degrees = layout.orders, np.array(layout.degrees, dtype=int)
+        owners = np.repeat(np.arange(degrees.size), degrees)
+        # How many derivatives of a row are left until the constraint inputs act.
+        left = degrees[owners] - 1 - orders if degrees.size else np.zeros(0, dtype=int)
+        groups = _groups(system, int(max(degrees, default=0)))
+        self.levels: list[tuple[Indices, Indices, int]] = [
+            (np.flatnonzero(left == depth), groups[depth], depth)
+            for depth in reversed(range(len(groups)))
+            if np.any(left == depth)
+        ]
+        self._last = np.flatnonzero(left == 0)
+        self.is_known = len(groups) == int(max(degrees, default=0)) and bool(groups)
+        if not self.is_known:
+            return
+        moving = groups[0].tolist()
+        forces = system.rubbing.without_friction(system.g)[moving, :]
+        outputs = {
+            "mass": ca.densify(system.mass_matrix[moving, moving]),
+            "forces": ca.densify(forces),
+        }
+        for depth in range(1, len(groups)):
+            rates, by = system.f[groups[depth].tolist()], system.state[groups[depth - 1].tolist()]
+            outputs[f"rate{depth}"] = ca.densify(ca.jacobian(rates, by))
+        self._groups = groups
+        self._function = system.trace("kinetic metric", outputs, often=False)
+
+    def does_no_work(
+        self, state: FloatArray, parameters: FloatArray, gradients: FloatArray
+    ) -> bool:
+        """Whether all forces of constraints are along their gradients at a state.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters.
+            gradients: C, shape (sum r_i, n).
+        """
+        if not self.is_known:
+            return False
+        forces = self._values(state, parameters)[1]
+        across = gradients[np.ix_(self._last, self._groups[0])].T
+        lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
+        if not all(np.all(np.isfinite(one)) and np.all(one > 0.0) for one in lengths):
+            return False
+        basis = scipy.linalg.orth(across / lengths[0])
+        unit = forces / lengths[1]
+        return bool(np.max(np.abs(unit - basis @ (basis.T @ unit))) <= ALONG)
+
+    def directions(
+        self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int
+    ) -> FloatArray:
+        """W^-1 C^T of some rows of C, where W is the metric of the states of a level.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters.
+            gradient: The rows, by the states of the level, shape (k, c).
+            depth: How many derivatives of the rows are left until the constraint inputs act.
+        """
+        mass, _, *rates = self._values(state, parameters)
+        moved: FloatArray = gradient.T
+        for rate in reversed(rates[:depth]):
+            moved = rate.T @ moved
+        moved = np.asarray(np.linalg.solve(mass, moved), dtype=np.float64)
+        for rate in rates[:depth]:
+            moved = rate @ moved
+        return moved
+
+    def _values(self, state: FloatArray, parameters: FloatArray) -> list[FloatArray]:
+        sizes = [group.size for group in self._groups]
+        shapes = [(sizes[0], sizes[0]), (sizes[0], self._system.num_constraints)]
+        shapes += list(zip(sizes[1:], sizes[:-1], strict=True))
+        values = self._function.evaluate(state, parameters)
+        return [value.copy().reshape(shape) for value, shape in zip(values, shapes, strict=True)]
+
+
+def _groups(system: DaeSystem, count: int) -> list[Indices]:
+    """The states whose rates hold constraint inputs, those whose rates hold these, and so on."""
+    mass = nonzeros(system.mass_matrix.sparsity())
+    own = nonzeros(system.g.sparsity()).any(axis=1)
+    while True:
+        both = own | mass[:, own].any(axis=1)
+        if np.array_equal(both, own):
+            break
+        own = both
+    plain = np.array(
+        [
+            mass[i].sum() == 1 and bool(system.mass_matrix[i, i].is_one())
+            for i in range(system.num_states)
+        ]
+    )
+    uses = nonzeros(ca.jacobian_sparsity(system.f, system.state))
+    groups, taken = [np.flatnonzero(own)], own.copy()
+    while len(groups) < count:
+        following = uses[:, groups[-1]].any(axis=1) & ~taken & plain
+        if not following.any():
+            break
+        groups.append(np.flatnonzero(following))
+        taken |= following
+    return groups if own.any() else []

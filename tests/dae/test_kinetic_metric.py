@@ -1,0 +1,104 @@
+"""A start is made consistent with the least kinetic energy, whatever the units."""
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+from actuated import actuated
+from arms import arm, consistent_states, numbers
+
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.structure.constrained import find_constraint_structure
+from drake_dae.dae.system import DaeSystem
+
+
+def least(mass: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """The dv with J dv = -residual and the least dv^T M dv, by the equations of Lagrange."""
+    n, m = mass.shape[0], jacobian.shape[0]
+    whole = np.block([[mass, jacobian.T], [jacobian, np.zeros((m, m))]])
+    return scipy.linalg.solve(whole, np.concatenate([np.zeros(n), -residual]))[:n]
+
+
+def rod_between_masses(masses=(1.0, 1e4), lengths=(1.0, 1.0)) -> Manifold:
+    """Two bodies in the plane at a fixed distance; lengths are the units of their coordinates."""
+    x = ca.SX.sym("x", 8)
+    q, v = x[:4], x[4:]
+    first, second = lengths[0] * q[:2], lengths[1] * q[2:]
+    k = ca.sumsqr(first - second) - 1.0
+    units = np.repeat(lengths, 2)
+    inertia = np.diag(np.repeat(masses, 2) * units**2)
+    system = DaeSystem(
+        state=x,
+        mass_matrix=ca.diagcat(ca.SX.eye(4), ca.SX(inertia)),
+        f=ca.vertcat(v, ca.SX(4, 1)),
+        g=ca.vertcat(ca.SX(4, 1), ca.jacobian(k, q).T),
+        h=ca.SX(8, 0),
+        k=k,
+        l=ca.SX(0, 1),
+        m=ca.SX(0, 1),
+        nominal_state=np.array([0.0, 0.0, 0.6, 0.8, 1.0, 2.0, 1.0, 2.0]) / np.tile(units, 2),
+    )
+    return find_constraint_structure(system).manifold
+
+
+@pytest.mark.parametrize("lengths", [(1.0, 1.0), (1e-3, 1.0), (1.0, 1e3), (1e-6, 1e2)])
+def test_what_is_heavy_stays_in_any_units(lengths):
+    """A rod that is too long by 2e-6 m: of it the body of 1 kg moves 1e4 times as far."""
+    manifold = rod_between_masses(lengths=lengths)
+    units = np.tile(np.repeat(lengths, 2), 2)
+    along = np.array([0.6, 0.8])
+    start = np.array(
+        [0.0, 0.0, *((1.0 + 2e-6) * along), 1.0, 2.0, *(np.array([1, 2]) + 3e-6 * along)]
+    )
+    found = units * manifold.settle(start / units)
+    share = 1e4 / (1.0 + 1e4)
+    moved = np.array([*(2e-6 * share * along), *(-2e-6 * (1.0 - share) * along)])
+    np.testing.assert_allclose(found[:4] - start[:4], moved, rtol=0, atol=1e-11)
+    turned = np.array([*(3e-6 * share * along), *(-3e-6 * (1.0 - share) * along)])
+    np.testing.assert_allclose(found[4:] - start[4:], turned, rtol=0, atol=1e-11)
+    assert manifold.is_consistent(found / units)
+    np.testing.assert_allclose(manifold.residual(found / units), 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+def test_a_robot_is_moved_as_multibody_plant_says(name):
+    """Positions by M^-1 J^T and velocities likewise, to the square of what they are off."""
+    structure, random = arm(name).structure, np.random.default_rng(0)
+    size = structure.system.num_states // 2
+    for state in consistent_states(name, 3):
+        truth = numbers(name, state[:size], state[size:])
+        mass, J = truth.mass, truth.constraint_jacobian
+        off = 1e-5 * random.standard_normal(size)
+        moved = structure.manifold.settle(state + np.concatenate([off, np.zeros(size)]))
+        wanted = least(mass, J, J @ off)
+        found = moved[:size] - state[:size] - off
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
+        # Velocities alone: exactly, as the constraint is linear in them.
+        moved = structure.manifold.settle(state + np.concatenate([np.zeros(size), off]))
+        np.testing.assert_allclose(moved[:size], state[:size], rtol=0, atol=2e-15)
+        found = moved[size:] - state[size:] - off
+        np.testing.assert_allclose(found, least(mass, J, J @ off), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["flexible", "flexible motor", "hydraulic"])
+def test_what_no_constraint_force_reaches_stays_as_it_is(kind):
+    """Motors behind springs, currents and pressures are not moved by a velocity that is off."""
+    structure = actuated("two_link", kind).structure
+    state = structure.states[1]
+    names = [signal.name for signal in structure.system.state_signals]
+    reached = find_reached(structure.system)
+    start = state.copy()
+    start[reached] += 1e-6
+    found = structure.manifold.settle(start)
+    others = np.setdiff1d(np.arange(len(names)), reached)
+    positions = [i for i in others if abs(found[i] - state[i]) > 0.0]
+    # What is left are positions of links: the velocities alone were off, so they stay too.
+    assert not positions
+    assert structure.manifold.is_consistent(found)
+
+
+def find_reached(system: DaeSystem) -> np.ndarray:
+    """The states that constraint inputs accelerate: velocities of links."""
+    g = ca.Function("g", [system.state, system.parameter_symbol], [system.explicit.g])
+    values = np.array(g(system.nominal_state, system.parameter_values))
+    return np.flatnonzero(np.abs(values).max(axis=1) > 1e-9 * np.abs(values).max())
