@@ -10,7 +10,7 @@ from drake_dae.analysis.contact_text import contact_margin_as_dict, contact_marg
 from drake_dae.analysis.findings import Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.margins import SINGULAR, Margin
+from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
@@ -134,7 +134,7 @@ def parts_of(findings: Findings) -> list[Part]:
         parts.append(
             [
                 "margin: smallest singular value after rows and columns are scaled to about "
-                f"length one; below {SINGULAR:.0e} it counts as singular."
+                f"length one; below {findings.system.least_margin:.0e} it counts as singular."
             ]
         )
     parts += _places(findings)

@@ -65,6 +65,7 @@ def eliminate_numbers(
     constraint_gradient: FloatArray,
     constraint_matrix: FloatArray,
     scale: FloatArray,
+    negligible: float,
 ) -> tuple[Sized, Sized]:
     """h* (10) and n* (12) at one state, where what is zero but for round-off is zero.
 
@@ -76,14 +77,15 @@ def eliminate_numbers(
         constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
         constraint_matrix: A, shape (m, m).
         scale: How large each state is, shape (n,).
+        negligible: `DaeSystem.negligible`.
     """
     h, size = fields["h"], np.abs(fields["h"])
-    by_control = multiply(constraint_gradient, (h, size), scale)
+    by_control = multiply(constraint_gradient, (h, size), scale, negligible)
     # Units of the constraints' derivatives, and of the constraint inputs.
     rows, columns = equilibration(np.abs(constraint_matrix))
     scaled = np.linalg.inv(constraint_matrix / rows[:, None] / columns)
     inverse = scaled / columns[:, None] / rows
-    beta = multiply(-inverse, by_control, rows)
-    added, added_size = multiply(fields["g"], beta, 1.0 / columns)
+    beta = multiply(-inverse, by_control, rows, negligible)
+    added, added_size = multiply(fields["g"], beta, 1.0 / columns, negligible)
     h_star = without_round_off(h + added, size + added_size)
-    return h_star, multiply(fields["m"], beta, 1.0 / columns)
+    return h_star, multiply(fields["m"], beta, 1.0 / columns, negligible)

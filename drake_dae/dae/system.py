@@ -23,6 +23,7 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled, check_choice
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +84,11 @@ class DaeSystem:
         compiled: Whether functions of the system that are called often become machine code, where a
             C compiler is found: True, from the first call on; False; or "auto", what the cache has,
             and else what was called so often that compiling it pays. See `trace.compiled`.
+        least_margin: A(x) and B(x) count as singular where their smallest singular value, rows and
+            columns scaled to about length one, is below this.
+        negligible: What is below this, relative to the other entries of its row or column, counts
+            as zero where relative degrees are decided: 1e-17 in place of a typed 0. What is smaller
+            and meant needs other units, or a smaller number here.
         contacts: Those constraint inputs that can only push, where friction acts on one of them:
             the motion makes sense only where they are sure to push, see `dae.contacts`.
 
@@ -115,6 +121,8 @@ class DaeSystem:
     free_control: ca.SX = None
     compiled: Compiled = "auto"
     contacts: tuple[Contact, ...] = ()
+    least_margin: float = SINGULAR
+    negligible: float = NEGLIGIBLE
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -125,6 +133,12 @@ class DaeSystem:
                 f"for example casadi.SX.sym('x', 4); got {type(self.state).__name__}"
             )
         check_choice(self.name, self.compiled)
+        for key in ("least_margin", "negligible"):
+            if not 1e-15 <= getattr(self, key) < 1.0:
+                raise ModelError(
+                    f"{self.name}: {key} must be from 1e-15, which is round-off, to below 1, got "
+                    f"{getattr(self, key):g}"
+                )
         self._put("state", ca.vec(self.state))
         given = self.parameters if isinstance(self.parameters, (list, tuple)) else [None]
         if not all(isinstance(parameter, Parameter) for parameter in given):

@@ -8,26 +8,32 @@ ZERO = 1e-9
 """A sum of products below this, relative to the sizes of its terms, is zero."""
 
 
-ROUND_OFF = 1e-11
+NEGLIGIBLE = 1e-11
 """A factor below this, relative to the other factors in its row or column, is zero."""
+
+SINGULAR = 1e-6
+"""A matrix with a singular value below this, its rows and columns scaled, is singular."""
 
 
 Sized = tuple[FloatArray, FloatArray]
 """A matrix without its round-off, and how large its entries were before terms cancelled."""
 
 
-def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:
+def multiply(
+    left: FloatArray, right: Sized, scale: FloatArray, negligible: float = NEGLIGIBLE
+) -> Sized:
     """A product in which entries that are nothing but round-off are zero.
 
     Args:
         left: The left factor, shape (a, k).
         right: The right factor, shape (k, b).
         scale: Units in which the columns of `left` and the rows of `right` compare, shape (k,).
+        negligible: A factor below this, relative to the others in its row or column, is zero.
     """
     value, size = right
     row, column = np.abs(left) * scale, size / scale[:, None]
-    row_noise = ROUND_OFF * np.max(row, axis=1, keepdims=True, initial=0.0)
-    column_noise = ROUND_OFF * np.max(column, axis=0, keepdims=True, initial=0.0)
+    row_noise = negligible * np.max(row, axis=1, keepdims=True, initial=0.0)
+    column_noise = negligible * np.max(column, axis=0, keepdims=True, initial=0.0)
     left = np.where(row > row_noise, left, 0.0)
     kept = np.abs(value) / scale[:, None] > column_noise
     value, size = np.where(kept, value, 0.0), np.where(column > column_noise, size, 0.0)

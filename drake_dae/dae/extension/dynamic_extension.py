@@ -28,7 +28,6 @@ from drake_dae.dae.extension.extension import (
 )
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.margins import SINGULAR
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import eliminated_at
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
@@ -198,11 +197,12 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     column_size = positive((size / row_size[:, None]).max(axis=0))
     scaled = matrices / row_size[:, None] / column_size
     left, values, _ = np.linalg.svd(scaled)
-    ranks = (values > SINGULAR).sum(axis=1)
+    ranks = (values > system.least_margin).sum(axis=1)
     rank, p = int(ranks.max()), system.num_controls
     if rank == p:
         return None
-    rows = [i for i in range(p) if any(np.abs(u[i, rank:]).max() > SINGULAR for u in left)]
+    least = system.least_margin
+    rows = [i for i in range(p) if any(np.abs(u[i, rank:]).max() > least for u in left)]
     names = ", ".join(system.output_signals[i].name for i in rows)
     if ranks.min() < rank:
         state = samples.states[int(ranks.argmin())]
@@ -247,13 +247,14 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
 def _control_matrices(structure: Structure, samples: Samples) -> FloatArray:
     """B(x) without its round-off, shape (samples, p, p)."""
     elimination, state = structure.elimination, structure.system.state
+    negligible = structure.system.negligible
     h_star, n_star = eliminated_at(samples, elimination)
     dynamic = [i for i, degree in enumerate(structure.output_degrees) if degree]
     last = ca.vertcat(ca.SX(0, 1), *[structure.output_chains[i][-1] for i in dynamic])
     gradients = samples.values(gradient=ca.jacobian(last, state))
     result = np.array([value for value, _ in n_star])
     for matrix, (gradient,), field in zip(result, gradients, h_star, strict=True):
-        matrix[dynamic] = multiply(gradient, field, samples.scale)[0]
+        matrix[dynamic] = multiply(gradient, field, samples.scale, negligible)[0]
     return result
 
 
@@ -267,8 +268,12 @@ def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
         last = explicit.k[i]
         for _ in range(system.num_states):
             gradient = samples.values(gradient=ca.jacobian(last, x))[0][0]
-            by_force = multiply(gradient, samples.field("g")[0], samples.scale)[0]
-            by_control = multiply(gradient, samples.field("h")[0], samples.scale)[0]
+            by_force = multiply(gradient, samples.field("g")[0], samples.scale, system.negligible)[
+                0
+            ]
+            by_control = multiply(
+                gradient, samples.field("h")[0], samples.scale, system.negligible
+            )[0]
             if by_force.any():
                 break
             if by_control.any():

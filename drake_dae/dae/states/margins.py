@@ -11,10 +11,7 @@ from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibration, smallest_singular_value
-
-SINGULAR = 1e-6
-"""A matrix with a singular value below this, its rows and columns scaled, is singular."""
+from drake_dae.trace.round_off import SINGULAR, equilibration, smallest_singular_value
 
 
 @dataclass(frozen=True)
@@ -27,17 +24,19 @@ class Margin:
             that are common to all states, so that units do not matter.
         state: Where `relative` is smallest, shape (n,).
         vanishing_row: The row that is zero there; None if none is.
+        least: Below this `relative` counts as singular: `DaeSystem.least_margin`.
     """
 
     singular_value: float
     relative: float
     state: FloatArray
     vanishing_row: int | None = None
+    least: float = SINGULAR
 
     @property
     def is_singular(self) -> bool:
         """Whether the rank is lost at `state`."""
-        return self.relative < SINGULAR
+        return self.relative < self.least
 
 
 def find_margin(
@@ -66,18 +65,21 @@ def find_margin(
         candidates += [box.descend(scaled.slope, start) for start in starts]
     state = min(candidates, key=scaled.distance)
     length = np.linalg.norm(scaled(state), axis=1)
+    least = samples.system.least_margin
     return Margin(
         singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
         relative=scaled.distance(state),
         state=state,
-        vanishing_row=int(np.argmin(length)) if length.min() < SINGULAR else None,
+        vanishing_row=int(np.argmin(length)) if length.min() < least else None,
+        least=least,
     )
 
 
 def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = None) -> bool:
     """Whether a square matrix is regular at every sampled state itself."""
     scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
-    return all(scaled.distance(state) >= SINGULAR for state in samples.states)
+    least = samples.system.least_margin
+    return all(scaled.distance(state) >= least for state in samples.states)
 
 
 def surroundings(samples: Samples) -> Region:

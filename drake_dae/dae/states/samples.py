@@ -105,7 +105,7 @@ class Samples:
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return np.array(
             [
-                multiply(gradient, value, self.scale)[0]
+                multiply(gradient, value, self.scale, self.system.negligible)[0]
                 for (gradient,), value in zip(gradients, field, strict=True)
             ]
         )

@@ -74,6 +74,7 @@ class Violation:
             everywhere.
         singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
             if the rank is lost.
+        least: Below this it counts as lost, `DaeSystem.least_margin`.
         combinations: The constraints that follow from others there, if the rank of A(x) is lost.
         deciding: The parameters and signals that decide, where it is so at their defaults alone.
     """
@@ -86,6 +87,7 @@ class Violation:
     singular_value: float | None = None
     combinations: tuple[Combination, ...] = ()
     deciding: Deciding | None = None
+    least: float | None = None
 
     def __str__(self) -> str:
         text = f"Assumption ({self.assumption}): {self._found()}. {self.cause.value}"
@@ -106,6 +108,9 @@ class Violation:
         names = ", ".join(f"'{name}'" for name in self.names)
         where = "" if self.state is None else f" at x = {show(self.state)}"
         value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
+        scaled = "rows and columns scaled"
+        if self.least is not None:
+            scaled += f"; below the system's least_margin of {self.least:.0e} it is lost"
         rows = "; ".join(map(str, self.combinations))
         match self.cause:
             case Cause.COUNT:
@@ -152,7 +157,7 @@ class Violation:
                     what = "rows of A(x)"
                 found = [f"{what}: {rows}"] if rows else []
                 if value:
-                    found.insert(0, f"smallest singular value {value} (rows and columns scaled)")
+                    found.insert(0, f"smallest singular value {value} ({scaled})")
                 return f"A(x) loses rank{where}: {'; '.join(found)}"
             case Cause.NUMBERS:
                 kind = "output" if self.assumption == 4 else "constraint"
@@ -173,7 +178,7 @@ class Violation:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "
                     f"{', '.join(self.names)} cannot be steered independently; smallest singular "
-                    f"value {value} (rows and columns scaled)"
+                    f"value {value} ({scaled})"
                 )
 
 
@@ -201,4 +206,10 @@ def rank_violation(
     if row is not None:
         return Violation(*vanishing, (signals[row].name,), degrees[row], margin.state)
     names = tuple(signal.name for signal in signals)
-    return Violation(*dependent, names, state=margin.state, singular_value=margin.relative)
+    return Violation(
+        *dependent,
+        names,
+        state=margin.state,
+        singular_value=margin.relative,
+        least=margin.least,
+    )

@@ -12,7 +12,7 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.family import Family
-from drake_dae.dae.states.margins import SINGULAR, Margin, find_margin
+from drake_dae.dae.states.margins import Margin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
@@ -291,7 +291,7 @@ def with_numbers(
             return 0.0
         rows, columns = equilibration(value)
         scaled = value / rows[:, None] / columns
-        if smallest_singular_value(scaled) <= SINGULAR:
+        if smallest_singular_value(scaled) <= system.least_margin:
             return 0.0
         return float(np.linalg.slogdet(scaled)[0]) if matrix.is_square() else 1.0
 

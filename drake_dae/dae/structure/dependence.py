@@ -9,10 +9,9 @@ import scipy.linalg
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.states.margins import SINGULAR
 from drake_dae.dae.states.samples import Samples
 from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import equilibration
+from drake_dae.trace.round_off import SINGULAR, equilibration
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def find_dependence(
 
     def is_singular(state: FloatArray) -> bool:
         scaled = _scaled(matrices(state)[0])[0]
-        return bool(np.linalg.svd(scaled, compute_uv=False)[-1] < SINGULAR)
+        return bool(np.linalg.svd(scaled, compute_uv=False)[-1] < system.least_margin)
 
     def in_gradients(state: FloatArray) -> bool:
         return are_dependent(manifold.gradients(state) * system.scale)

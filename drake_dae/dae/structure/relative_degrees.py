@@ -209,7 +209,7 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
         gradient=elimination.constraint_gradient, matrix=elimination.constraint_matrix
     )
     pairs = [
-        eliminate_numbers(fields, gradient, matrix, samples.scale)
+        eliminate_numbers(fields, gradient, matrix, samples.scale, samples.system.negligible)
         for fields, (gradient, matrix) in zip(samples.fields, factors, strict=True)
     ]
     return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
@@ -282,7 +282,8 @@ class _Rows:
             else:
                 value = fields_at(system, state, parameters)[key]
                 field = value, np.abs(value)
-            return multiply(trace(state, parameters)[0].reshape(1, -1), field, self._scale)
+            gradients = trace(state, parameters)[0].reshape(1, -1)
+            return multiply(gradients, field, self._scale, system.negligible)
 
         return row
 
@@ -300,7 +301,7 @@ class _Rows:
         fields = fields_at(self._system, state, parameters)
         gradient, matrix = map(as_matrix, self._factors(state, parameters))
         try:
-            return eliminate_numbers(fields, gradient, matrix, self._scale)
+            return eliminate_numbers(fields, gradient, matrix, self._scale, self._system.negligible)
         except np.linalg.LinAlgError:
             h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
             return (h_star, h_star), (n_star * np.nan, n_star)

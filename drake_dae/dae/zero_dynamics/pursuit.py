@@ -262,6 +262,9 @@ class _Pursuit:
         ]
         which = int(np.argmin(shares))
         if shares[which] > LOST:
+            escape = self._escape()
+            if escape:
+                return escape
             return self._stop(
                 Cause.NO_WAY_ON,
                 f"{self._name}: no state that continues the motion is found beyond {when}, x = "
@@ -280,6 +283,26 @@ class _Pursuit:
             return self._stop(Cause.SINGULAR, text, matrix)
         text = f"{self._name}: {Cause.OUT_OF_REACH.value} at {when}: {singular}"
         return self._stop(Cause.OUT_OF_REACH, text, matrix)
+
+    def _escape(self) -> _MotionEnd | None:
+        """The end where a state grows without bound within a finite time; None where none does.
+
+        At such an end a rate is as large as if the state had grown by `GROWN` in the time so far,
+        though the state itself may still be small, as that of x' = exp(x).
+        """
+        system, last = self._pinned.system, self._last
+        elapsed = max(self._time - self._times[0], SHORTEST * (self._times[-1] - self._times[0]))
+        size = np.maximum(1.0, np.abs(last.state) / system.scale)
+        rates = np.abs(last.rate) / system.scale * elapsed / size
+        worst = int(np.argmax(rates))
+        if not rates[worst] > GROWN:
+            return None
+        return self._stop(
+            Cause.UNBOUNDED,
+            f"{self._name}: {Cause.UNBOUNDED.value}, within a finite time: "
+            f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g} at t = "
+            f"{self._time:.6g} s",
+        )
 
     def _stop(self, cause: Cause, text: str, matrix: str = "") -> _MotionEnd:
         """The end of the motion at the last point."""

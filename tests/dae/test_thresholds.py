@@ -1,0 +1,135 @@
+"""What counts as zero or as singular can be seen and set, and a motion's end has its cause."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from drake_dae import analyze
+from drake_dae.analysis.findings import Finding
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.errors import AssumptionError, ModelError
+
+
+def nearly_singular(off, **more):
+    """z' = [[1, 1], [1, 1 + off]] u: the smallest singular value is off / 8^0.5, rows scaled."""
+    return DaeSystem.from_functions(
+        2,
+        f=lambda x: [-x[0], -x[1]],
+        h=lambda x: [[1, 1], [1, 1 + off]],
+        l=lambda x: [x[0], x[1]],
+        **more,
+    )
+
+
+@pytest.mark.parametrize("off", [1e-7, 1e-8, 1e-10])
+def test_how_near_to_singular_is_singular_is_said_and_can_be_set(off):
+    with pytest.raises(
+        AssumptionError, match=r"below the system's least_margin of 1e-06 it is lost"
+    ):
+        find_structure(nearly_singular(off))
+    report = analyze(nearly_singular(off))
+    assert report.assumptions[4].finding is Finding.VIOLATED
+    allowed = nearly_singular(off, least_margin=0.1 * off)
+    assert find_structure(allowed).control_margin.relative == pytest.approx(off / 8**0.5, rel=0.01)
+    assert analyze(allowed).assumptions[4].finding is Finding.SATISFIED
+    assert f"below {0.1 * off:.0e} it counts as singular" in " ".join(str(analyze(allowed)).split())
+    with pytest.raises(AssumptionError, match="least_margin"):
+        find_structure(nearly_singular(0.1, least_margin=0.3))
+
+
+def nearly_apart(off, **more):
+    """Two constraints in nearly one direction."""
+    return DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], 0, 0],
+        g=lambda x: [[0, 0], [0, 0], [1, 1], [0, off]],
+        h=lambda x: [0, 0, 0, 0],
+        k=lambda x: [x[0], x[0] + off * x[1]],
+        l=lambda x: [],
+        m=lambda x: ca.SX(0, 2),
+        **more,
+    )
+
+
+def test_so_it_is_for_constraints():
+    from drake_dae.dae.structure.constrained import find_constraint_structure
+
+    with pytest.raises(AssumptionError, match="least_margin"):
+        find_constraint_structure(nearly_apart(1e-4))
+    allowed = nearly_apart(1e-4, least_margin=1e-10)
+    assert find_constraint_structure(allowed).constraint_degrees == (2, 2)
+
+
+@pytest.mark.parametrize("small", [1e-12, 1e-13, -3e-12])
+def test_how_small_is_nothing_can_be_set(small):
+    """A control that acts on z itself by 1e-12 beside 1: mu = 1 if that is meant, and 2 if not."""
+
+    def system(**more):
+        return DaeSystem.from_functions(
+            2,
+            f=lambda x: [x[1], 0],
+            h=lambda x: [small, 1],
+            l=lambda x: x[0],
+            state_scale=[1.0, 1.0],
+            **more,
+        )
+
+    assert find_structure(system()).output_degrees == (2,)
+    assert find_structure(system(negligible=1e-14)).output_degrees == (1,)
+
+
+@pytest.mark.parametrize("key", ["least_margin", "negligible"])
+@pytest.mark.parametrize("value", [0.0, -1e-6, 1e-20, 1.0, float("nan")])
+def test_thresholds_that_make_no_sense(key, value):
+    with pytest.raises(ModelError, match=f"{key} must be from 1e-15"):
+        nearly_singular(0.1, **{key: value})
+
+
+ESCAPES = {
+    "square": (lambda a: a**2, 1.0, 1.0),
+    "exponential": (lambda a: ca.exp(a), 0.0, 1.0),
+    "fifth power": (lambda a: a**5, 1.0, 0.25),
+    "tangent": (lambda a: 1 + a**2, 0.0, np.pi / 2),
+    "to the other side": (lambda a: -ca.exp(-3 * a), 0.0, 1 / 3),
+}
+"""A rate, where the motion begins, and when it is infinite: closed forms."""
+
+
+def beside(rate, start):
+    return DaeSystem.from_functions(
+        ["z", "s"],
+        f=lambda x: [0, rate(x[1])],
+        h=lambda x: [1, 0],
+        l=lambda x: x[0],
+        nominal_state=[0.0, start],
+    )
+
+
+@pytest.mark.parametrize("name", ESCAPES)
+def test_an_escape_within_a_finite_time_is_no_jump_of_the_reference(name):
+    rate, start, when = ESCAPES[name]
+    dynamics = ZeroDynamics(beside(rate, start))
+
+    def reference(t):
+        return np.array([np.sin(t), np.cos(t)])
+
+    motion = dynamics.motion(reference, np.linspace(0.0, 5.0, 21))
+    assert motion.ending.cause is Cause.UNBOUNDED
+    assert motion.ending.time == pytest.approx(when, rel=1e-5)
+    assert "grow without bound" in str(motion.ending)
+    assert dynamics.stability_along(reference, motion).verdict is Verdict.UNSTABLE
+
+
+@pytest.mark.parametrize(
+    ("rate", "start", "jump"),
+    [(lambda a: -a, 1.0, 1.0), (lambda a: -1 / (2 * a), 1.0, np.inf)],
+)
+def test_a_jump_and_the_end_of_the_domain_are_no_escape(rate, start, jump):
+    dynamics = ZeroDynamics(beside(rate, start))
+    motion = dynamics.motion(lambda t: np.array([float(t > jump), 0.0]), np.linspace(0.0, 5.0, 21))
+    assert motion.ending.cause is Cause.NO_WAY_ON
+    assert motion.ending.time == pytest.approx(1.0, abs=1e-3)
