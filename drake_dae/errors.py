@@ -130,6 +130,10 @@ class AdviceWarning(UserWarning):
     """Gains that are advised outside of the range in which they are right."""
 
 
+class NegligibleWarning(UserWarning):
+    """What is larger than round-off counts as zero where relative degrees are decided."""
+
+
 class MachineCodeWarning(UserWarning):
     """Functions that run interpreted where machine code was asked for, or would have paid."""
 

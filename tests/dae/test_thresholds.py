@@ -11,7 +11,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import Cause
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.errors import AssumptionError, ModelError, NegligibleWarning
 
 
 def nearly_singular(off, **more):
@@ -64,9 +64,9 @@ def test_so_it_is_for_constraints():
     assert find_constraint_structure(allowed).constraint_degrees == (2, 2)
 
 
-@pytest.mark.parametrize("small", [1e-12, 1e-13, -3e-12])
+@pytest.mark.parametrize("small", [1e-12, 3e-13, -3e-12])
 def test_how_small_is_nothing_can_be_set(small):
-    """A control that acts on z itself by 1e-12 beside 1: mu = 1 if that is meant, and 2 if not."""
+    """A control that acts on z' by 1e-12 beside 1: mu = 1 if that is meant, and 2 if not."""
 
     def system(**more):
         return DaeSystem.from_functions(
@@ -78,8 +78,17 @@ def test_how_small_is_nothing_can_be_set(small):
             **more,
         )
 
-    assert find_structure(system()).output_degrees == (2,)
+    with pytest.warns(NegligibleWarning, match=r"derivative 1 of 'z0' is less than 1e-11 of the"):
+        assert find_structure(system()).output_degrees == (2,)
     assert find_structure(system(negligible=1e-14)).output_degrees == (1,)
+
+
+@pytest.mark.parametrize("typed", [1e-17, -2e-16, np.cos(np.pi / 2)])
+def test_a_zero_that_was_rounded_is_one_without_a_word(typed):
+    system = DaeSystem.from_functions(
+        2, f=lambda x: [x[1], 0], h=lambda x: [typed, 1], l=lambda x: x[0], state_scale=[1.0, 1.0]
+    )
+    assert find_structure(system).output_degrees == (2,)
 
 
 @pytest.mark.parametrize("key", ["least_margin", "negligible"])

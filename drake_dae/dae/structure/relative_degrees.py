@@ -5,6 +5,7 @@ its numbers at consistent states, with the default parameters and signals at res
 there must be zero with all other numbers.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -23,13 +24,17 @@ from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.dae.structure.dependence import redundant_constraints
 from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized, multiply
 
-_Row = Callable[[FloatArray, FloatArray], Sized]
-"""A row of numbers at a state, with values of all parameters."""
+_Row = Callable[[FloatArray, FloatArray, float], Sized]
+"""A row of numbers at a state, with values of all parameters, and what is negligible in it."""
+
+DOUBTFUL = 1e-13
+"""What is above this, relative to the others in its row or column, may be meant."""
 
 MANY = 10
 """A function that is zero at this many random states is zero."""
@@ -82,7 +87,7 @@ def constraint_chains(
                 if rows[row, :].nnz():
                     violation = Violation(assumption, Cause.NUMBERS, (names[i],), order)
                     along = numbers.along(chains[i][-1], key)
-                    elsewhere.look(i, violation, numbers.family, along)
+                    elsewhere.look(i, violation, samples, along)
             still.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
@@ -161,7 +166,7 @@ def output_chains(
             else:
                 if not chains[i] and rows[row, :].nnz():
                     violation = Violation(4, Cause.NUMBERS, (names[i],), 0)
-                    elsewhere.look(i, violation, numbers.family, numbers.feedthrough(i))
+                    elsewhere.look(i, violation, samples, numbers.feedthrough(i))
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -179,7 +184,7 @@ def output_chains(
                 continue
             if rows[row, :].nnz():
                 violation = Violation(4, Cause.NUMBERS, (names[i],), len(chains[i]))
-                elsewhere.look(i, violation, numbers.family, numbers.along(chains[i][-1], "h*"))
+                elsewhere.look(i, violation, samples, numbers.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree; worth
             # a look where nothing acts although the structure says that it could.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -221,26 +226,43 @@ class _Elsewhere:
     def __init__(self) -> None:
         self._found: dict[int, Violation] = {}
 
-    def look(self, index: int, violation: Violation, family: Family, row: _Row) -> None:
+    def look(self, index: int, violation: Violation, samples: Samples, row: _Row) -> None:
         """Looks whether a row that is zero with the default parameters is zero with others, too.
 
         Args:
             index: Which constraint or output the row belongs to; the first that is not zero counts.
             violation: What it is if it is not.
-            family: Other parameters, and states that are consistent with them.
+            samples: The states at which it is zero.
             row: The row at a state, with values of all parameters.
+
+        Warns:
+            NegligibleWarning: It counts as zero, and may be meant.
         """
         if index in self._found:
             return
+        system = samples.system
 
         @np.errstate(all="ignore")  # Not finite is no answer.
-        def acts(state: FloatArray, parameters: FloatArray) -> bool:
-            value, size = row(state, parameters)
+        def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
+            value, size = row(state, parameters, negligible)
             return bool(np.any(np.abs(value) > VISIBLE * size))
 
-        deciding = family.deciding(acts)
+        family = Family(samples.manifold, samples.states)
+        deciding = family.deciding(lambda x, p: acts(x, p, system.negligible))
         if deciding:
             self._found[index] = replace(violation, deciding=deciding)
+        defaults = system.parameter_values
+        if system.negligible > DOUBTFUL and all(
+            acts(state, defaults, DOUBTFUL) for state in samples.states
+        ):
+            warnings.warn(
+                f"{system.name}: what acts on derivative {violation.order} of "
+                f"'{violation.names[0]}' is less than {system.negligible:g} of the others, the "
+                "system's `negligible`, and counts as zero. If it is meant, choose other units, or "
+                "set a smaller number",
+                NegligibleWarning,
+                stacklevel=5,
+            )
 
     def refuse(self, index: int) -> None:
         """Refuses a constraint or output whose degree is another one with other parameters.
@@ -266,7 +288,6 @@ class _Rows:
     """
 
     def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
-        self.family = Family(samples.manifold, samples.states)
         self._system, self._scale = samples.system, samples.scale
         self._elimination = elimination
 
@@ -276,32 +297,34 @@ class _Rows:
         gradient = ca.jacobian(function, system.state)
         trace = system.trace("sample", {"gradient": gradient}, often=False)
 
-        def row(state: FloatArray, parameters: FloatArray) -> Sized:
+        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
             if key == "h*":
-                field, _ = self._eliminated(state, parameters)
+                field, _ = self._eliminated(state, parameters, negligible)
             else:
                 value = fields_at(system, state, parameters)[key]
                 field = value, np.abs(value)
             gradients = trace(state, parameters)[0].reshape(1, -1)
-            return multiply(gradients, field, self._scale, system.negligible)
+            return multiply(gradients, field, self._scale, negligible)
 
         return row
 
     def feedthrough(self, index: int) -> _Row:
         """A row of n*."""
 
-        def row(state: FloatArray, parameters: FloatArray) -> Sized:
-            value, size = self._eliminated(state, parameters)[1]
+        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+            value, size = self._eliminated(state, parameters, negligible)[1]
             return value[index], size[index]
 
         return row
 
-    def _eliminated(self, state: FloatArray, parameters: FloatArray) -> tuple[Sized, Sized]:
+    def _eliminated(
+        self, state: FloatArray, parameters: FloatArray, negligible: float
+    ) -> tuple[Sized, Sized]:
         """h* and n*."""
         fields = fields_at(self._system, state, parameters)
         gradient, matrix = map(as_matrix, self._factors(state, parameters))
         try:
-            return eliminate_numbers(fields, gradient, matrix, self._scale, self._system.negligible)
+            return eliminate_numbers(fields, gradient, matrix, self._scale, negligible)
         except np.linalg.LinAlgError:
             h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
             return (h_star, h_star), (n_star * np.nan, n_star)
