@@ -98,7 +98,7 @@ class Violation:
             Cause.NO_CONTROL: "the control acts",
         }
         regular = f"{'A' if self.assumption <= 3 else 'B'}(x) is regular"
-        return f"{text}. This hangs on numbers: {acts.get(self.cause, regular)} {self.deciding}"
+        return f"{text}. This depends on numbers: {acts.get(self.cause, regular)} {self.deciding}"
 
     def error(self) -> AssumptionError:
         """The exception to raise where the violation ends what was asked for."""
@@ -163,8 +163,8 @@ class Violation:
                 kind = "output" if self.assumption == 4 else "constraint"
                 inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
                 return (
-                    f"the relative degree of {kind} {names} hangs on numbers: the {inputs} on its "
-                    f"derivative {self.order} {self.deciding}"
+                    f"the relative degree of {kind} {names} depends on numbers: the {inputs} on "
+                    f"its derivative {self.order} {self.deciding}"
                 )
             case Cause.BOUNDS:
                 assert self.deciding is not None

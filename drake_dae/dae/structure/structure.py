@@ -150,7 +150,10 @@ def find_structure(
     """Finds relative degrees, A(x), B(x) and checks Assumptions (1)-(5).
 
     Whether an expression is zero is decided by its structure first, then by its numbers at
-    consistent states drawn around `system.nominal_state`, with the default parameters.
+    consistent states drawn around `system.nominal_state`, with the default parameters and exogenous
+    signals at rest. What is zero there must be zero with all other numbers that parameters, signals
+    and their derivatives may have, see `Parameter.bounds`: otherwise the degree is another one once
+    they move, and the system is refused.
 
     Args:
         system: The system (1)-(3).

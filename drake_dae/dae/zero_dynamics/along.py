@@ -18,10 +18,13 @@ class StabilityAlong:
 
     Attributes:
         verdict: With a period: exponentially stable if all multipliers are inside the unit circle,
-            unstable if one is outside and the motions that leave are not seen to stay bounded, or
-            bounded; undecided if one is on the circle up to the error. Without: what the
-            exponents and the volume of the disturbances say over the second half of the time.
-        period: The period of the reference in s; None if it has none, 0 if it is constant.
+            unstable if one is outside, bounded if the motions that leave are seen to come to one
+            that repeats itself, undecided if these draw their neighbours to them and are not seen
+            to return, or if a multiplier is on the circle up to the error. Without: what the
+            exponents of the disturbances say over the second half of the time; undecided where
+            these neither grow nor die out.
+        period: The period of the reference in s, or of the motion where that repeats itself after
+            several of them; None if there is none, 0 if the reference is constant.
         multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
             (dimension,); empty if there is no such motion.
         exponents: The rates at which disturbances grow, in 1/s, the largest first: log |multiplier|

@@ -40,8 +40,11 @@ class Stability:
 
     Attributes:
         verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
-            one; undecided if one is on the imaginary axis up to round-off, or if no equilibrium is
-            found. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
+            one; bounded if what leaves an unstable equilibrium is seen to come to a limit cycle,
+            which returns and attracts; undecided if an eigenvalue is on the imaginary axis up to
+            round-off, if no equilibrium is found, or if what leaves it draws its neighbours to it
+            and is not seen to return. Without zero dynamics: stable, or undecided if A(x) or B(x)
+            is singular.
         eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
             (dimension,); empty if no equilibrium is found.
         state: The equilibrium, shape (n,); None if none is needed, or found.
