@@ -69,8 +69,8 @@ def analyze(
     numbers that parameters may have, see `DaeSystem.with_bounds`. A determinant that changes its
     sign between the first state and another one is zero on the way. From the worst of the random
     ones the smallest singular values of A(x) and B(x) are also followed downhill, inside the region
-    or the box that the random states span, so that a singular state between them is found as a rule.
-    There is no proof that none was missed.
+    or the box that the random states span, so that a singular state between them is found as a
+    rule. There is no proof that none was missed.
 
     Where friction acts on contacts that can only push, the margin of A(x) is that without friction,
     and `contact_margin` tells with its sign how far friction is from jamming a contact (Painleve),
