@@ -46,6 +46,11 @@ _REMEDIES = {
         "determined. Take a redundant one out, or write compliances: {}, which has the forces "
         "shared by least squares"
     ),
+    Cause.NUMBERS: (
+        "The structure must be the same for all numbers that the robot may have. Give such a "
+        "number another value where it is written, away from the one at which it changes, or "
+        "choose another output or constraint"
+    ),
     Cause.CONTROL_RANK: (
         "An output may repeat a constraint or another output; choose others. Or the robot is in a "
         "singular configuration there, as an arm is that is stretched: give start.positions from "

@@ -10,7 +10,9 @@ from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.diagrams.keys import violated
 from drake_dae.errors import AssumptionError, ScenarioError
 
-PYTHON = re.compile(r"drop_constraints|share_forces|dynamic_extension|plant\.\w+\(|Finalize")
+PYTHON = re.compile(
+    r"drop_constraints|share_forces|dynamic_extension|with_bounds|plant\.\w+\(|Finalize"
+)
 
 
 @pytest.mark.parametrize("cause", Cause)

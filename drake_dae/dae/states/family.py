@@ -40,6 +40,11 @@ class Deciding:
     values: tuple[float, ...]
     defaults: tuple[float, ...]
 
+    @property
+    def pairs(self) -> tuple[tuple[str, float, float], ...]:
+        """Name, value and default of each."""
+        return tuple(zip(self.names, self.values, self.defaults, strict=True))
+
     def __str__(self) -> str:
         there, here = (
             " and ".join(f"{n} = {v:.3g}" for n, v in zip(self.names, values, strict=True))

@@ -167,13 +167,12 @@ class Violation:
                     f"its derivative {self.order} {self.deciding}"
                 )
             case Cause.BOUNDS:
-                assert self.deciding is not None
                 matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
-                (number,), (bound,) = self.deciding.names, self.deciding.values
-                return (
-                    f"{matrix} loses rank within the bounds of '{number}', between its default "
-                    f"{self.deciding.defaults[0]:.6g} and {bound:.6g}"
-                )
+                found = [
+                    f" of '{name}', between its default {default:.6g} and {bound:.6g}"
+                    for name, bound, default in (self.deciding.pairs if self.deciding else ())
+                ]
+                return f"{matrix} loses rank within the bounds{','.join(found)}"
             case Cause.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "
