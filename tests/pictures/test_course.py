@@ -42,6 +42,7 @@ def test_a_path_around_a_sphere_is_seen_from_a_side(turns):
     assert np.linalg.norm(np.ptp(path.actual, axis=0)) == pytest.approx(width)
 
 
+@pytest.mark.slow
 def test_wheels_turn_in_the_desired_course_as_they_turned():
     """The outputs leave open how far: it is as it was, while the rest of the cart is elsewhere."""
     loop, _, record = run_scenario(scenario("cart_wall", "duration=0.2"))

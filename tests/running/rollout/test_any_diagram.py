@@ -265,6 +265,7 @@ def test_a_run_ends_where_a_block_has_no_value_of_use(is_fixed, is_held, compile
     assert np.isfinite(found.record["sum"]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 @pytest.mark.parametrize(
     ("matrix", "begin"),

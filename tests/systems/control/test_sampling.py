@@ -328,6 +328,7 @@ def test_what_a_sampled_sensor_takes_is_read_a_sample_later(gain, late):
     assert number == pytest.approx(radius, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_force_of_a_sampled_sensor_follows_the_control_of_two_samples_before():
     """e_(k+2) = a e_(k+1) - (1 - a) Gbar e_k of the measured force, in Drake's Simulator.
 
