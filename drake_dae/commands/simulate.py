@@ -33,7 +33,7 @@ from drake_dae.simulation.plots import PATHS, PLOTS, save_plots
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.record import Record
 from drake_dae.simulation.record_writer import RecordWriter
-from drake_dae.simulation.remarks import stop_remarks, surface_remarks
+from drake_dae.simulation.remarks import reference_remarks, stop_remarks, surface_remarks
 from drake_dae.simulation.run_folder import (
     ANIMATION,
     FILES,
@@ -201,6 +201,9 @@ def _write(run: _Run) -> bool:
         text = summary(record, predicted, limits, run.statistics, run.failure, accuracy, reasons)
         if isinstance(loop.plant, RobotBlock):
             text = "\n".join([text, *surface_remarks(loop.plant.model, record)])
+        scenario = run.scenario
+        followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
+        text = "\n".join([text, *reference_remarks(followed)])
         if isinstance(loop, TaskLoop):
             stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, loop.changes(run.context)), *stopped])

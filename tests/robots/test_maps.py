@@ -277,8 +277,14 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
         (lambda f: HeightMap((0.4, 0.3), file=f / "none.npy"), "no file '"),
         (lambda f: HeightMap((0.4, 0.3), file=f / "a\0.npy"), "no file '"),
         (lambda f: HeightMap((0.4, 0.3), file=f), "is no .csv, .npy or .png"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "hole.csv"), "row 2, column 1 is no height"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "uneven.csv"), "rows of numbers of one length"),
+        (
+            lambda f: HeightMap((0.4, 0.3), file=f / "hole.csv"),
+            "row 2, column 1: expected a number, got 'nan'",
+        ),
+        (
+            lambda f: HeightMap((0.4, 0.3), file=f / "uneven.csv"),
+            "row 1 has 2 heights, row 2 has 1",
+        ),
         (lambda f: HeightMap((0.4, 0.3), file=f / "words.csv"), "has no table of heights"),
         (lambda f: HeightMap((0.4, 0.3), file=f / "words.png"), "'words.png'"),
         (lambda f: HeightMap((0.4, 0.3), file=f / "words.npy"), "'words.npy'"),

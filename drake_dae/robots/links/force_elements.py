@@ -20,6 +20,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import PlantFrames, position_of
+from drake_dae.trace.smoothness import length_of
 
 SUPPORTED_FORCE_ELEMENTS = (
     UniformGravityFieldElement,
@@ -120,5 +121,5 @@ class Springs:
                 start = self._frames.pose(element.bodyA().body_frame())
                 end = self._frames.pose(element.bodyB().body_frame())
                 apart = position_of(end, element.p_BQ()) - position_of(start, element.p_AP())
-                springs.append((element, ca.norm_2(apart)))
+                springs.append((element, length_of(apart)))
         return springs
