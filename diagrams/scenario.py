@@ -24,8 +24,9 @@ from drake_dae.diagrams import scenario_parts as parts
 from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
 from drake_dae.diagrams.robot_file import payloads
 from drake_dae.diagrams.scenario_task import ScenarioTask
-from drake_dae.diagrams.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
+from drake_dae.diagrams.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_yaml, put_entry, set_entry
 from drake_dae.errors import ScenarioError
+from drake_dae.files import read_text
 from drake_dae.robots import actuation, contact, force_outputs, loads, outputs
 from drake_dae.robots.contact import maps, surface, surfaces
 from drake_dae.simulation.simulate import check_config, check_duration
@@ -332,11 +333,11 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, 4 * MOST_TEXT)
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     except (OSError, ValueError) as error:  # A null byte in the path.
-        raise ScenarioError((str(path), str(error))) from None
+        raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
     data = load_yaml(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):

@@ -60,6 +60,23 @@ def number_in(text: str) -> float | None:
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
+def can_be_written(text: str) -> bool:
+    """Whether a file can hold a text: not where it has half of a letter, a lone surrogate."""
+    return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+def check_writable(what: str, text: str) -> None:
+    """Refuses a text that no file can hold.
+
+    Raises:
+        ModelError: It has half of a letter.
+    """
+    if not can_be_written(text):
+        raise ModelError(
+            f"{what} has half of a letter (\\ud800 to \\udfff), which no file can hold: {text!a}"
+        )
+
+
 def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:
     """A finite real number.
 

@@ -17,6 +17,7 @@ from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.resources import check_resources, package_folder
 from drake_dae.diagrams.robot_file.descriptions import find_description
 from drake_dae.diagrams.robot_file.efforts import Efforts, read_efforts
+from drake_dae.diagrams.robot_file.includes import check_includes
 from drake_dae.diagrams.robot_file.meshes import Copies, add_models
 from drake_dae.diagrams.robot_file.packages import add_packages, explained, find_packages
 from drake_dae.diagrams.scenario_parts import Robot
@@ -88,6 +89,7 @@ def read_into(
             add_packages(robot.packages, packages)
             folders, missing = find_packages(name, packages, places)
             file = Path(packages.ResolveUrl(name) if is_url else name)
+            check_includes(file, packages)
             _check_one_robot(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
         except ScenarioError:
@@ -101,6 +103,8 @@ def read_into(
         for key in plant.GetConstraintIds():
             plant.RemoveConstraint(key)
     told = [text for text in dropped.warnings if not _is_answered(text, robot)]
+    # The parser of SDFormat tells of a link twice, once without the place.
+    told = [text for text in told if not text.startswith("warning: ")] or told
     if told:
         raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
     if scene_graph is not None:
@@ -188,8 +192,12 @@ class _Dropped(logging.Filter):
 
 
 def _explained(warning: str) -> str:
-    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint."""
-    place, text = warning.split(": warning: ", 1)
+    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint.
+
+    That of SDFormat may have no place.
+    """
+    before, _, text = warning.partition("warning: ")
+    place = before.removesuffix(": ") or "the robot's file"
     kind = "link" if "inertia" in text else "joint"
     if "inertia" in text:
         text = (

@@ -1,6 +1,7 @@
 """`drake-dae export`: writes law, plant and projection of a scenario as C99."""
 
 import argparse
+import json
 from pathlib import Path
 
 from drake_dae.diagrams.build import build_loop, start_scenario
@@ -20,8 +21,12 @@ def run_command(options: argparse.Namespace) -> int:
     context = start_scenario(scenario, loop)
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
-    print(f"written to {folder}/: {', '.join(file.name for file in files)}")
-    if missing := _left_out(scenario, loop):
+    names, missing = [file.name for file in files], _left_out(scenario, loop)
+    if options.json:
+        print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
+        return 0
+    print(f"written to {folder}/: {', '.join(names)}")
+    if missing:
         print(f"not among them: {'; '.join(missing)}")
     return 0
 

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, check_writable, numbers
 from drake_dae.errors import ModelError
 
 
@@ -24,6 +24,9 @@ class Signal:
 
     name: str
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        check_writable("the name of a signal", self.name)
 
     def derivative(self, order: int) -> "Signal":
         """Its time derivative: x -> x', x'', ..., with the unit to match."""
