@@ -19,7 +19,8 @@ PACKAGE = ROOT / "drake_dae"
 # but the command may import it.
 FLOORS = (
     ("errors",),
-    ("arrays", "files"),
+    ("files",),
+    ("arrays",),
     ("arguments",),
     ("trace",),
     ("dae",),

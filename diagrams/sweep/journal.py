@@ -157,8 +157,9 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
             result = RunResult.from_dict(json.loads(line))
             if result.run >= len(head["variations"]):
                 raise LookupError(result.run)
-        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-            if place == len(lines) + 1:  # Zeros, where a machine lost its power.
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+            is_json = not isinstance(error, (json.JSONDecodeError, UnicodeDecodeError))
+            if place == len(lines) + 1 and not is_json:  # Zeros, where a machine lost its power.
                 rest = line + b"\n" + rest
                 break
             raise ModelError(

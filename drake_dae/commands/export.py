@@ -4,12 +4,14 @@ import argparse
 import json
 from pathlib import Path
 
-from drake_dae.diagrams.build import build_loop, start_scenario
+from drake_dae.diagrams.build import build_scenario
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.contact_plant import ContactPlant
 from drake_dae.diagrams.export.export import export_code
 from drake_dae.diagrams.scenario import Scenario, load_scenario
 from drake_dae.diagrams.shipped import find_scenario
+from drake_dae.diagrams.task_loop import TaskLoop
+from drake_dae.errors import ScenarioError
 from drake_dae.systems.unilateral.plant import UnilateralRobotPlant
 
 
@@ -17,8 +19,10 @@ def run_command(options: argparse.Namespace) -> int:
     """Writes the code of the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
-    loop = build_loop(scenario)
-    context = start_scenario(scenario, loop)
+    loop, context = build_scenario(scenario)
+    if isinstance(loop, TaskLoop):
+        text = "exports know `references` alone; `drake-dae simulate` runs a task"
+        raise ScenarioError(("task", text))
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
     names, missing = [file.name for file in files], _left_out(scenario, loop)

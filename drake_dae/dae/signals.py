@@ -40,6 +40,11 @@ DERIVATIVES = 10
 """How many derivatives of an exogenous parameter there are symbols for; long chains need 8."""
 
 
+LARGEST = 1e60
+"""No parameter is larger, and none that is positive is smaller than its inverse: equations multiply
+five of them before they divide."""
+
+
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Parameter:
@@ -109,7 +114,8 @@ class Parameter:
         """Refuses values that make no sense for the parameter.
 
         Raises:
-            ModelError: A number is not finite, or not positive or negative where it must (not) be.
+            ModelError: A number is not finite, or not positive or negative where it must (not) be;
+                or it is beyond `LARGEST`.
         """
         if not np.all(np.isfinite(value)):
             raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
@@ -117,6 +123,11 @@ class Parameter:
             raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
         if self.nonnegative and not np.all(value >= 0.0):
             raise ModelError(f"parameter '{self.name}' must not be negative, got {value}")
+        if np.any(np.abs(value) > LARGEST) or (self.positive and np.any(value < 1.0 / LARGEST)):
+            raise ModelError(
+                f"parameter '{self.name}' must be a number whose products a double holds, from "
+                f"{1.0 / LARGEST:g} to {LARGEST:g}, got {value}"
+            )
 
 
 def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:

@@ -169,7 +169,7 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     (worker,) = map(int, listed.stdout.split())
     os.kill(worker, signal.SIGKILL)
     said, _ = process.communicate(timeout=100)
-    assert process.returncode == 0
+    assert process.returncode == 1
     assert said.startswith(
         "6 runs: 5 finished, 1 crashed\n\nrun 3 crashed: the process ended with signal SIGKILL\n"
     )
