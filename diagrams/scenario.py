@@ -21,7 +21,17 @@ from drake_dae.arrays import listed
 from drake_dae.dae import references
 from drake_dae.diagrams import contact_material, unilateral
 from drake_dae.diagrams import scenario_parts as parts
-from drake_dae.diagrams.forms import Choice, FileName, Form, Numbers, Pair, Reader, Row, Triple
+from drake_dae.diagrams.forms import (
+    Choice,
+    FileName,
+    Form,
+    Numbers,
+    Pair,
+    Reader,
+    Row,
+    Triple,
+    without_tags,
+)
 from drake_dae.diagrams.robot_file import payloads
 from drake_dae.diagrams.scenario_task import ScenarioTask
 from drake_dae.diagrams.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_yaml, put_entry, set_entry
@@ -283,9 +293,15 @@ def _reader() -> Reader[Scenario]:
     return Reader(Scenario)
 
 
-def scenario_schema() -> dict[str, Any]:
-    """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
-    return _reader().schema
+def scenario_schema(tags: bool = True) -> dict[str, Any]:
+    """The JSON Schema of a scenario as plain data.
+
+    Args:
+        tags: Whether the data have tags as entries "_tag", as those of `read_scenario` do. Without,
+            it is for data that have none, as a plain reader of YAML or an editor gives them: any
+            form fits where a tag chooses.
+    """
+    return _reader().schema if tags else dict(without_tags(_reader().schema))
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def simulate(
     diagram: System,
     context: Context,
     duration: float,
-    config: SimulatorConfig,
+    config: SimulatorConfig | None = None,
     progress: bool = False,
     after_step: Callable[[Context], None] | None = None,
 ) -> RunStatistics:
@@ -83,7 +83,7 @@ def simulate(
         diagram: The system.
         context: Its context with the start state; changed in place.
         duration: How long to simulate, in s.
-        config: Drake's integrator settings. The run begins at its start_time.
+        config: Drake's integrator settings; its defaults if None. The run begins at its start_time.
         progress: Shows simulated time and speed on stderr.
         after_step: Called with the context after each step, such as `RecordWriter.update`.
 
@@ -95,6 +95,7 @@ def simulate(
         InconsistentStateError: The start state is not on the manifold.
         SimulationError: The run cannot go on; the exception has time and state.
     """
+    config = config or SimulatorConfig()
     check_duration(duration)
     check_config(config)
     _check_times(config.start_time, duration)
