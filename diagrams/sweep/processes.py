@@ -29,6 +29,9 @@ BUILDS = 200
 PERIOD = 0.02
 """Results are told this often, in s: those of short runs are synced to the disk together."""
 
+STARTING = 300.0
+"""So long a process may take until it is ready, in s."""
+
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 _ENDED = {128 + signal.SIGINT, *(-number for number in ENDING_SIGNALS)}
@@ -71,7 +74,7 @@ def run_in_processes(
                     running.append(worker)
                     selector.register(worker.output, selectors.EVENT_READ, worker)
                 now = time.monotonic()
-                due = min(worker.began for worker in running) + time_limit - now
+                due = min(worker.due(time_limit) for worker in running) - now
                 due = min(due, told + PERIOD - now) if found else due
                 for key, _ in selector.select(max(0.0, due) if isfinite(due) else None):
                     worker = key.data
@@ -89,7 +92,7 @@ def run_in_processes(
                     elif worker.is_idle:
                         worker.dismiss()
                 for worker in running:
-                    if not worker.is_idle and time.monotonic() >= worker.began + time_limit:
+                    if time.monotonic() >= worker.due(time_limit):
                         worker.stop(time_limit)  # What it is about is told when its output ends.
                 if found and (time.monotonic() >= told + PERIOD or not (waiting or running)):
                     told = time.monotonic()
@@ -161,6 +164,10 @@ class _Worker:
                 self._results.append(RunResult.from_dict(told))
                 self.left, self.began = self.left[1:], time.monotonic()
         return bool(data)
+
+    def due(self, limit: float) -> float:
+        """When it has taken longer than a run may, by the monotonic clock in s."""
+        return self.began + (limit if self._is_ready else max(limit, STARTING))
 
     def stop(self, limit: float) -> None:
         """Ends it, since its run takes longer than a limit in s; `read` and `close` tell it."""

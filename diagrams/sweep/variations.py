@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import product
-from math import prod
+from math import isfinite, prod
 from typing import Any
 from zlib import crc32
 
@@ -156,7 +156,7 @@ def _ends(key: str, found: re.Match[str]) -> tuple[float, float]:
 
 
 def _check_width(key: str, low: float, high: float) -> None:
-    if not np.isfinite(high - low):
+    if not isfinite(float(high) - float(low)):
         raise _wrong(key, f"the range from {low:g} to {high:g} is wider than the largest number")
 
 
