@@ -90,7 +90,7 @@ def read_into(
             folders, missing = find_packages(name, packages, places)
             file = Path(packages.ResolveUrl(name) if is_url else name)
             check_includes(file, packages)
-            _check_one_robot(file)
+            _check_text(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
         except ScenarioError:
             raise
@@ -227,14 +227,31 @@ def _explained(warning: str) -> str:
     return f"{place}: {owner}{' '.join(text.split())}"
 
 
-def _check_one_robot(file: Path) -> None:
-    """Refuses a second robot in a URDF, which Drake would not read."""
+_WITH_COMMA = re.compile(r"(?:=\s*[\"']|>)\s*([-+.\deE\s]*\d,\d[-+.\deE,\s]*)[\"'<]")
+"""A value of XML that is but numbers, with a comma between two digits."""
+
+
+def _check_text(file: Path) -> None:
+    """Refuses what Drake would pass over: a second robot in a URDF, and what follows a comma."""
+    if file.suffix not in (".urdf", ".sdf", ".xml"):
+        return
+    text = re.sub(r"<!--.*?-->", _lines, file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
+    if comma := _WITH_COMMA.search(text):
+        line = text.count("\n", 0, comma.start(1)) + 1
+        raise ModelError(
+            f"'{file.name}', line {line}: '{comma[1].strip()}': numbers have a point and no comma, "
+            "and blanks between them"
+        )
     if file.suffix != ".urdf":
         return
-    text = re.sub(r"<!--.*?-->", "", file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
     names = re.findall(r"<robot\b[^>]*", text)
     if len(names) > 1:
         raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
+
+
+def _lines(found: re.Match[str]) -> str:
+    """As many lines as there were."""
+    return "\n" * found[0].count("\n")
 
 
 def _is_file(name: str) -> bool:

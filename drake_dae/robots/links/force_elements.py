@@ -18,6 +18,7 @@ from pydrake.multibody.tree import (
     UniformGravityFieldElement,
 )
 
+from drake_dae.dae.signals import LARGEST
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import PlantFrames, position_of
 from drake_dae.trace.smoothness import length_of
@@ -73,6 +74,13 @@ class Springs:
     ) -> None:
         self._elements = force_elements(plant)
         self._damping = np.concatenate([joint.default_damping_vector() for joint in joints])
+        for joint in joints:
+            largest = np.max(joint.default_damping_vector(), initial=0.0)
+            if largest > LARGEST:
+                raise ModelError(
+                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that can "
+                    f"be computed with is {LARGEST:g}"
+                )
         self._frames = frames
         self._q, self._v, self._velocity_map = q, v, velocity_map
 
