@@ -108,9 +108,9 @@ def _main(arguments: Sequence[str] | None) -> int:
     run.add_argument(
         "--rollout",
         action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
-        "fast where it is machine code, five times as fast where not; the record has every fixed "
-        "step, or 1000 rows under error control",
+        help="run without Drake's Simulator, the whole loop as one function, which pays for many "
+        "runs (see sweep) rather than for one; the record has every fixed step, or 1000 rows under "
+        "error control, and is written at the end alone",
     )
     run.add_argument(
         "--check", action="store_true", help="exit code 2 for a run that missed its task"

@@ -47,11 +47,13 @@ FLAGS = (
     "-fvisibility=hidden",
     "-DGCC_HASCLASSVISIBILITY",
 )
-"""-O1 comes with them: of code that takes much compiling, -O2 takes twice as much."""
+"""-O1 comes with them. -O2 takes 1.3 to 1.6 times as long, for laws that are faster by 1 to 6 per
+cent with rigid joints, 12 with flexible ones, and 20 to 25 for two arms or a hand."""
 
 NATIVE = "-march=native"
-"""All that the processor at hand can do. Where the older instructions of x86-64 meet the newer ones
-of libm and memcpy, a call takes a tenth longer, at times twice as long. The bits are the same."""
+"""All that the processor at hand can do, where the compiler takes this option for it: not each one
+does for each processor. On x86-64, where older instructions meet the newer ones of libm and memcpy,
+a call takes a tenth longer without, at times twice as long. The bits are the same."""
 
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
 """Options of Python that make it a C compiler, where ziglang is installed. Code for any processor:

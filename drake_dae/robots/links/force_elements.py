@@ -78,8 +78,8 @@ class Springs:
             largest = np.max(joint.default_damping_vector(), initial=0.0)
             if largest > LARGEST:
                 raise ModelError(
-                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that can "
-                    f"be computed with is {LARGEST:g}"
+                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that "
+                    f"can be computed with is {LARGEST:g}"
                 )
         self._frames = frames
         self._q, self._v, self._velocity_map = q, v, velocity_map
