@@ -10,6 +10,7 @@ from pydrake.multibody.parsing import PackageMap
 from drake_dae.diagrams.keys import at
 from drake_dae.diagrams.shipped import FOLDER
 from drake_dae.errors import ModelError
+from drake_dae.files import read_bytes
 
 _URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
 _MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
@@ -115,7 +116,7 @@ def _beside(name: str, file: Path) -> Path | None:
 def _names(package: Path) -> Iterator[str]:
     """The name in a package.xml, if there is one."""
     try:
-        text = package.read_text("utf-8", errors="replace")
+        text = read_bytes(package).decode("utf-8", errors="replace")
     except (OSError, ValueError):
         return
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
