@@ -298,7 +298,6 @@ WORDS = (
     "--set=sampling={period: 0.001, delay: 1.0e+6}",
     "--set=write={}",
     "--set=start={}",
-    "--set=sampling={period: 1.0e-12}",
     "--set=references={tool.z: !Csv {file: /dev/zero, columns: [z]}}",
     '--set=constraints.0.name="\\ud800"',
     "--out=",

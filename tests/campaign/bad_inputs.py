@@ -131,7 +131,11 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
         return "it is what it was"
     if path.startswith(("references.", "exogenous.")) and _is_constant(after):
         return "a number is a constant reference" if abs(after) <= 1e15 else LOST
-    if after is None and path in ("gains", "integral", "observer", "task", "forces"):
+    if path.startswith("gains.") and before == after:
+        return "it is what it was"
+    if path.startswith("gains.") and isinstance(before, float) and after == -1.0:
+        return "another pole, or a gain that is refused where it makes errors grow"
+    if after is None and path.split(".")[-1] in _OR_NOTHING:
         return "nothing is its default"
     if path == "description" or path.endswith(".name"):
         return "any text is a name" if isinstance(after, str) else ""
@@ -147,6 +151,10 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
     if isinstance(before, (int, float)) and (SIGNED.search(path) or after > 0):
         return "another finite number with a meaning"
     return ""
+
+
+_OR_NOTHING = ("gains", "integral", "observer", "task", "forces", "effort_limit")
+"""Keys that may hold nothing."""
 
 
 def _is_constant(value: Any) -> bool:
