@@ -5,6 +5,7 @@ import gc
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import warnings
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import drake_dae
+from drake_dae.arrays import number_in
 from drake_dae.errors import (
     DrakeDaeError,
     NonMinimumPhaseWarning,
@@ -22,6 +24,10 @@ from drake_dae.errors import (
     describe_os_error,
 )
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, description, shipped_scenarios
+from drake_dae.simulation.records.interruption import end_at_once, ending_signals
+
+TIME_LIMIT = 3600.0
+"""How long a run of a sweep may take where nobody says, in s."""
 
 YOUNG = 50_000
 """So many new objects are there before garbage is looked for: what a command loads and builds
@@ -31,8 +37,9 @@ stays, and to look through it as often as Python does takes a sixth of a short r
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
-    0, or 1 for an error, 2 for a problem that `analyze` found (as for wrong usage), 128 + signal
-    after Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
+    0, or 1 for an error, also where a run ends early; 2 for a problem that `analyze` found, for a
+    run that missed its task where `--check` asks for it, and for wrong usage; 128 + signal after
+    Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
 
     Args:
         arguments: Those after the command's name; those of this process, which then is the
@@ -54,7 +61,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     )
     parser.add_argument("--version", action="version", version=drake_dae.__version__)
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("list", help="name the shipped scenarios")
+    listed = commands.add_parser("list", help="name the shipped scenarios")
+    _add_json(listed, "print names and descriptions as JSON")
     shown = commands.add_parser("show", help="print a scenario, to begin one with")
     shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
     shown.add_argument("--path", action="store_true", help="print where its file is instead")
@@ -80,9 +88,16 @@ def _main(arguments: Sequence[str] | None) -> int:
         choices=["true", "false", "auto"],
         help="whether functions become machine code, as the scenario's key `compiled`",
     )
-    run = commands.add_parser("simulate", parents=[named], help="run a scenario")
+    run = commands.add_parser(
+        "simulate",
+        parents=[named],
+        help="run a scenario",
+        epilog="exit code: 0 if the run came to its end, 1 for an error, also where it ended "
+        "early; with --check 2 if it missed its task: errors are not as predicted, without a "
+        "reason or to the end, or a contact, a drive or a joint would have to do what it cannot",
+    )
     run.add_argument(
-        "--out", type=Path, help="folder for the results (default: runs/<scenario>-<time>)"
+        "--out", type=_path, help="folder for the results (default: runs/<scenario>-<time>)"
     )
     run.add_argument(
         "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
@@ -93,12 +108,16 @@ def _main(arguments: Sequence[str] | None) -> int:
     run.add_argument(
         "--rollout",
         action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
-        "fast where it is machine code, five times as fast where not; the record has every fixed "
-        "step, or 1000 rows under error control",
+        help="run without Drake's Simulator, the whole loop as one function, which pays for many "
+        "runs (see sweep) rather than for one; the record has every fixed step, or 1000 rows under "
+        "error control, and is written at the end alone",
     )
+    run.add_argument(
+        "--check", action="store_true", help="exit code 2 for a run that missed its task"
+    )
+    _add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
     shown = commands.add_parser("view", help="open the animation of a run in the browser")
-    shown.add_argument("folder", type=Path, help="the folder of the run")
+    shown.add_argument("folder", type=_path, help="the folder of the run")
     examine = commands.add_parser(
         "analyze",
         parents=[named],
@@ -110,9 +129,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
         "error",
     )
-    examine.add_argument(
-        "--json", action="store_true", help='print JSON; for an error, its text under "error"'
-    )
+    _add_json(examine, "print JSON")
     _add_sweep(commands, named)
     _add_new(commands)
     written = commands.add_parser(
@@ -123,17 +140,18 @@ def _main(arguments: Sequence[str] | None) -> int:
         "without dependencies, with sizes, names and units, and a test program: `make` in the "
         "folder compiles it and compares it with Python.",
     )
-    written.add_argument("--out", type=Path, help="folder for the files (default: <scenario>_c99)")
+    written.add_argument("--out", type=_path, help="folder for the files (default: <scenario>_c99)")
+    _add_json(written, "print as JSON what is written")
     film = commands.add_parser(
         "film",
         help="film a run, into a GIF or a strip of pictures",
         description="Renders what a run left in its folder, with the paths and the forces of its "
         "contacts. It takes no screen, and no browser.",
     )
-    film.add_argument("folder", type=Path, help="the folder of a run, as runs/seven_joint_wall")
+    film.add_argument("folder", type=_path, help="the folder of a run, as runs/seven_joint_wall")
     film.add_argument(
         "--out",
-        type=Path,
+        type=_path,
         help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
     )
     kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
@@ -144,9 +162,10 @@ def _main(arguments: Sequence[str] | None) -> int:
     if isinstance(sys.stdout, TextIOWrapper):
         # Names may have letters that the terminal does not.
         sys.stdout.reconfigure(errors="backslashreplace")
+    as_json = getattr(options, "json", False)
     try:
         if options.command == "list":
-            return _list()
+            return _list(as_json)
         # What a command needs is loaded with it: Drake alone takes a second.
         ignored: list[type[Warning]] = []
         if options.command == "show":
@@ -175,13 +194,14 @@ def _main(arguments: Sequence[str] | None) -> int:
             options.settings.append(f"compiled={options.compiled}")
         # Drake tells where each Meshcat listens, also the one that only records.
         logging.getLogger("drake").setLevel(logging.WARNING)
-        with _warnings(*ignored):
+        # Files on their way go when a signal ends it.
+        with _warnings(*ignored), ending_signals(end_at_once):
             return run_command(options)
     except DrakeDaeError as error:
         # A scenario has a line for each problem; other texts, as of Drake, are made one.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
         print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
-        if options.command == "analyze" and options.json:
+        if as_json:
             print(json.dumps({"error": text}))
         return 1
     except BrokenPipeError:
@@ -189,15 +209,49 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        print(f"error: {describe_os_error(error)}", file=sys.stderr)
+        text = describe_os_error(error)
+        print(f"error: {text}", file=sys.stderr)
+        if as_json:
+            print(json.dumps({"error": text}))
         return 1
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
-def _list() -> int:
+def _path(text: str) -> Path:
+    """A path of the command line; "", as of a variable of the shell that is not set, is none."""
+    if not text:
+        raise argparse.ArgumentTypeError("a name is needed, got ''")
+    return Path(text)
+
+
+def _whole(text: str) -> int:
+    """A whole number of the command line; Python also reads 1_000 and digits of other alphabets."""
+    if not re.fullmatch("-?[0-9]{1,15}", text):
+        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    """A positive number of the command line."""
+    value = number_in(text)
+    if value is None or value <= 0.0:
+        raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got '{text}'")
+    return value
+
+
+def _add_json(command: argparse.ArgumentParser, what: str) -> None:
+    command.add_argument(
+        "--json", action="store_true", help=f'{what}; for an error, its text under "error"'
+    )
+
+
+def _list(as_json: bool) -> int:
     paths = shipped_scenarios()
+    if as_json:
+        print(json.dumps({name: description(path) for name, path in paths.items()}, indent=2))
+        return 0
     width = max(map(len, paths), default=0)
     for name, path in paths.items():
         print(f"{name.ljust(width)}  {description(path)}")
@@ -237,7 +291,7 @@ def _add_new(commands: Any) -> None:
         "longest chain)",
     )
     begin.add_argument(
-        "--out", type=Path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
+        "--out", type=_path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
     )
 
 
@@ -249,6 +303,8 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         description="Runs a scenario once for every combination of the values of some keys, on all "
         "cores, and leaves a table with figures of each run, a summary and plots. Killed at any "
         "moment and started again with the same command, it continues where it was.",
+        epilog="exit code: 0, or 1 for an error, also where the process of a run died or was too "
+        "slow: the same command tries that run again; with --check 2 if a run did not finish",
     )
     study.add_argument(
         "--vary",
@@ -263,7 +319,7 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
     chosen = study.add_mutually_exclusive_group()
     chosen.add_argument(
         "--random",
-        type=int,
+        type=_whole,
         metavar="COUNT",
         help="so many runs with random values, all in a range equally likely, instead of a grid",
     )
@@ -272,7 +328,7 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the first values of all keys, then the second ones, instead of a grid",
     )
-    study.add_argument("--seed", type=int, default=0, help="of the random values (default: 0)")
+    study.add_argument("--seed", type=_whole, default=0, help="of the random values (default: 0)")
     study.add_argument(
         "--rollout",
         action="store_true",
@@ -280,11 +336,21 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         "--rollout` does: many times as fast",
     )
     study.add_argument(
-        "--workers", type=int, metavar="COUNT", help="how many processes (default: one per core)"
+        "--workers", type=_whole, metavar="COUNT", help="how many processes (default: one per core)"
     )
     study.add_argument(
         "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
     )
     study.add_argument(
-        "--out", type=Path, help="folder for the results (default: runs/<scenario>-sweep)"
+        "--time-limit",
+        type=_seconds,
+        default=TIME_LIMIT,
+        metavar="SECONDS",
+        help="how long a run may take by the clock, building included, until its process is ended "
+        f"and it counts as timed out (default: {TIME_LIMIT:g}; on a cluster there is none)",
+    )
+    study.add_argument("--check", action="store_true", help="exit code 2 if a run did not finish")
+    _add_json(study, "print outcomes and figures as JSON, and all else on stderr")
+    study.add_argument(
+        "--out", type=_path, help="folder for the results (default: runs/<scenario>-sweep)"
     )

@@ -83,26 +83,13 @@ def build_completed(
     return completed, wire_loop(completed.scenario, model, structure, scene_graph, meshcat)
 
 
-def build_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
-    """The closed loop of a scenario of which nothing is left open.
-
-    The arguments and errors are those of `build_scenario`.
-    """
-    loop = build_completed(scenario, meshcat)[1]
-    if isinstance(loop, TaskLoop):
-        raise ScenarioError(
-            ("task", "sweeps and exports know `references` alone; `drake-dae simulate` runs a task")
-        )
-    return loop
-
-
 def start_scenario(scenario: Scenario, loop: ClosedLoop | TaskLoop) -> Context:
     """A new context of a closed loop at a scenario's start.
 
     Args:
         scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
             uncoupled gains, and the seed of the sensor may be others than those it was built with.
-        loop: What `build_loop` made.
+        loop: What `build_completed` made.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.

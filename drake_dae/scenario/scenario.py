@@ -21,6 +21,7 @@ from drake_dae.arrays import listed
 from drake_dae.dae import references
 from drake_dae.diagrams import unilateral
 from drake_dae.errors import ScenarioError
+from drake_dae.files import read_text
 from drake_dae.robots import actuation, force_outputs, loads, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.surfaces import maps, surface, surfaces
@@ -34,8 +35,16 @@ from drake_dae.scenario.forms.forms import (
     Reader,
     Row,
     Triple,
+    without_tags,
 )
-from drake_dae.scenario.forms.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
+from drake_dae.scenario.forms.typed_yaml import (
+    MOST_TEXT,
+    TAG,
+    dump_yaml,
+    load_yaml,
+    put_entry,
+    set_entry,
+)
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.scenario.task import ScenarioTask
 from drake_dae.simulation.simulate import check_config, check_duration
@@ -294,9 +303,15 @@ def _reader() -> Reader[Scenario]:
     return Reader(Scenario)
 
 
-def scenario_schema() -> dict[str, Any]:
-    """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
-    return _reader().schema
+def scenario_schema(tags: bool = True) -> dict[str, Any]:
+    """The JSON Schema of a scenario as plain data.
+
+    Args:
+        tags: Whether the data have tags as entries "_tag", as those of `read_scenario` do. Without,
+            it is for data that have none, as a plain reader of YAML or an editor gives them: any
+            form fits where a tag chooses.
+    """
+    return _reader().schema if tags else dict(without_tags(_reader().schema))
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:
@@ -344,11 +359,11 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, 4 * MOST_TEXT)
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     except (OSError, ValueError) as error:  # A null byte in the path.
-        raise ScenarioError((str(path), str(error))) from None
+        raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
     data = load_yaml(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):

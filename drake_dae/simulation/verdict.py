@@ -115,6 +115,17 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     return Verdict(tracking, signals[column], off, float(record.time[row]), share, settled)
 
 
+def is_missed(verdict: Verdict, reasons: Sequence[str] = ()) -> bool:
+    """Whether a run missed its task: it is off, and stays so or has no reason to be.
+
+    Args:
+        verdict: The verdict.
+        reasons: Why a run is not as predicted, as in `in_words`.
+    """
+    is_off = verdict.tracking is Tracking.OFF
+    return is_off and not (reasons and verdict.settled <= NEAR)
+
+
 def in_words(
     verdict: Verdict,
     accuracy: float | None = None,

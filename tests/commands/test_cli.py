@@ -218,7 +218,7 @@ def test_open_shows_the_animation_at_the_end(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path, capsys):
+def test_an_earlier_run_moves_away_and_other_files_stay(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
     assert main([*arguments, *QUICK]) == 0
     (tmp_path / "notes.txt").write_text("mine")

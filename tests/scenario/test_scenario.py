@@ -1,5 +1,6 @@
 """Scenario files: read, refused with one line that names the key, built, and written."""
 
+import json
 from copy import deepcopy
 from dataclasses import fields
 
@@ -37,10 +38,11 @@ from drake_dae import (
     Torus,
     build_scenario,
     load_scenario,
+    scenario_schema,
 )
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import parts as forms
-from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario.forms.typed_yaml import TAG, load_yaml
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.trace.functions import TracedFunction
@@ -202,6 +204,26 @@ def test_the_json_schema_holds_for_shipped_scenarios(name, tmp_path):
         data["constraints"][0]["nmae"] = "wall"
         with pytest.raises(jsonschema.ValidationError):
             scenario_validator().validate(data)
+
+
+@pytest.mark.parametrize("name", ["two_link_wall", "two_link_flexible_motors", "wall_polish"])
+def test_a_schema_without_tags_is_for_plain_readers(name):
+    """Of YAML without its tags, as a plain validator gets it."""
+    schema = scenario_schema(tags=False)
+    assert TAG not in json.dumps(schema)
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+    def plain(data):
+        if isinstance(data, dict):
+            return {key: plain(value) for key, value in data.items() if key != TAG}
+        return [*map(plain, data)] if isinstance(data, list) else data
+
+    data = load_yaml(find_scenario(name).read_text(), name)
+    validator = jsonschema.Draft202012Validator(schema)
+    validator.validate(plain(data))
+    for wrong in ({**plain(data), "nothing": 1}, {**plain(data), "duration": "long"}):
+        with pytest.raises(jsonschema.ValidationError):
+            validator.validate(wrong)
 
 
 def test_every_form_reads_back_equal(tmp_path):

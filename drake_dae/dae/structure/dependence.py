@@ -20,8 +20,8 @@ class Combination:
     """A row that is a combination of others: row = sum factors_j row_j.
 
     Attributes:
-        name: The constraint whose row it is.
-        others: The constraints that it follows from.
+        name: The constraint or the output whose row it is.
+        others: The constraints or outputs that it follows from.
         factors: Theirs, shape (len(others),), at the state where this was found.
         constant: Whether the factors are the same at all examined states.
     """
@@ -89,7 +89,7 @@ def find_dependence(
     # Chains may depend on each other below their last derivatives alone.
     by_gradients = dependent and are_dependent(matrices(where)[1] * system.scale)
     values = [matrices(state)[1 if by_gradients else 0] for state in examined]
-    return Dependence(tuple(_combinations(names, values)), everywhere, dependent)
+    return Dependence(tuple(combinations_of(names, values)), everywhere, dependent)
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
@@ -99,11 +99,16 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
         return ()
     names = [signal.name for signal in system.constraint_output_signals]
     values = samples.values(gradient=ca.jacobian(system.k, system.state))
-    return tuple(_combinations(names, [gradient for (gradient,) in values]))
+    return tuple(combinations_of(names, [gradient for (gradient,) in values]))
 
 
-def _combinations(names: list[str], values: list[FloatArray]) -> list[Combination]:
-    """The rows that follow from those before them at the first of some states."""
+def combinations_of(names: list[str], values: list[FloatArray]) -> list[Combination]:
+    """The rows that follow from those before them at the first of some states.
+
+    Args:
+        names: What the rows are about.
+        values: The matrix at each state.
+    """
     matrix, lengths = _scaled(values[0])
     kept: list[int] = []
     found = []

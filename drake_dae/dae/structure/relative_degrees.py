@@ -4,6 +4,7 @@ Whether an input acts on a derivative is decided by the structure of the express
 its numbers at consistent states.
 """
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import casadi as ca
@@ -16,7 +17,11 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation
-from drake_dae.dae.structure.dependence import redundant_constraints
+from drake_dae.dae.structure.dependence import (
+    Combination,
+    combinations_of,
+    redundant_constraints,
+)
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
@@ -165,7 +170,8 @@ def output_chains(
             ):
                 stuck.append(names[i])
         if stuck:
-            raise Violation(5, Cause.NO_CONTROL, tuple(stuck)).error()
+            found = tuple(_following(samples, stuck))
+            raise Violation(5, Cause.NO_CONTROL, tuple(stuck), combinations=found).error()
         undecided = still
     return OutputChains(
         chains=tuple(tuple(chain) for chain in chains),
@@ -175,6 +181,18 @@ def output_chains(
         need_force=need_force,
         round_off=round_off,
     )
+
+
+def _following(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
+    """Which of some outputs follow from the constraints, by their gradients."""
+    system, manifold = samples.system, samples.manifold
+    known = [signal.name for signal in manifold.residual_signals]
+    for row, signal in enumerate(system.output_signals):
+        if signal.name in names and not system.m[row, :].nnz():
+            both = ca.vertcat(manifold.residual_expression, system.l[row])
+            values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
+            rows = combinations_of([*known, signal.name], [gradient for (gradient,) in values])
+            yield from (one for one in rows if one.name == signal.name)
 
 
 def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Sized], list[Sized]]:

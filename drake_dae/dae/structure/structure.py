@@ -19,6 +19,7 @@ from drake_dae.dae.structure.constrained import (
     examine_constraints,
     guesses,
 )
+from drake_dae.dae.structure.dependence import combinations_of
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.system import DaeSystem
@@ -303,4 +304,8 @@ def control_violation(
 ) -> Violation | None:
     """How a singular B(x) violates Assumption (4) or (5); None if it is regular."""
     causes = ((4, Cause.OUTPUT_DEGREE), (5, Cause.CONTROL_RANK))
-    return rank_violation(margin, system.output_signals, degrees, *causes)
+    violation = rank_violation(margin, system.output_signals, degrees, *causes)
+    if violation is None or violation.cause is not Cause.CONTROL_RANK or margin.matrix is None:
+        return violation
+    names = [signal.name for signal in system.output_signals]
+    return replace(violation, combinations=tuple(combinations_of(names, [margin.matrix])))

@@ -27,6 +27,7 @@ from drake_dae.robots.surfaces.surface import (
     unit_vector,
 )
 from drake_dae.trace.formula import check_names, parse_formula
+from drake_dae.trace.smoothness import length_of
 
 _TAKEN = (
     "position",
@@ -112,7 +113,7 @@ class Sphere(Surface):
         return self.center
 
     def distance(self, offset: ca.SX) -> ca.SX:
-        return _side(ca.norm_2(offset) - self.radius, self.inside)
+        return _side(length_of(offset) - self.radius, self.inside)
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
         x, y, z = _components(self.axis, offset)
@@ -164,7 +165,7 @@ class Cylinder(Surface):
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y, _ = _components(self.axis, offset)
-        return _side(ca.sqrt(x**2 + y**2) - self.radius, self.inside)
+        return _side(length_of(ca.vertcat(x, y)) - self.radius, self.inside)
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
         x, y, z = _components(self.axis, offset, self.zero)
@@ -342,7 +343,7 @@ def _normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
     value = as_expression("an ImplicitSurface", "its function", function(p))
     if value.shape != (1, 1):
         raise ModelError(f"a surface function returns one number, this one has {value.shape}")
-    quotient = value / ca.norm_2(ca.gradient(value, p))
+    quotient = value / length_of(ca.gradient(value, p))
     return ca.substitute(quotient, p, offset)
 
 

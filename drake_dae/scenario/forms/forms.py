@@ -16,7 +16,7 @@ import numpy as np
 import pydantic
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, can_be_written
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.forms.docstrings import attribute_texts, introduction
 from drake_dae.scenario.forms.typed_yaml import TAG
@@ -264,6 +264,10 @@ class Reader(Generic[T]):
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all of them are told.
         """
+        unwritable = dict.fromkeys(_unwritable(data, ""))
+        if unwritable:
+            text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+            raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
             return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:
@@ -291,6 +295,21 @@ class Reader(Generic[T]):
         if kind == "value_error":
             return place.key, str(details["ctx"]["error"])
         return place.key, _wrong_value(place.schema, value)
+
+
+def _unwritable(data: Any, key: str) -> Iterator[str]:
+    """The dotted keys of texts in plain data that no file can hold."""
+    if isinstance(data, str) and not can_be_written(data):
+        yield key
+    pairs: Iterator[tuple[Any, Any]] = iter(())
+    if isinstance(data, Mapping):
+        pairs = iter(data.items())
+    elif isinstance(data, (list, tuple)):
+        pairs = iter(enumerate(data))
+    for name, inner in pairs:
+        if isinstance(name, str) and not can_be_written(name):
+            yield key
+        yield from _unwritable(inner, f"{key}.{name}" if key else str(name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,6 +402,27 @@ def _in_words(schema: Mapping[str, Any]) -> str:
     if "enum" in schema or "const" in schema:
         return "one of " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
     return _IN_WORDS.get(schema.get("type", ""), "something else")
+
+
+def without_tags(schema: Any) -> Any:
+    """A schema of the same data without the entries "_tag", as a plain reader of YAML gives them.
+
+    Where a tag chooses, any form fits.
+    """
+    if isinstance(schema, list):
+        return [without_tags(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    plain = {
+        ("anyOf" if key == "oneOf" else key): without_tags(value)
+        for key, value in schema.items()
+        if key != TAG
+    }
+    if TAG in schema.get("properties", {}):
+        plain["title"] = schema["properties"][TAG]["const"]
+    if TAG in schema.get("required", ()):
+        plain["required"] = [name for name in schema["required"] if name != TAG]
+    return plain
 
 
 def _tag(schema: Mapping[str, Any]) -> str:
