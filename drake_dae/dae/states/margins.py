@@ -1,6 +1,6 @@
 """How far a matrix of the state is from losing its rank."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import casadi as ca
@@ -27,12 +27,14 @@ class Margin:
             that are common to all states, so that units do not matter.
         state: Where `relative` is smallest, shape (n,).
         vanishing_row: The row that is zero there; None if none is.
+        matrix: The matrix there.
     """
 
     singular_value: float
     relative: float
     state: FloatArray
     vanishing_row: int | None = None
+    matrix: FloatArray | None = field(default=None, compare=False, repr=False)
 
     @property
     def is_singular(self) -> bool:
@@ -71,6 +73,7 @@ def find_margin(
         relative=scaled.distance(state),
         state=state,
         vanishing_row=int(np.argmin(length)) if length.min() < SINGULAR else None,
+        matrix=scaled.plain(state),
     )
 
 

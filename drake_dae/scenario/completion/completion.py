@@ -16,6 +16,7 @@ from drake_dae.scenario.completion.choice import best_joints, first_independent
 from drake_dae.scenario.completion.postures import Posture, Postures
 from drake_dae.scenario.completion.referred import ReferredRows, value_at
 from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts.written import made
 from drake_dae.scenario.scenario import Scenario
 
@@ -87,9 +88,10 @@ def complete(
     if missing < 0 or (missing == 0 and scenario.start.positions):
         return Completed(scenario)
     candidates = Candidates(scenario, links, given, bound)
-    postures = Postures(
-        links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
-    )
+    with at("plant_parameters or exogenous"):
+        postures = Postures(
+            links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
+        )
     # Rows that references name are known before the posture is: by the normal near the guess.
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
     movable = _movable(postures) if missing else []
