@@ -68,7 +68,8 @@ benchmark: $(VENV)/installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -q
 
 campaign: $(VENV)/installed-dev
-	$(BIN)/python tests/campaign/run.py --count 1600 --robots 520 --drops 1000 --seed $(SEED)
+	$(BIN)/python tests/campaign/run.py --count 1600 --files 2000 --several 800 \
+		--robots 520 --drops 1000 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
 	$(PYTEST) -m thorough
 	$(BIN)/python tests/support/woodpecker.py

@@ -1,5 +1,6 @@
 """Arrays of numbers: how arguments are checked, and how messages show them."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
@@ -46,6 +47,37 @@ def numbers(what: str, value: Any, error: type[Exception] = ModelError) -> Float
     except (TypeError, ValueError, OverflowError, RuntimeError, NotImplementedError):
         pass
     raise error(f"{what} must be real numbers, got {brief(value)}") from None
+
+
+def number_in(text: str) -> float | None:
+    """The finite number that a text is, as JSON has it or with a sign; None if it is none.
+
+    Python itself reads "1_0", "nan" and digits of other alphabets as well.
+    """
+    if not _NUMBER.fullmatch(text.strip(" \t")):
+        return None
+    value = float(text)
+    return value if np.isfinite(value) else None
+
+
+_NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
+
+
+def can_be_written(text: str) -> bool:
+    """Whether a file can hold a text: not where it has half of a letter, a lone surrogate."""
+    return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+def check_writable(what: str, text: str) -> None:
+    """Refuses a text that no file can hold.
+
+    Raises:
+        ModelError: It has half of a letter.
+    """
+    if not can_be_written(text):
+        raise ModelError(
+            f"{what} has half of a letter (\\ud800 to \\udfff), which no file can hold: {text!a}"
+        )
 
 
 def number(what: str, value: Any, error: type[Exception] = ModelError) -> float:

@@ -1,6 +1,5 @@
 """The command `drake-dae`."""
 
-import argparse
 import gc
 import json
 import logging
@@ -11,17 +10,16 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
-from pathlib import Path
-from typing import Any
 
-import drake_dae
+from drake_dae.commands.options import parse_options
 from drake_dae.errors import (
     DrakeDaeError,
     NonMinimumPhaseWarning,
     ScenarioError,
     describe_os_error,
 )
-from drake_dae.scenario.shipped import DEFAULT_SCENARIO, description, shipped_scenarios
+from drake_dae.scenario.shipped import description, shipped_scenarios
+from drake_dae.simulation.records.interruption import end_at_once, ending_signals
 
 YOUNG = 50_000
 """So many new objects are there before garbage is looked for: what a command loads and builds
@@ -31,8 +29,9 @@ stays, and to look through it as often as Python does takes a sixth of a short r
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code.
 
-    0, or 1 for an error, 2 for a problem that `analyze` found (as for wrong usage), 128 + signal
-    after Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
+    0, or 1 for an error, also where a run ends early; 2 for a problem that `analyze` found, for a
+    run that missed its task where `--check` asks for it, and for wrong usage; 128 + signal after
+    Ctrl-C (130), SIGTERM (143) or SIGHUP (129).
 
     Args:
         arguments: Those after the command's name; those of this process, which then is the
@@ -48,105 +47,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="drake-dae",
-        description="Robots in contact: position and force tracking on Drake's systems framework.",
-    )
-    parser.add_argument("--version", action="version", version=drake_dae.__version__)
-    commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("list", help="name the shipped scenarios")
-    shown = commands.add_parser("show", help="print a scenario, to begin one with")
-    shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
-    shown.add_argument("--path", action="store_true", help="print where its file is instead")
-    commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
-    commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
-    named = argparse.ArgumentParser(add_help=False)
-    named.add_argument(
-        "scenario",
-        nargs="?",
-        default=DEFAULT_SCENARIO,
-        help=f"a shipped scenario or a YAML file (default: {DEFAULT_SCENARIO})",
-    )
-    named.add_argument(
-        "--set",
-        dest="settings",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help='change the scenario, for example "integrator.accuracy=1e-8"; may be repeated',
-    )
-    named.add_argument(
-        "--compiled",
-        choices=["true", "false", "auto"],
-        help="whether functions become machine code, as the scenario's key `compiled`",
-    )
-    run = commands.add_parser("simulate", parents=[named], help="run a scenario")
-    run.add_argument(
-        "--out", type=Path, help="folder for the results (default: runs/<scenario>-<time>)"
-    )
-    run.add_argument(
-        "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
-    )
-    run.add_argument(
-        "--open", action="store_true", help="open the animation in a browser at the end"
-    )
-    run.add_argument(
-        "--rollout",
-        action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function: some fifty times as "
-        "fast where it is machine code, five times as fast where not; the record has every fixed "
-        "step, or 1000 rows under error control",
-    )
-    shown = commands.add_parser("view", help="open the animation of a run in the browser")
-    shown.add_argument("folder", type=Path, help="the folder of the run")
-    examine = commands.add_parser(
-        "analyze",
-        parents=[named],
-        help="examine a scenario without running it",
-        description="Examines the robot of a scenario (relative degrees, index, Assumptions "
-        "(1)-(5), zero dynamics) and what its reference takes: the nearest singularity, control "
-        "and joint forces against their limits, contact forces, joint limits, and when the "
-        "reference leaves what the robot can reach.",
-        epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
-        "error",
-    )
-    examine.add_argument(
-        "--json", action="store_true", help='print JSON; for an error, its text under "error"'
-    )
-    _add_sweep(commands, named)
-    _add_new(commands)
-    written = commands.add_parser(
-        "export",
-        parents=[named],
-        help="write law, plant and projection as C99",
-        description="Writes the law, the plant and the projection of a scenario as plain C99 "
-        "without dependencies, with sizes, names and units, and a test program: `make` in the "
-        "folder compiles it and compares it with Python.",
-    )
-    written.add_argument("--out", type=Path, help="folder for the files (default: <scenario>_c99)")
-    film = commands.add_parser(
-        "film",
-        help="film a run, into a GIF or a strip of pictures",
-        description="Renders what a run left in its folder, with the paths and the forces of its "
-        "contacts. It takes no screen, and no browser.",
-    )
-    film.add_argument("folder", type=Path, help="the folder of a run, as runs/seven_joint_wall")
-    film.add_argument(
-        "--out",
-        type=Path,
-        help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
-    )
-    kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
-    kept.add_argument("--clear", action="store_true", help="remove it all")
-    options = parser.parse_args(arguments)
-    if options.command == "simulate" and options.rollout and options.meshcat:
-        parser.error("--rollout shows nothing while it runs; leave out --meshcat")
+    options = parse_options(arguments)
     if isinstance(sys.stdout, TextIOWrapper):
         # Names may have letters that the terminal does not.
         sys.stdout.reconfigure(errors="backslashreplace")
+    as_json = getattr(options, "json", False)
     try:
         if options.command == "list":
-            return _list()
+            return _list(as_json)
         # What a command needs is loaded with it: Drake alone takes a second.
         ignored: list[type[Warning]] = []
         if options.command == "show":
@@ -175,13 +83,14 @@ def _main(arguments: Sequence[str] | None) -> int:
             options.settings.append(f"compiled={options.compiled}")
         # Drake tells where each Meshcat listens, also the one that only records.
         logging.getLogger("drake").setLevel(logging.WARNING)
-        with _warnings(*ignored):
+        # Files on their way go when a signal ends it.
+        with _warnings(*ignored), ending_signals(end_at_once):
             return run_command(options)
     except DrakeDaeError as error:
         # A scenario has a line for each problem; other texts, as of Drake, are made one.
         text = str(error) if isinstance(error, ScenarioError) else " ".join(str(error).split())
         print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
-        if options.command == "analyze" and options.json:
+        if as_json:
             print(json.dumps({"error": text}))
         return 1
     except BrokenPipeError:
@@ -189,15 +98,21 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        print(f"error: {describe_os_error(error)}", file=sys.stderr)
+        text = describe_os_error(error)
+        print(f"error: {text}", file=sys.stderr)
+        if as_json:
+            print(json.dumps({"error": text}))
         return 1
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
-def _list() -> int:
+def _list(as_json: bool) -> int:
     paths = shipped_scenarios()
+    if as_json:
+        print(json.dumps({name: description(path) for name, path in paths.items()}, indent=2))
+        return 0
     width = max(map(len, paths), default=0)
     for name, path in paths.items():
         print(f"{name.ljust(width)}  {description(path)}")
@@ -212,79 +127,3 @@ def _warnings(*ignored: type[Warning]) -> Iterator[None]:
             warnings.simplefilter("ignore", category)
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         yield
-
-
-def _add_new(commands: Any) -> None:
-    begin = commands.add_parser(
-        "new",
-        help="write a scenario for a robot of your own",
-        description="Writes a scenario for a robot of which only the file is known: it finds base, "
-        "chain and tip, locks what grasps or rolls, puts a surface where the tip reaches it well, "
-        "and has it circle and press there within the limits. Each line says why.",
-    )
-    begin.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
-    begin.add_argument(
-        "--surface",
-        choices=["plane", "cylinder", "sphere"],
-        default="plane",
-        help="what it works on (default: plane)",
-    )
-    begin.add_argument(
-        "--tip",
-        default="",
-        metavar="LINK[:x,y,z]",
-        help="the link or frame that touches, and the point in it in m (default: the end of the "
-        "longest chain)",
-    )
-    begin.add_argument(
-        "--out", type=Path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
-    )
-
-
-def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
-    study = commands.add_parser(
-        "sweep",
-        parents=[named],
-        help="run a scenario many times with other values",
-        description="Runs a scenario once for every combination of the values of some keys, on all "
-        "cores, and leaves a table with figures of each run, a summary and plots. Killed at any "
-        "moment and started again with the same command, it continues where it was.",
-    )
-    study.add_argument(
-        "--vary",
-        action="append",
-        required=True,
-        metavar="KEY=VALUES",
-        help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
-        '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
-        '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
-        '"force.seed=1..20:20"; may be repeated',
-    )
-    chosen = study.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--random",
-        type=int,
-        metavar="COUNT",
-        help="so many runs with random values, all in a range equally likely, instead of a grid",
-    )
-    chosen.add_argument(
-        "--together",
-        action="store_true",
-        help="the first values of all keys, then the second ones, instead of a grid",
-    )
-    study.add_argument("--seed", type=int, default=0, help="of the random values (default: 0)")
-    study.add_argument(
-        "--rollout",
-        action="store_true",
-        help="run without Drake's Simulator, the whole loop as one function, as `simulate "
-        "--rollout` does: many times as fast",
-    )
-    study.add_argument(
-        "--workers", type=int, metavar="COUNT", help="how many processes (default: one per core)"
-    )
-    study.add_argument(
-        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
-    )
-    study.add_argument(
-        "--out", type=Path, help="folder for the results (default: runs/<scenario>-sweep)"
-    )

@@ -4,7 +4,7 @@ import argparse
 
 from drake_dae.errors import MachineCodeError
 from drake_dae.trace.cache import cache_folder, clear, contents
-from drake_dae.trace.compiled import find_compiler
+from drake_dae.trace.compiler import find_compiler
 
 
 def run_command(options: argparse.Namespace) -> int:

@@ -1,27 +1,34 @@
 """`drake-dae export`: writes law, plant and projection of a scenario as C99."""
 
 import argparse
+import json
 from pathlib import Path
 
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ScenarioError
 from drake_dae.running.export.export import export_code
-from drake_dae.scenario.build import build_law_loop
+from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.scenario.start import start_scenario
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Writes the code of the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
-    loop = build_law_loop(scenario)
-    context = start_scenario(scenario, loop)
+    loop, context = build_scenario(scenario)
+    if loop.generator is None:
+        text = "exports know `references` alone; `drake-dae simulate` runs a task"
+        raise ScenarioError(("task", text))
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
-    print(f"written to {folder}/: {', '.join(file.name for file in files)}")
-    if missing := _left_out(scenario, loop):
+    names, missing = [file.name for file in files], _left_out(scenario, loop)
+    if options.json:
+        print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
+        return 0
+    print(f"written to {folder}/: {', '.join(names)}")
+    if missing:
         print(f"not among them: {'; '.join(missing)}")
     return 0
 

@@ -6,6 +6,7 @@ import re
 import warnings
 from pathlib import Path
 
+from drake_dae.arrays import number_in
 from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.new.new_scenario import new_scenario
@@ -37,9 +38,9 @@ def _tip(text: str) -> tuple[str, Vector]:
     found = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
     if found is None:
         return text, (0.0, 0.0, 0.0)
-    try:
-        x, y, z = map(float, found[2].split(","))
-    except ValueError:
+    numbers = [number_in(word) for word in found[2].split(",")]
+    x, y, z = numbers if len(numbers) == 3 else (None, None, None)
+    if x is None or y is None or z is None:
         wanted = "LINK or LINK:x,y,z with three numbers in m"
-        raise ScenarioError(("--tip", f"expected {wanted}, got '{text}'")) from None
+        raise ScenarioError(("--tip", f"expected {wanted}, got '{text}'"))
     return found[1], (x, y, z)

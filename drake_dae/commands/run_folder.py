@@ -5,7 +5,7 @@ import fcntl
 import os
 import shutil
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,15 +33,18 @@ _STAGE = ".unfinished-"
 
 
 @contextmanager
-def run_folder(folder: Path) -> Iterator[None]:
+def run_folder(folder: Path) -> Iterator[Path | None]:
     """Makes the folder of a run, and keeps other runs out of it as long as the block lasts.
 
-    The files of an earlier run are removed, others never. The scenario is there, empty, and holds
-    the lock; no file is written through a symbolic link.
+    The files of an earlier run move into a folder beside it, "<folder>-1", "<folder>-2", ...;
+    others stay. The scenario is there, empty, and holds the lock; no file is written through a
+    symbolic link.
+
+    Yields:
+        The folder that the earlier run is kept in; None if there was none.
 
     Warns:
-        UserWarning: The earlier run was killed and its record is removed, or the file system has
-            no locks.
+        UserWarning: The file system has no locks.
 
     Raises:
         ModelError: The folder cannot be used; why.
@@ -51,7 +54,7 @@ def run_folder(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise ModelError(f"'{folder}' is a file; name a folder")
-        lock = _prepare(folder)
+        lock, kept = _prepare(folder)
     except ModelError:
         raise
     except (OSError, ValueError) as error:  # The latter for text of another encoding.
@@ -59,23 +62,20 @@ def run_folder(folder: Path) -> Iterator[None]:
         where = f" ({path})" if path and Path(path) != folder else ""
         raise ModelError(f"cannot write to '{folder}': {reason}{where}") from None
     try:
-        yield
+        yield kept
     finally:
         os.close(lock)
 
 
-def _prepare(folder: Path) -> int:
-    """The open file with the lock."""
+def _prepare(folder: Path) -> tuple[int, Path | None]:
+    """The open file with the lock, and where an earlier run is kept."""
     folder.mkdir(parents=True, exist_ok=True)
     _check(folder, None)
     lock = os.open(folder / SCENARIO, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:
         _lock(lock, folder)
         _check(folder, (folder / SCENARIO).read_text("utf-8"))
-        if os.path.lexists(folder / PART):
-            warnings.warn(f"{folder / PART} of a run that did not end is removed", stacklevel=5)
-        for file in _present(folder)[1:]:
-            file.unlink()
+        kept = _keep(folder, _present(folder)[1:])
         for stale in folder.glob(f"{_STAGE}*"):
             if stale.is_dir() and not stale.is_symlink():
                 shutil.rmtree(stale)
@@ -83,7 +83,29 @@ def _prepare(folder: Path) -> int:
     except BaseException:
         os.close(lock)
         raise
-    return lock
+    return lock, kept
+
+
+def _keep(folder: Path, files: Sequence[Path]) -> Path | None:
+    """Moves the files of an earlier run beside its folder, with a copy of its scenario."""
+    if not files:
+        return None
+    for file in files:
+        if file.is_dir() and not file.is_symlink():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
+    here, number = folder.absolute(), 1
+    while True:
+        kept = here.with_name(f"{here.name}-{number}")
+        try:
+            kept.mkdir()
+            break
+        except FileExistsError:
+            number += 1
+    # The copy first: a folder of a run is known by it.
+    shutil.copyfile(folder / SCENARIO, kept / SCENARIO)
+    for file in files:
+        file.rename(kept / file.name)
+    return folder.with_name(kept.name) if folder.name else kept
 
 
 def _present(folder: Path) -> list[Path]:

@@ -2,16 +2,17 @@
 
 import argparse
 import gc
+import json
 import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from pydrake.systems.framework import Context
 
@@ -37,16 +38,22 @@ from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.records.record_writer import RecordWriter
-from drake_dae.simulation.remarks import ball_remarks, stop_remarks, surface_remarks
+from drake_dae.simulation.remarks import (
+    ball_remarks,
+    reference_remarks,
+    stop_remarks,
+    surface_remarks,
+)
 from drake_dae.simulation.simulate import RunStatistics, simulate
-from drake_dae.simulation.summary import Limits, summary
+from drake_dae.simulation.summary import Limits, shortfalls, summary
+from drake_dae.simulation.verdict import Verdict, as_data, judge
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -55,6 +62,18 @@ def run_command(options: argparse.Namespace) -> int:
     scenario = load_scenario(path, options.settings)
     if options.open and not scenario.write.animation:
         raise ScenarioError(("write.animation", "--open shows the animation: leave it true"))
+    if not options.json:
+        return _simulate(options, path.stem, scenario)[0]
+    with redirect_stdout(sys.stderr):
+        code, told = _simulate(options, path.stem, scenario)
+    print(json.dumps(told, indent=2))
+    return code
+
+
+def _simulate(
+    options: argparse.Namespace, name: str, scenario: Scenario
+) -> tuple[int, dict[str, Any]]:
+    """Runs a scenario; returns the exit code, and what JSON says of the run."""
     if options.meshcat:
         scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
@@ -62,19 +81,23 @@ def run_command(options: argparse.Namespace) -> int:
     completed, loop = build_completed(scenario, meshcat)
     scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
     simulate_by = _roll if options.rollout else _step
-    print(f"{path.stem}: built in {time.perf_counter() - began:.2f} s", flush=True)
+    print(f"{name}: built in {time.perf_counter() - began:.2f} s", flush=True)
     for note in completed.notes:
         print(note, flush=True)
-    folder = options.out or _unused(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
-    with ending_signals(end_at_once), run_folder(folder):
+    folder = options.out or _unused(f"{name}-{datetime.now():%Y%m%d-%H%M%S}")
+    with ending_signals(end_at_once), run_folder(folder) as kept:
+        if kept is not None:
+            print(f"the earlier run in {folder}/ is kept in {kept}/", flush=True)
         save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
         if meshcat is not None:
             print(f"watch at {meshcat.web_url()}", flush=True)
-        title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
-        code = _run(loop, context, completed, folder, simulate_by, title)
+        title = f"{name}: {scenario.description}" if scenario.description else name
+        code, told = _run(loop, context, completed, folder, simulate_by, title)
     if options.open:
         show(folder)
-    return code
+    if code == 0 and options.check and told.get("missed"):
+        code = 2
+    return code, {"scenario": name, "folder": str(folder), **told}
 
 
 def _unused(name: str) -> Path:
@@ -105,6 +128,7 @@ class _Run:
     failure: str = ""
     pictures: bool = True
     record: Record | None = None
+    told: dict[str, Any] = field(default_factory=dict)
 
 
 def _step(run: _Run) -> RunStatistics:
@@ -166,9 +190,10 @@ def _run(
     folder: Path,
     simulate_by: Callable[[_Run], RunStatistics],
     title: str,
-) -> int:
+) -> tuple[int, dict[str, Any]]:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
-    with RecordWriter(folder / PART, loop.record) as writer:
+    about = {"scenario": scenario_data(completed.scenario)}
+    with RecordWriter(folder / PART, loop.record, about) as writer:
         run = _Run(loop, context, completed.scenario, folder, writer, title, completed.notes)
         try:
             run.statistics = simulate_by(run)
@@ -181,8 +206,8 @@ def _run(
         finally:
             complete = _write(run)
     if run.statistics.interrupted:
-        return 128 + run.statistics.interrupted
-    return 0 if complete else 1
+        return 128 + run.statistics.interrupted, run.told
+    return 0 if complete else 1, run.told
 
 
 def _write(run: _Run) -> bool:
@@ -205,16 +230,22 @@ def _write(run: _Run) -> bool:
         text = summary(
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
         )
+        run.told = _as_data(run, judge(record, predicted, accuracy), reasons)
+        run.told["shortfalls"] = [*shortfalls(record, limits), *map(str, behind)]
+        run.told["missed"] |= bool(run.told["shortfalls"])
         if model is not None:
             material = run.scenario.plant.material
             rolling = ball_remarks(None if material is None else material.radius)
             text = "\n".join([text, *surface_remarks(model, record), *rolling])
+        scenario = run.scenario
+        followed = {**scenario.references, **scenario.exogenous, "task": scenario.task}
+        text = "\n".join([text, *reference_remarks(followed)])
         if changes := loop.changes(run.context):
             stopped = stop_remarks(run.statistics, run.scenario.duration)
             text = "\n".join([text, "", *map(str, changes), *stopped])
         if write.record:
             with _collected(problems):
-                _write_record(record, run)
+                _write_record(replace(record, about=run.writer.about), run)
         with _collected(problems), stage(folder, "summary.txt") as place:
             told = "\n".join([text, *run.notes, ""])
             (place / "summary.txt").write_text(told, encoding="utf-8")
@@ -235,6 +266,7 @@ def _write(run: _Run) -> bool:
                 (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         files = [name for name in (*FILES, PART) if (folder / name).exists()]
+        run.told["files"] = files
         with _collected(problems):
             _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
             if ANIMATION in files:
@@ -253,6 +285,18 @@ def _behind(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBeh
     if "exogenous" in record.signals:
         own[:, plant.exogenous_places] = record["exogenous"]
     return links_behind(plant.model, record.time, record["state"], own)
+
+
+def _as_data(run: _Run, verdict: Verdict, reasons: Sequence[str]) -> dict[str, Any]:
+    """What JSON says of a run."""
+    found = run.statistics
+    return {
+        **as_data(verdict, reasons),
+        "interrupted": found is not None and found.interrupted is not None,
+        "simulated_time": None if found is None else found.simulated_time,
+        "steps": None if found is None else found.steps,
+        "wall_time": None if found is None else found.wall_time,
+    }
 
 
 def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:

@@ -1,12 +1,18 @@
 """`drake-dae sweep`: runs a scenario many times with other values."""
 
 import argparse
+import json
 import sys
+from collections import Counter
+from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
+from drake_dae.analysis.tables import count_of
 from drake_dae.errors import ModelError
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.studies.runs import Outcome
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
 from drake_dae.studies.variations import parse_variations
@@ -14,6 +20,16 @@ from drake_dae.studies.variations import parse_variations
 
 def run_command(options: argparse.Namespace) -> int:
     """Runs the study that the options describe; returns the exit code."""
+    if not options.json:
+        return _sweep(options)[0]
+    with redirect_stdout(sys.stderr):
+        code, told = _sweep(options)
+    print(json.dumps(told, indent=2))
+    return code
+
+
+def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Runs the study; returns the exit code, and what JSON says of it."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     variations = parse_variations(
@@ -35,6 +51,7 @@ def run_command(options: argparse.Namespace) -> int:
             cluster=options.cluster,
             progress=True,
             rollout=options.rollout,
+            time_limit=options.time_limit,
         )
     except KeyboardInterrupt:
         print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
@@ -42,4 +59,21 @@ def run_command(options: argparse.Namespace) -> int:
     files = study.save(folder)
     names = ", ".join([file.name, *(written.name for written in files)])
     print(f"{study}\nwritten to {folder}/: {names}", flush=True)
-    return 0
+    unfinished = [result for result in study.results if result.outcome is not Outcome.FINISHED]
+    told = {
+        "scenario": path.stem,
+        "folder": str(folder),
+        "runs": len(study.results),
+        "outcomes": Counter(str(result.outcome) for result in study.results),
+        "not_finished": [
+            {"run": one.run, "outcome": str(one.outcome), "reason": one.reason}
+            for one in unfinished
+        ],
+        "figures": study.extent(),
+        "files": names.split(", "),
+    }
+    if again := [str(one.run) for one in unfinished if not one.outcome.is_final]:
+        text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
+        print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
+        return 1, told
+    return 2 if unfinished and options.check else 0, told

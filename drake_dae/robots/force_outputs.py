@@ -12,6 +12,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.kinematics import Kinematics
 from drake_dae.robots.links.links import Links
+from drake_dae.trace.smoothness import length_of
 
 
 class ForceOutput(ABC):
@@ -132,7 +133,7 @@ class Squeeze(ForceOutput):
             for name in (self.first, self.second)
         )
         apart = p_j - p_i
-        return ca.dot(apart, f_i - f_j) / (2.0 * ca.norm_2(apart))
+        return ca.dot(apart, f_i - f_j) / (2.0 * length_of(apart))
 
     def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
         return (Signal(self.name or f"{self.first}.{self.second}.squeeze", "N"),)

@@ -81,7 +81,7 @@ class RobotModel:
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, positions, name, loads: The arguments.
+        links, positions, nominal_positions, name, loads: The arguments.
         constraints: The constraints, with those of the plant.
         forces: The force outputs; a name is a `NamedForce`.
         stages: The attached stages.
@@ -144,7 +144,7 @@ class RobotModel:
         motors = [joint.effort_limit for _, joint in bound.joints if joint.motor is not None]
         self.control_limits = np.concatenate([efforts, motors])
         self.loop_joints = LoopState.of(bound, links)
-        nominal = self._nominal(nominal_positions)
+        self.nominal_positions = nominal = self._nominal(nominal_positions)
         steered = (*signals, *(s for f in self.forces for s in f.signals(bound)))
         equations = robot_equations(
             name,

@@ -72,19 +72,6 @@ def build_completed(
     return completed, build_loop(completed.scenario, model, structure, scene_graph, meshcat)
 
 
-def build_law_loop(scenario: Scenario, meshcat: Meshcat | None = None) -> ClosedLoop:
-    """The closed loop of a scenario without a task.
-
-    The arguments and errors are those of `build_scenario`.
-    """
-    loop = build_completed(scenario, meshcat)[1]
-    if loop.generator is None:
-        raise ScenarioError(
-            ("task", "sweeps and exports know `references` alone; `drake-dae simulate` runs a task")
-        )
-    return loop
-
-
 def build_loop(
     scenario: Scenario,
     model: RobotModel,

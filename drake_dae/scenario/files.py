@@ -10,7 +10,15 @@ from typing import Any
 from drake_dae.arguments import checked
 from drake_dae.dae import references
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.typed_yaml import TAG, dump_yaml, load_yaml, put_entry, set_entry
+from drake_dae.files import read_text
+from drake_dae.scenario.forms.typed_yaml import (
+    MOST_TEXT,
+    TAG,
+    dump_yaml,
+    load_yaml,
+    put_entry,
+    set_entry,
+)
 from drake_dae.scenario.scenario import Scenario, scenario_reader
 from drake_dae.systems.task import phases
 
@@ -42,11 +50,11 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, 4 * MOST_TEXT)
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     except (OSError, ValueError) as error:  # A null byte in the path.
-        raise ScenarioError((str(path), str(error))) from None
+        raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
     _check_no_robot(path, text)
     data = load_yaml(text, str(path))
     data = {} if data is None else data

@@ -273,9 +273,17 @@ def _check_exogenous(
 
 
 @at("start.positions")
-def start_guess(positions: dict[str, float], links: Links) -> FloatArray:
-    """q near which the robot starts."""
-    guess = links.default_positions.copy()
+def start_guess(
+    positions: dict[str, float], links: Links, others: FloatArray | None = None
+) -> FloatArray:
+    """q near which the robot starts.
+
+    Args:
+        positions: Joint name -> position.
+        links: The robot.
+        others: Those of all others, shape (nq,); the robot's default if None.
+    """
+    guess = (links.default_positions if others is None else others).copy()
     for name, value in positions.items():
         index = index_of(name, links.position_signals, "joint position")
         low, high = (limits[index] for limits in links.position_limits)

@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.state_feedback import encoder_seed
+from drake_dae.errors import ModelError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
@@ -16,12 +17,21 @@ from drake_dae.scenario.scenario import Scenario
 ROWS = 1000
 """So many rows has the record of a rollout under error control, after the first."""
 
+MOST_ROWS = 1e7
+"""Of more rows, each a fixed step, the record takes gigabytes."""
+
 
 def rollout_times(scenario: Scenario) -> FloatArray:
     """When the record of a scenario's rollout has rows, in s: even ones, or the fixed steps."""
     config, rows = scenario.integrator, ROWS
     if not config.use_error_control:
-        rows = max(1, ceil(scenario.duration / config.max_step_size - 0.01))
+        steps = scenario.duration / config.max_step_size
+        if steps > MOST_ROWS:
+            raise ModelError(
+                f"max_step_size {config.max_step_size:g} s makes {steps:.2g} rows for "
+                f"{scenario.duration:g} s; a rollout keeps at most {MOST_ROWS:g}"
+            )
+        rows = max(1, ceil(steps - 0.01))
     times: FloatArray = config.start_time + np.linspace(0.0, scenario.duration, rows + 1)
     return times
 

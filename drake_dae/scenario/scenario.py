@@ -16,6 +16,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from drake_dae.arrays import listed
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
+from drake_dae.scenario.forms.problems import without_tags
 from drake_dae.scenario.forms.reader import Reader
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
@@ -206,9 +207,16 @@ def scenario_reader() -> Reader[Scenario]:
     return Reader(Scenario)
 
 
-def scenario_schema() -> dict[str, Any]:
-    """The JSON Schema of a scenario as plain data, where a tag is an entry "_tag"."""
-    return scenario_reader().schema
+def scenario_schema(tags: bool = True) -> dict[str, Any]:
+    """The JSON Schema of a scenario as plain data.
+
+    Args:
+        tags: Whether the data have tags as entries "_tag", as those of `read_scenario` do. Without,
+            it is for data that have none, as a plain reader of YAML or an editor gives them: any
+            form fits where a tag chooses.
+    """
+    schema = scenario_reader().schema
+    return schema if tags else dict(without_tags(schema))
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:

@@ -77,7 +77,8 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
     positions, forces = np.split(wanted, [len(model.position_signals)])
     with at("start"):
-        guess = start_guess(scenario.start.positions, model.links)
+        # Where nothing is said, near what the robot was completed with: that is told nowhere else.
+        guess = start_guess(scenario.start.positions, model.links, model.nominal_positions)
         q = _configuration(model, positions, guess, parameters)
         state = model.rest_state(q, forces, parameters)
         if scenario.exogenous:

@@ -1,8 +1,13 @@
 """What a run should say of the surfaces that a robot touched, and of how it ended."""
 
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
+from drake_dae.dae.references import Reference
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.records.record import Record
@@ -57,6 +62,30 @@ def ball_remarks(radius: float | None) -> list[str]:
         "an angle a the ball rolls,\nand touches 2 * radius * sin(a / 2) beside the point of the "
         "constraint; no stiffness changes that, a smaller\nplant.radius does."
     ]
+
+
+def reference_remarks(references: Mapping[str, Any]) -> list[str]:
+    """What of the references is approximate.
+
+    Args:
+        references: What holds references, in lists, mappings and data classes, by name.
+    """
+    return list(dict.fromkeys(_told(references)))
+
+
+def _told(one: Any, name: str = "") -> Iterator[str]:
+    if isinstance(one, Reference):
+        if one.remark:
+            yield f"{name}: {one.remark}" if name else one.remark
+    elif isinstance(one, Mapping):
+        for key, inner in one.items():
+            yield from _told(inner, key)
+    elif isinstance(one, (list, tuple)):
+        for inner in one:
+            yield from _told(inner, name)
+    elif is_dataclass(one):
+        for part in fields(one):
+            yield from _told(getattr(one, part.name), name)
 
 
 def stop_remarks(statistics: RunStatistics | None, duration: float) -> list[str]:

@@ -15,14 +15,15 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import (
     ApplySimulatorConfig,
     GetIntegrationSchemes,
     Simulator,
     SimulatorConfig,
 )
-from pydrake.systems.framework import Context, EventStatus, System
-from pydrake.systems.primitives import Integrator
+from pydrake.systems.framework import Context, Diagram, EventStatus, System
+from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
@@ -68,7 +69,7 @@ def simulate(
     diagram: System,
     context: Context,
     duration: float,
-    config: SimulatorConfig,
+    config: SimulatorConfig | None = None,
     progress: bool = False,
     after_step: Callable[[Context], None] | None = None,
     may_diverge: bool = False,
@@ -77,6 +78,9 @@ def simulate(
 
     A run of a `Plant` that diverges ends, with what grew and since when: see `DivergenceWatch`.
 
+    A run that goes on from the end of another one, with that as its start_time, adds to its logs.
+    One that begins earlier is a new one, and clears them.
+
     Ctrl-C, SIGTERM and SIGHUP end the run after the current step, a second one at once with a
     KeyboardInterrupt. Logs keep what they have, as they do when the run fails with an exception.
 
@@ -84,7 +88,7 @@ def simulate(
         diagram: The system.
         context: Its context with the start state; changed in place.
         duration: How long to simulate, in s.
-        config: Drake's integrator settings. The run begins at its start_time.
+        config: Drake's integrator settings; its defaults if None. The run begins at its start_time.
         progress: Shows simulated time and speed on stderr.
         after_step: Called with the context after each step, such as `RecordWriter.update`.
         may_diverge: Whether a run that diverges goes on.
@@ -97,12 +101,14 @@ def simulate(
         InconsistentStateError: The start state is not on the manifold.
         SimulationError: The run cannot go on, or diverges; the exception has time and state.
     """
+    config = config or SimulatorConfig()
     check_duration(duration)
     check_config(config)
     _check_times(config.start_time, duration)
-    _warn_of_many_steps(duration, config.max_step_size)
+    _warn_of_many_steps(duration, _longest_step(diagram, config.max_step_size))
     simulator = Simulator(diagram, context)
     ApplySimulatorConfig(config, simulator)
+    _forget_later(diagram, context, config.start_time)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
@@ -159,12 +165,40 @@ def simulate(
         return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
 
 
-def _warn_of_many_steps(duration: float, max_step_size: float) -> None:
-    least = duration / max_step_size
+def _forget_later(system: System, context: Context, start: float) -> None:
+    """Clears the logs that hold what is later than the start of a run, in s."""
+    if isinstance(system, Diagram):
+        for part in system.GetSystems():
+            _forget_later(part, context, start)
+    elif isinstance(system, VectorLogSink):
+        log = system.FindMutableLog(context)
+        if log.num_samples() and log.sample_times()[-1] > start:
+            log.Clear()
+
+
+def _longest_step(system: System, max_step_size: float) -> tuple[str, float]:
+    """What limits steps most, in words, and the longest step in s: it ends at each sample."""
+    least = "max_step_size", max_step_size
+    if isinstance(system, Diagram):
+        for part in system.GetSystems():
+            least = min(least, _longest_step(part, least[1]), key=lambda pair: pair[1])
+        return least
+    if isinstance(system, MultibodyPlant):
+        what, period = "the plant's time step", system.time_step()
+    else:
+        what, period = "the sample period", getattr(system, "sample_period", None) or 0.0
+    if 0.0 < period < max_step_size:
+        return f"{what} of '{system.get_name()}',", period
+    return least
+
+
+def _warn_of_many_steps(duration: float, longest: tuple[str, float]) -> None:
+    what, step = longest
+    least = duration / step
     if least > MANY_STEPS:
         hours = least * TYPICAL_STEP / 3600.0
         warnings.warn(
-            f"max_step_size {max_step_size:g} s takes at least {least:.2g} steps for {duration:g} "
+            f"{what} {step:g} s takes at least {least:.2g} steps for {duration:g} "
             f"s, about {hours:.2g} hours if a step takes {1e3 * TYPICAL_STEP:g} ms, and each is "
             "kept in memory; Ctrl-C ends the run and keeps its record",
             stacklevel=3,

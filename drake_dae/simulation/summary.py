@@ -112,7 +112,7 @@ def summary(
         ended = f"The run ended early, at {record.time[-1]:.4g} s"
         reasons = ["of what ended it, see above"]
     words = in_words(judge(record, predicted, accuracy), accuracy, reasons, ended)
-    beware = [*_beware(record, limits), *map(str, behind)]
+    beware = [*shortfalls(record, limits), *map(str, behind)]
     verdict = [fill(f"{words} But {'; '.join(beware)}." if beware else words, _WIDTH)]
     return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
 
@@ -220,8 +220,13 @@ def _pulls(signal: Signal, values: FloatArray, limits: Limits) -> bool:
     return bool(np.min(values) < 0.0) and not limits.can_pull(signal)
 
 
-def _beware(record: Record, limits: Limits) -> list[str]:
-    """What a robot would not do that tracks as well as this."""
+def shortfalls(record: Record, limits: Limits) -> list[str]:
+    """What a robot would not do that tracks as well as this, each in words.
+
+    Args:
+        record: A record with constraint_force and control.
+        limits: What the robot can take.
+    """
     forces, controls = record.signals["constraint_force"], record.signals["control"]
     pulling = [
         signal.name

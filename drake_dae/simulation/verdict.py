@@ -1,8 +1,10 @@
-"""Whether a run went as theory predicts, as a value and in words."""
+"""Whether a run went as theory predicts, as a value, as data and in words."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import isfinite
+from typing import Any
 
 import numpy as np
 
@@ -113,6 +115,41 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     off = float(np.max(np.abs(error - predicted)[:, column]))
     settled = float(np.max(shares[len(shares) // 2 :]))
     return Verdict(tracking, signals[column], off, float(record.time[row]), share, settled)
+
+
+def is_missed(verdict: Verdict, reasons: Sequence[str] = ()) -> bool:
+    """Whether a run missed its task: it is off, and stays so or has no reason to be.
+
+    Args:
+        verdict: The verdict.
+        reasons: Why a run is not as predicted, as in `in_words`.
+    """
+    is_off = verdict.tracking is Tracking.OFF
+    return is_off and not (reasons and verdict.settled <= NEAR)
+
+
+def as_data(verdict: Verdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
+    """A verdict as plain data, where a number that is not finite is None.
+
+    Args:
+        verdict: The verdict.
+        reasons: Why a run is not as predicted, as in `in_words`.
+    """
+    worst = verdict.worst
+    return {
+        "missed": is_missed(verdict, reasons),
+        "tracking": verdict.tracking.name.lower(),
+        "worst_output": None if worst is None else worst.name,
+        "off_prediction": _finite(verdict.off),
+        "unit": "" if worst is None else worst.unit,
+        "share_of_size": _finite(verdict.share),
+        "share_in_second_half": _finite(verdict.settled),
+        "reasons": list(reasons),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def in_words(

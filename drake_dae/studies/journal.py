@@ -43,7 +43,8 @@ class Journal:
 
     Attributes:
         path: The file.
-        results: Number of a run -> its result, of all that are in the file.
+        results: Number of a run -> its result, of all that are in the file: the first final one, or
+            else the last one.
     """
 
     def __init__(self, path: Path, file: int, results: dict[int, RunResult]) -> None:
@@ -139,7 +140,7 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
     try:
         found = json.loads(first)
         known = found["study"]
-    except (ValueError, TypeError, LookupError):
+    except (ValueError, TypeError, LookupError, RecursionError):
         raise ModelError(f"'{path}' is no file of a study; choose another name") from None
     if known != FORMAT:
         raise ModelError(f"'{path}' has format {brief(known)}, this version writes {FORMAT}")
@@ -154,12 +155,18 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
     for place, line in enumerate(lines, start=2):
         try:
             result = RunResult.from_dict(json.loads(line))
-        except (ValueError, TypeError, LookupError, AttributeError):
-            if place == len(lines) + 1:  # Zeros, where a machine lost its power.
+            if result.run >= len(head["variations"]):
+                raise LookupError(result.run)
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+            is_json = not isinstance(error, (json.JSONDecodeError, UnicodeDecodeError))
+            if place == len(lines) + 1 and not is_json:  # Zeros, where a machine lost its power.
                 rest = line + b"\n" + rest
                 break
-            raise ModelError(f"'{path}' was changed: line {place} is no run of a study") from None
-        results.setdefault(result.run, result)
+            raise ModelError(
+                f"'{path}' was changed: line {place} is no run of this study"
+            ) from None
+        if not (result.run in results and results[result.run].outcome.is_final):
+            results[result.run] = result
     if rest:
         os.ftruncate(file, os.fstat(file).st_size - len(rest))
         os.fsync(file)

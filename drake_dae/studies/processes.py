@@ -16,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import suppress
+from math import isfinite
 from typing import IO, Any
 
 from drake_dae.errors import ModelError
@@ -27,6 +28,9 @@ BUILDS = 200
 
 PERIOD = 0.02
 """Results are told this often, in s: those of short runs are synced to the disk together."""
+
+STARTING = 300.0
+"""So long a process may take until it is ready, in s."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -42,7 +46,10 @@ def cores() -> int:
 
 
 def run_in_processes(
-    settings: Sequence[Any], batches: Sequence[Batch], workers: int
+    settings: Sequence[Any],
+    batches: Sequence[Batch],
+    workers: int,
+    time_limit: float = float("inf"),
 ) -> Generator[list[RunResult], None, None]:
     """The results of all runs, as they come, whoever is first.
 
@@ -50,6 +57,7 @@ def run_in_processes(
         settings: The arguments of `Runner`, as plain data.
         batches: The runs.
         workers: How many processes.
+        time_limit: How long a run may take, in s; a process that takes longer is ended.
 
     Raises:
         ModelError: A process does not start.
@@ -65,8 +73,10 @@ def run_in_processes(
                     worker = _Worker(settings)
                     running.append(worker)
                     selector.register(worker.output, selectors.EVENT_READ, worker)
-                due = told + PERIOD - time.monotonic()
-                for key, _ in selector.select(max(0.0, due) if found else None):
+                now = time.monotonic()
+                due = min(worker.due(time_limit) for worker in running) - now
+                due = min(due, told + PERIOD - now) if found else due
+                for key, _ in selector.select(max(0.0, due) if isfinite(due) else None):
                     worker = key.data
                     is_open = worker.read()
                     found += worker.take()
@@ -81,6 +91,9 @@ def run_in_processes(
                         worker.give(waiting.popleft())
                     elif worker.is_idle:
                         worker.dismiss()
+                for worker in running:
+                    if time.monotonic() >= worker.due(time_limit):
+                        worker.stop(time_limit)  # What it is about is told when its output ends.
                 if found and (time.monotonic() >= told + PERIOD or not (waiting or running)):
                     told = time.monotonic()
                     yield found
@@ -98,6 +111,7 @@ class _Worker:
         left: The runs that it was given and has not told of.
         is_idle: Whether it waits for runs.
         builds: How many loops it has built.
+        began: When it began what it does, by the monotonic clock in s; infinite while it is idle.
     """
 
     def __init__(self, settings: Sequence[Any]) -> None:
@@ -119,7 +133,9 @@ class _Worker:
         self.left: Batch = []
         self.is_idle = False
         self.builds = 0
+        self.began = time.monotonic()
         self._is_ready = False
+        self._limit: float | None = None
         self._text = b""
         self._results: list[RunResult] = []
         self._send(settings)
@@ -127,6 +143,7 @@ class _Worker:
     def give(self, batch: Batch) -> None:
         """Gives it runs."""
         self.left, self.is_idle = list(batch), False
+        self.began = time.monotonic()
         self._send(self.left)
 
     def dismiss(self) -> None:
@@ -142,11 +159,22 @@ class _Worker:
             told = json.loads(line)
             if "builds" in told:
                 self._is_ready = self.is_idle = True
-                self.builds = told["builds"]
+                self.began, self.builds = float("inf"), told["builds"]
             else:
                 self._results.append(RunResult.from_dict(told))
-                self.left = self.left[1:]
+                self.left, self.began = self.left[1:], time.monotonic()
         return bool(data)
+
+    def due(self, limit: float) -> float:
+        """When it has taken longer than a run may, by the monotonic clock in s."""
+        return self.began + (limit if self._is_ready else max(limit, STARTING))
+
+    def stop(self, limit: float) -> None:
+        """Ends it, since its run takes longer than a limit in s; `read` and `close` tell it."""
+        if self._limit is None:
+            self._limit = limit
+            self._process.kill()
+        self.began = float("inf")
 
     def take(self) -> list[RunResult]:
         """The results since the last call."""
@@ -167,6 +195,9 @@ class _Worker:
         said = next((line.strip() for line in reversed(lines) if line.strip()), "")
         how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         reason = f"the process ended with {how}" + (f": {said[:200]}" if said else "")
+        outcome = Outcome.CRASHED
+        if self._limit is not None:
+            outcome, reason = Outcome.TIMED_OUT, f"no end within {self._limit:g} s"
         if not self._is_ready:
             raise ModelError(f"no process for the runs of a study starts; {reason}")
         if code in _ENDED:
@@ -175,7 +206,7 @@ class _Worker:
             return None
         (number, _), *rest = self.left
         self.left = rest
-        return RunResult(number, Outcome.CRASHED, reason)
+        return RunResult(number, outcome, reason)
 
     def kill(self) -> None:
         """Ends it at once."""

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import lru_cache
+from math import isfinite
 from threading import Lock
 from typing import Any, Self, cast
 
@@ -47,6 +48,13 @@ class Outcome(StrEnum):
     """The scenario does not fit together, or violates an assumption."""
     CRASHED = "crashed"
     """The process ended, or failed in a way that it should not."""
+    TIMED_OUT = "timed out"
+    """The process was ended, since the run took longer than it may."""
+
+    @property
+    def is_final(self) -> bool:
+        """Whether it tells of the run itself: one whose process was ended may be tried again."""
+        return self not in (Outcome.CRASHED, Outcome.TIMED_OUT)
 
 
 @dataclass(frozen=True)
@@ -83,7 +91,18 @@ class RunResult:
         values = dict(data)
         values["outcome"] = Outcome(values["outcome"])
         values["exceeded"] = tuple(values["exceeded"])
-        return cls(**values)
+        found = cls(**values)
+        numbers = [*found.figures.values(), found.seconds]
+        if not (
+            type(found.run) is int
+            and found.run >= 0
+            and all(type(number) in (int, float) and isfinite(number) for number in numbers)
+            and all(isinstance(text, str) for text in (found.reason, *found.exceeded))
+            and isinstance(found.figures, dict)
+            and found.seconds >= 0.0
+        ):
+            raise ValueError("no result of a run")
+        return found
 
 
 Batch = Sequence[tuple[int, Variation]]

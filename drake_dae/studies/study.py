@@ -86,6 +86,18 @@ class Study:
             **{name: [r.figures.get(name) for r in self.results] for name in self.figures},
         }
 
+    def extent(self) -> dict[str, dict[str, float]]:
+        """Name of a figure -> its least, median and largest value over the runs that have it."""
+        found = {}
+        for name in self.figures:
+            values = self.values(name)
+            found[name] = {
+                "least": float(np.nanmin(values)),
+                "median": float(np.nanmedian(values)),
+                "largest": float(np.nanmax(values)),
+            }
+        return found
+
     def save(self, folder: str | Path) -> list[Path]:
         """Writes `runs.csv`, `summary.txt`, and the plots that the study has figures for.
 

@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_whole_number
+from drake_dae.arrays import check_whole_number, positive
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.model import complete_scenario
@@ -40,12 +40,14 @@ def sweep(
     cluster: str | None = None,
     progress: bool = False,
     rollout: bool = False,
+    time_limit: float = 3600.0,
 ) -> Study:
     """Runs a scenario once for each variation; what runs come to is in a file from then on.
 
     A study that ended early, by whatever, continues when the same call is made again: runs that the
     file has are not run again, and the table is the same as without the interruption. Runs that
-    fail are outcomes with a reason. Before the first run, keys and values are checked, of numbers
+    fail are outcomes with a reason; those whose process died or was too slow are run again by the
+    next call. Before the first run, keys and values are checked, of numbers
     the least and the largest, and the first, the middle or the last variation is built.
 
     Runs that differ in start, plant_parameters, seed of the sensor, gains that couple no outputs,
@@ -63,6 +65,8 @@ def sweep(
         rollout: Runs by `rollout` in place of Drake's Simulator, many times as fast; machine code
             is made where that pays for the whole study. Figures are those of 1,000 even rows of
             each run, of all steps where these are fixed.
+        time_limit: How long a run may take on this machine by the clock, in s, building included: a
+            process that takes longer, as one that was stopped does, is ended.
 
     Raises:
         ScenarioError: A key or a value cannot be used, or no variation that was tried starts, or a
@@ -77,13 +81,14 @@ def sweep(
     _check(base, chosen)
     if workers is not None:
         check_whole_number("workers", workers, 1)
+    positive("time_limit", time_limit)
     path, head = Path(file), study_head(version("drake_dae"), base, chosen, rollout)
     settings = base, lasting(base, chosen) if rollout else None
     with ending_signals(end_at_once):
         if not os.path.lexists(path):
             _try(Runner(*settings), chosen)
         with open_journal(path, head) as journal:
-            _run(settings, chosen, journal, workers, cluster, progress)
+            _run(settings, chosen, journal, workers, cluster, progress, time_limit)
     return Study(tuple(chosen), tuple(journal.results[run] for run in range(len(chosen))))
 
 
@@ -94,9 +99,11 @@ def _run(
     workers: int | None,
     cluster: str | None,
     progress: bool,
+    time_limit: float,
 ) -> None:
     """Runs what is missing, and puts it into the journal as it comes."""
-    missing = [pair for pair in enumerate(variations) if pair[0] not in journal.results]
+    final = {run for run, result in journal.results.items() if result.outcome.is_final}
+    missing = [pair for pair in enumerate(variations) if pair[0] not in final]
     if not missing:
         return
     base, total = settings[0], len(variations)
@@ -104,7 +111,7 @@ def _run(
         if cluster is None:
             count = workers or cores()
             portions = batches(base, missing, count)
-            _collect(run_in_processes(settings, portions, count), journal, show)
+            _collect(run_in_processes(settings, portions, count, time_limit), journal, show)
             return
         with Cluster(cluster) as connected:
             portions = batches(base, missing, connected.workers)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import product
-from math import prod
+from math import isfinite, prod
 from typing import Any
 from zlib import crc32
 
@@ -152,7 +152,13 @@ def _ends(key: str, found: re.Match[str]) -> tuple[float, float]:
     if not (np.isfinite([low, high]).all() and low < high):
         text = found[0].strip()
         raise _wrong(key, f"{text} is an empty range; the first number is the lower one")
+    _check_width(key, low, high)
     return low, high
+
+
+def _check_width(key: str, low: float, high: float) -> None:
+    if not isfinite(float(high) - float(low)):
+        raise _wrong(key, f"the range from {low:g} to {high:g} is wider than the largest number")
 
 
 def _is_whole_number(key: str, low: float, high: float, data: Mapping[str, Any]) -> bool:
@@ -174,9 +180,12 @@ def _values(key: str, given: Any) -> list[Any]:
         given = list(given)
     if not isinstance(given, (list, tuple, range)):
         raise _wrong(key, f"expected a list of values, got {brief(given)}")
-    if not len(given):
+    if not given:
         raise _wrong(key, "expected at least one value")
-    _check_count(len(given))
+    try:
+        _check_count(len(given))
+    except OverflowError:  # Of a range.
+        raise _wrong(key, f"{brief(given)} has more values than a study has runs") from None
     return [plain(key, value) for value in given]
 
 
@@ -186,10 +195,13 @@ def _drawn(key: str, given: Any, count: int, seed: int) -> list[Any]:
         low, high = vector(f"the range of {key}", given, 2)
         if not low < high:
             raise _wrong(key, f"the range {brief(given)} is empty; the first is the lower one")
+        _check_width(key, low, high)
         share = random.random(count)
         return (low * (1.0 - share) + high * share).tolist()
     # One number of the generator for each value, so that more runs begin with the same ones.
-    if isinstance(given, range) and len(given):
+    if isinstance(given, range) and given:
+        if given[-1] - given[0] > 2**53:
+            raise _wrong(key, f"{brief(given)} has more whole numbers than can be drawn from")
         return [given[int(len(given) * share)] for share in random.random(count)]
     values = _values(key, given)
     chosen = [values[int(len(values) * share)] for share in random.random(count)]

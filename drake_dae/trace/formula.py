@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import casadi as ca
 
-from drake_dae.arrays import unknown_name
+from drake_dae.arrays import number_in, unknown_name
 from drake_dae.errors import ModelError
 
 MOST_LETTERS = 10_000
@@ -115,12 +115,10 @@ class _Formula:
         raise self._wrong(node, f"'{self._piece(node)}' {self._remedy(node)}")
 
     def _number(self, node: ast.Constant) -> ca.SX:
-        try:
-            number = float(node.value)  # type: ignore[arg-type]
-        except OverflowError:
-            number = float("inf")
-        if number == float("inf"):
-            raise self._wrong(node, f"{self._piece(node)} is too large a number")
+        # Python also has 1_000 and 0x10; and what is too large it makes infinite.
+        number = number_in(ast.get_source_segment(self.text, node) or "")
+        if number is None:
+            raise self._wrong(node, f"{self._piece(node)} is no number, or is too large a number")
         return ca.SX(number)
 
     def _call(self, node: ast.Call, name: str) -> ca.SX:

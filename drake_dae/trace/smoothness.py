@@ -21,6 +21,18 @@ _KINKS = {
 """Operations of CasADi that are not smooth."""
 
 
+def length_of(vector: ca.SX) -> ca.SX:
+    """The length of a column, with derivatives of all orders wherever it is not zero.
+
+    Of a column with one entry e CasADi makes sqrt(e^2) = fabs(e), which it differentiates but once.
+    That entry is here turned into a plane: e^2 = (0.6 e)^2 + (0.8 e)^2.
+    """
+    entries = [entry for entry in ca.vertsplit(vector) if not entry.is_zero()]
+    if len(entries) == 1:
+        return ca.norm_2(ca.vertcat(0.6 * entries[0], 0.8 * entries[0]))
+    return ca.norm_2(vector)
+
+
 @dataclass(frozen=True)
 class Flaw:
     """What keeps an expression from being differentiated.

@@ -61,7 +61,8 @@ TURNS = (
 )
 TO_AND_FRO = Path(__file__).parent / "to_and_fro.csv"
 RESTS = (
-    f"references={{tool.y: !Csv {{file: '{TO_AND_FRO}', columns: [y], smoothing: 0.1}},"
+    f"references={{tool.y: !Csv {{file: '{TO_AND_FRO}', columns: [y], smoothing: 0.1,"
+    " tolerance: 0.03},"
     " tool.z: 0.7, tool.z_axis: 0.0, 'joint3, joint7': 0.0,"
     " wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}}",
 )

@@ -164,7 +164,7 @@ def mujoco_model(tree: Tree, equality: str, *sites: tuple[int, RigidTransform]):
     bodies = fixed(WORLD) + "".join(map(body, inside[0]))
     return mujoco.MjModel.from_xml_string(
         '<mujoco><compiler angle="radian" autolimits="false"/>'
-        '<option><flag contact="disable" limit="disable"/></option>'
+        '<option><flag contact="disable" limit="disable" island="disable"/></option>'
         f"<worldbody>{bodies}</worldbody><equality>{equality}</equality></mujoco>"
     )
 

@@ -16,7 +16,7 @@ from test_speed import empty_loop, stepping
 
 from drake_dae import build_scenario, export_code, simulate
 from drake_dae.errors import MachineCodeError
-from drake_dae.trace.compiled import find_compiler
+from drake_dae.trace.compiler import find_compiler
 from drake_dae.trace.functions import TracedFunction
 
 SCENARIOS = ["two_link_wall", "seven_joint_wall", "seven_joint_flexible_motors", "two_arms"]

@@ -14,7 +14,7 @@ from scipy.integrate import DOP853
 
 from drake_dae import build_scenario, rollout, simulate, start_values
 from drake_dae.errors import MachineCodeError
-from drake_dae.trace.compiled import find_compiler
+from drake_dae.trace.compiler import find_compiler
 
 FIXED = [
     "integrator.integration_scheme=runge_kutta3",

@@ -129,6 +129,14 @@ def _bad_value(choice: random.Random, folder: Path) -> BadInput:
 def _excuse_of_value(path: str, before: Any, after: Any) -> str:
     if before == after and type(before) is type(after):
         return "it is what it was"
+    if path.startswith(("references.", "exogenous.")) and _is_constant(after):
+        return "a number is a constant reference" if abs(after) <= 1e15 else LOST
+    if path.startswith("gains.") and before == after:
+        return "it is what it was"
+    if path.startswith("gains.") and isinstance(before, float) and after == -1.0:
+        return "another pole, or a gain that is refused where it makes errors grow"
+    if after is None and path.split(".")[-1] in _OR_NOTHING:
+        return "nothing is its default"
     if path == "description" or path.endswith(".name"):
         return "any text is a name" if isinstance(after, str) else ""
     if isinstance(after, (list, dict)):
@@ -143,6 +151,14 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
     if isinstance(before, (int, float)) and (SIGNED.search(path) or after > 0):
         return "another finite number with a meaning"
     return ""
+
+
+_OR_NOTHING = ("gains", "integral", "observer", "task", "forces", "effort_limit")
+"""Keys that may hold nothing."""
+
+
+def _is_constant(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
 
 
 def _bad_structure(choice: random.Random, folder: Path) -> BadInput:
@@ -198,6 +214,8 @@ def _bad_robot(choice: random.Random, folder: Path) -> BadInput:
         element = re.findall(r"<([?\w:]+)", text[: found.start()])[-1]
         how = f'{element} {found[0]} becomes "{new}"'
         excuse = _excuse_of_attribute(element, found[1], new)
+        if new == found[2]:
+            excuse = "it is what it was"
     elif choice.random() < 0.5:
         lines = text.splitlines(keepends=True)
         index = choice.randrange(len(lines))

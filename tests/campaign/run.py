@@ -15,10 +15,16 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 
-from campaign import bad_inputs, drops, random_robots
+from campaign import bad_files, bad_inputs, drops, random_robots
 from campaign.outcomes import BAD, CLASSES, HANG, RESULT, Outcome
 
-ATTEMPTS = {"input": bad_inputs.attempt, "robot": random_robots.attempt, "drop": drops.attempt}
+ATTEMPTS = {
+    "input": bad_inputs.attempt,
+    "file": bad_files.attempt,
+    "several": bad_files.several,
+    "robot": random_robots.attempt,
+    "drop": drops.attempt,
+}
 
 TIME_LIMIT = 60.0
 """For one attempt, s; the slowest that ends takes a third of it on a busy machine."""
@@ -129,6 +135,8 @@ def _table(title: str, counts: Counter[str]) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1500, help="bad inputs")
+    parser.add_argument("--files", type=int, default=1000, help="bad files and command lines")
+    parser.add_argument("--several", type=int, default=500, help="several bad settings at once")
     parser.add_argument("--robots", type=int, default=500, help="random robots")
     parser.add_argument("--drops", type=int, default=1000, help="drops onto a floor")
     parser.add_argument("--seed", type=int, default=0, help="of the first of each")
@@ -137,6 +145,8 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write every outcome into a file")
     given = parser.parse_args()
     items = [("input", given.seed + i) for i in range(given.count)]
+    items += [("file", given.seed + i) for i in range(given.files)]
+    items += [("several", given.seed + i) for i in range(given.several)]
     items += [("robot", given.seed + i) for i in range(given.robots)]
     items += [("drop", given.seed + i) for i in range(given.drops)]
     began = time.monotonic()

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from campaign import bad_inputs, drops, random_robots
+from campaign import bad_files, bad_inputs, drops, random_robots
 from campaign.outcomes import BAD, REFUSED, RESULT
 
 FEW, MANY = range(40), range(40, 110)
@@ -20,6 +20,18 @@ def each(few, many):
 @pytest.mark.parametrize("seed", each(FEW, MANY))
 def test_a_bad_input_is_refused_or_runs_with_a_reason(seed: int, tmp_path: Path):
     outcome = bad_inputs.attempt(seed, tmp_path)
+    assert outcome.kind not in BAD, outcome
+
+
+@pytest.mark.parametrize("seed", each(range(30), range(30, 60)))
+def test_a_bad_file_or_command_is_refused_or_read_with_a_reason(seed: int, tmp_path: Path):
+    outcome = bad_files.attempt(seed, tmp_path)
+    assert outcome.kind not in BAD, outcome
+
+
+@pytest.mark.parametrize("seed", each(range(10), range(10, 25)))
+def test_several_mistakes_at_once_end_as_a_message(seed: int, tmp_path: Path):
+    outcome = bad_files.several(seed, tmp_path)
     assert outcome.kind not in BAD, outcome
 
 
@@ -44,7 +56,15 @@ def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path:
 def test_the_command_prints_counts():
     command = [sys.executable, Path(__file__).with_name("run.py"), "--processes", "2"]
     done = subprocess.run(
-        [*command, "--count", "10", "--robots", "2", "--drops", "1", "--seed", "100"],
+        [
+            *command,
+            "--count=10",
+            "--files=5",
+            "--several=2",
+            "--robots=2",
+            "--drops=1",
+            "--seed=100",
+        ],
         capture_output=True,
         text=True,
         timeout=120,

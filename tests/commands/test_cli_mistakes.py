@@ -21,7 +21,7 @@ from drake_dae.scenario.shipped import find_scenario
 
 
 @pytest.mark.slow
-def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path, capsys):
+def test_an_earlier_run_moves_away_and_other_files_stay(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
     assert main([*arguments, *QUICK]) == 0
     (tmp_path / "notes.txt").write_text("mine")

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+from pathlib import Path
 
 import pytest
 
@@ -29,16 +30,42 @@ def test_two_runs_into_one_folder(tmp_path):
         assert (tmp_path / "run" / SCENARIO).read_text() == ""
 
 
-def test_what_a_killed_run_left_is_removed(earlier):
+def test_what_a_killed_run_left_is_kept_but_for_what_is_in_pieces(earlier):
     (earlier / ".unfinished-abc").mkdir()
     (earlier / ".unfinished-abc" / "record.npz").write_text("")
-    (earlier / PART).write_text("")
+    (earlier / PART).write_text("rows")
     (earlier / "notes.txt").write_text("mine")
-    with (
-        pytest.warns(UserWarning, match=r"record\.part of a run that did not end is removed"),
-        run_folder(earlier),
-    ):
+    with run_folder(earlier) as kept:
         assert sorted(path.name for path in earlier.iterdir()) == ["notes.txt", SCENARIO]
+    assert sorted(path.name for path in kept.iterdir()) == [PART, SCENARIO]
+    assert (kept / PART).read_text() == "rows"
+
+
+@pytest.mark.parametrize("files", [["record.npz"], [*FILES[1:], "film.gif"], [PART]])
+def test_each_earlier_run_is_kept_whole_under_a_name_of_its_own(files, tmp_path):
+    folder, found = tmp_path / "run", []
+    for number in range(4):
+        with run_folder(folder) as kept:
+            found.append(kept)
+            (folder / SCENARIO).write_text(f"{MARK}\n{number}")
+            for name in files:
+                (folder / name).write_text(f"{name} {number}")
+    assert found == [None, *(tmp_path / f"run-{number}" for number in (1, 2, 3))]
+    for number, kept in enumerate(found[1:]):
+        assert (kept / SCENARIO).read_text() == f"{MARK}\n{number}"
+        assert sorted(path.name for path in kept.iterdir()) == sorted([SCENARIO, *files])
+        assert all((kept / name).read_text() == f"{name} {number}" for name in files)
+
+
+def test_the_working_directory_may_be_the_folder(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for _ in range(2):
+        with run_folder(Path(".")) as kept:
+            Path(SCENARIO).write_text(MARK)
+            Path("record.npz").write_text("")
+    assert kept == tmp_path / "here-1"
+    assert (kept / "record.npz").exists()
 
 
 @pytest.mark.parametrize("name", [*FILES, PART])
@@ -80,6 +107,8 @@ def test_a_folder_in_the_place_of_a_file_is_named(earlier):
         run_folder(earlier),
     ):
         pass
+    assert (earlier / "record.npz").is_dir()
+    assert not earlier.with_name(f"{earlier.name}-1").exists()
 
 
 def test_a_file_system_without_locks(tmp_path, monkeypatch):

@@ -389,3 +389,25 @@ def test_wrong_words_are_refused(settings, message):
 def test_a_robot_that_nothing_pushes_has_no_contact_to_open():
     with pytest.raises(ScenarioError, match="no constraint that can only push"):
         build_scenario(scenario("slider_crank", "plant=!Unilateral {}"))
+
+
+@pytest.mark.slow
+def test_a_run_that_goes_on_keeps_the_events_of_the_first_part():
+    """Impacts of 3.3 s in one run and in two."""
+    chosen = scenario("wall_bounce", "duration=3.3")
+    whole, context = build_scenario(chosen)
+    simulate(whole.diagram, context, 3.3, chosen.integrator)
+    wanted = whole.record(context).events
+    assert len(wanted) >= 2
+    loop, parts = build_scenario(chosen)
+    simulate(loop.diagram, parts, 2.6, chosen.integrator)
+    first = loop.record(parts).events
+    chosen.integrator.start_time = parts.get_time()
+    simulate(loop.diagram, parts, 0.7, chosen.integrator)
+    both = loop.record(parts).events
+    assert 0 < len(first) < len(both)
+    assert both[: len(first)] == first
+    assert [event.kind for event in both] == [event.kind for event in wanted]
+    # Impact times are found to the accuracy of the steps, which are others.
+    found, times = ([event.time for event in events] for events in (both, wanted))
+    assert_allclose(found, times, atol=1e-5)

@@ -8,7 +8,6 @@ from runs import run_scenario, scenario
 from drake_dae import Record, build_scenario, load_scenario, simulate, start_meshcat
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.build import build_law_loop
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
 
 # At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
@@ -122,9 +121,9 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
         build_scenario(load_scenario(file, [change]))
 
 
-def test_what_knows_no_tasks_says_so(file):
-    with pytest.raises(ScenarioError, match="task: sweeps and exports know `references` alone"):
-        build_law_loop(load_scenario(file))
+def test_what_knows_no_tasks_says_so(file, tmp_path, capsys):
+    assert main(["export", str(file), "--out", str(tmp_path / "code")]) == 1
+    assert "task: exports know `references` alone" in capsys.readouterr().err
 
 
 def test_a_rollout_of_a_task_is_refused_in_its_words(file, tmp_path, capsys):

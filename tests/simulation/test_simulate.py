@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from pydrake.trajectories import PiecewisePolynomial
+from runs import scenario
 
 from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
@@ -21,6 +23,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation import simulate as module
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS
 from drake_dae.simulation.simulate import check_config, check_duration, simulate
+from drake_dae.systems.control.sampling import ControlHold, Sampling
 
 
 class Ramp(LeafSystem):
@@ -132,6 +135,51 @@ def test_endless_by_request():
     with warned, pytest.raises(StopIteration):
         simulate(diagram, context, 10.0, fixed(1e-9), after_step=enough)
     assert context.get_time() == pytest.approx(2500e-9)
+
+
+def test_samples_without_end_are_told_like_steps():
+    """Whatever samples: a held law, a force sensor, Drake's own plant."""
+    stopped = pytest.raises(StopIteration)
+
+    def stop(context):
+        raise StopIteration
+
+    for period, what in ((1e-12, "the sample period of 'control_hold',"), (1e-3, "")):
+        builder, hold = DiagramBuilder(), ControlHold(1, Sampling(period))
+        builder.AddSystem(hold)
+        builder.Connect(builder.AddSystem(ConstantVectorSource([1.0])).get_output_port(),
+                        hold.get_input_port())  # fmt: skip
+        diagram = builder.Build()
+        with warnings.catch_warnings(record=True) as told, stopped:
+            warnings.simplefilter("always")
+            simulate(diagram, diagram.CreateDefaultContext(), 1.0, fixed(0.1), after_step=stop)
+        assert [str(one.message).split(" takes")[0] for one in told] == (
+            [f"{what} 1e-12 s"] if what else []
+        )
+
+
+def test_drakes_settings_are_taken_where_none_are_given():
+    diagram, context, _ = ramp()
+    assert simulate(diagram, context, 1.0).simulated_time == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", ["two_link_wall", "two_link_measured_force"])
+def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
+    """It begins at its start_time again, from the state that the first one ended in."""
+    chosen = scenario(name, "duration=0.2")
+    loop, context = build_scenario(chosen)
+    simulate(loop.diagram, context, 0.2, chosen.integrator)
+    first = loop.record(context)
+    simulate(loop.diagram, context, 0.1, chosen.integrator)
+    second = loop.record(context)
+    assert (second.time[0], second.time[-1]) == (0.0, pytest.approx(0.1))
+    np.testing.assert_allclose(second["state"][0], first["state"][-1], atol=1e-9)
+    # A run that goes on where the last one ended adds to it.
+    chosen.integrator.start_time = context.get_time()
+    simulate(loop.diagram, context, 0.1, chosen.integrator)
+    both = loop.record(context)
+    assert (both.time[0], both.time[-1]) == (0.0, pytest.approx(0.2))
+    np.testing.assert_array_equal(both["state"][: len(second.time) - 1], second["state"][:-1])
 
 
 def test_two_million_steps_are_no_reason_to_warn():

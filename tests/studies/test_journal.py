@@ -136,6 +136,64 @@ def test_a_line_that_was_changed_is_told(tmp_path):
     assert path.read_bytes() == data
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"run": -1},
+        {"run": 3},
+        {"run": 99},
+        {"run": "0"},
+        {"run": True},
+        {"run": 1.0},
+        {"figures": {"end [s]": "1"}},
+        {"figures": {"end [s]": True}},
+        {"figures": []},
+        {"seconds": -1.0},
+        {"seconds": None},
+        {"reason": 1},
+        {"exceeded": [1]},
+        {"more": 1},
+    ],
+)
+@pytest.mark.parametrize("place", [1, 3])
+def test_a_line_that_is_no_run_of_this_study_is_told_and_stays(change, place, tmp_path):
+    """In the middle and at the end, where only what is no whole line is taken for cut off."""
+    path = tmp_path / "runs.jsonl"
+    lines = written(path).splitlines()
+    lines[place] = json.dumps(json.loads(lines[place]) | change).encode()
+    data = b"\n".join([*lines, b""])
+    path.write_bytes(data)
+    refused = pytest.raises(ModelError, match=f"was changed: line {place + 1} is no run of this")
+    with refused, open_journal(path, head()):
+        pass
+    assert path.read_bytes() == data
+
+
+@pytest.mark.parametrize("deep", ["[" * 100_000, '{"a":' * 100_000])
+def test_lines_that_are_deep_are_told(deep, tmp_path):
+    path = tmp_path / "runs.jsonl"
+    data = written(path)
+    path.write_bytes(data + deep.encode() + b"\n" + data.splitlines()[-1] + b"\n")
+    with pytest.raises(ModelError, match="was changed: line 5"), open_journal(path, head()):
+        pass
+    path.write_text(f"{deep}\n")
+    with pytest.raises(ModelError, match="no file of a study"), open_journal(path, head()):
+        pass
+
+
+def test_a_run_whose_process_died_is_replaced_by_one_that_ended(tmp_path):
+    path = tmp_path / "runs.jsonl"
+    died = [RunResult(1, outcome, "died") for outcome in (Outcome.CRASHED, Outcome.TIMED_OUT)]
+    with open_journal(path, head()) as journal:
+        journal.append(died)
+    with open_journal(path, head()) as journal:
+        assert journal.results == {1: died[-1]}
+        journal.append(RESULTS)
+        journal.append(died)
+    with open_journal(path, head()) as journal:
+        assert journal.results == {result.run: result for result in RESULTS}
+
+
 def test_only_one_process_writes(tmp_path):
     path = tmp_path / "runs.jsonl"
     with (

@@ -171,7 +171,7 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     (worker,) = map(int, listed.stdout.split())
     os.kill(worker, signal.SIGKILL)
     said, _ = process.communicate(timeout=100)
-    assert process.returncode == 0
+    assert process.returncode == 1
     assert said.startswith(
         "6 runs: 5 finished, 1 crashed\n\nrun 3 crashed: the process ended with signal SIGKILL\n"
     )
@@ -182,6 +182,47 @@ def test_a_process_that_dies_is_the_outcome_of_its_run_alone(study, tmp_path):
     assert rows[3][name] == ""
     others = [run for run in range(6) if run != 3]
     assert [float(rows[run][name]) for run in others] == list(study.values(name)[others])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("outcome", ["crashed", "timed out"])
+def test_a_run_whose_process_died_is_tried_again_and_no_other(outcome, tmp_path):
+    file = tmp_path / "runs.jsonl"
+    first = dd.sweep(chosen(), VARIATIONS[:3], file, workers=1)
+    data = file.read_text().splitlines()
+    (place,) = [i for i, line in enumerate(data) if line.startswith('{"run":1,')]
+    died = RunResult(1, Outcome(outcome), "it died")
+    data[place] = json.dumps(died.to_dict())
+    file.write_text("\n".join([*data, ""]))
+    again = dd.sweep(chosen(), VARIATIONS[:3], file, workers=1)
+    assert again.table() == first.table()
+    assert lines(file) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stopped", [True, pytest.param(False, marks=pytest.mark.thorough)])
+def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
+    """Its process is stopped, or it runs against the clock, 10,000 s; other runs are not lost."""
+    rates = [0.0, 0.05 if stopped else 0.00005, 0.0]
+    vary = f"--vary=integrator.target_realtime_rate={rates}"
+    process = subprocess.Popen(
+        command(tmp_path, vary, "--workers=1", "--time-limit=5", keys={}),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if stopped:
+        wait_for(1, tmp_path / "runs.jsonl", process)
+        listed = subprocess.run(
+            ["pgrep", "-P", str(process.pid)], check=True, capture_output=True, text=True
+        )
+        os.kill(int(listed.stdout), signal.SIGSTOP)
+    said, error = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert said.startswith(
+        "3 runs: 2 finished, 1 timed out\n\nrun 1 timed out: no end within 5 s\n"
+    )
+    assert "1 run died or took too long; the same command tries again: 1" in error
 
 
 @pytest.mark.parametrize(

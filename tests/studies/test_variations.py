@@ -56,6 +56,23 @@ def test_random_values_are_even():
     assert all(type(v["b"]) is int for v in found)
 
 
+@pytest.mark.parametrize("low", [-1e308, -9e307])
+def test_a_range_that_no_number_measures_is_refused(low):
+    for text, count in ((f"start.errors.tool.z={low}..{-low}:3", None), (f"a={low}..{-low}", 5)):
+        with pytest.raises(ScenarioError, match="is wider than the largest number"):
+            parse_variations([text], scenario("two_link_wall"), count, 0, False)
+    with pytest.raises(ScenarioError, match="is wider than the largest number"):
+        random_variations({"a": (low, -low)}, 5)
+
+
+def test_ranges_of_more_whole_numbers_than_there_are_runs_are_refused():
+    for values in (range(10**7), range(10**300)):
+        with pytest.raises(ScenarioError, match=r"at most 1000000 runs|more values than a study"):
+            grid_variations({"a": values})
+    with pytest.raises(ScenarioError, match="more whole numbers than can be drawn from"):
+        random_variations({"a": range(10**300)}, 5)
+
+
 def parsed(*texts, count=None, seed=0, together=False):
     chosen = scenario("two_link_measured_force")
     return parse_variations(texts, chosen, count, seed, together)

@@ -33,6 +33,7 @@ LOOKS = {
     "trace": ("CasADi alone: functions, derivatives, Newton", "#b8493c"),
     "arguments": ("annotations as checks", "#7a6a5a"),
     "arrays": ("checked numbers", "#7a6a5a"),
+    "files": ("what users name, read", "#7a6a5a"),
     "errors": ("exceptions", "#7a6a5a"),
 }
 INK, WHITE = "#27303a", "#fbfaf7"

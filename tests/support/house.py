@@ -20,6 +20,7 @@ PACKAGE = ROOT / "drake_dae"
 # but the command may import it.
 FLOORS = (
     ("errors",),
+    ("files",),
     ("arrays",),
     ("arguments",),
     ("trace",),
@@ -41,7 +42,7 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "arguments", "trace", "dae", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "analysis")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (

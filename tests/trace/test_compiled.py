@@ -20,7 +20,8 @@ from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.cache import cache_folder, clear, contents
-from drake_dae.trace.compiled import LIMIT, LOOK, Compiler, attempts, find_compiler
+from drake_dae.trace.compiled import LIMIT, LOOK, attempts
+from drake_dae.trace.compiler import Compiler, find_compiler
 from drake_dae.trace.functions import TracedFunction
 
 needs_compiler = pytest.mark.skipif(
@@ -236,7 +237,7 @@ def test_without_a_compiler(cache, monkeypatch):
     runs_interpreted("CC is no command")
     monkeypatch.delenv("CC")
     monkeypatch.setenv("PATH", "/nowhere")
-    monkeypatch.setattr("drake_dae.trace.compiled.find_spec", lambda name: None)
+    monkeypatch.setattr("drake_dae.trace.compiler.find_spec", lambda name: None)
     runs_interpreted("no C compiler: 'cc' is not found")
     assert contents() == []
 
@@ -288,9 +289,28 @@ def test_a_compiler_that_fails(cache, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", str(tmp_path))
     runs_interpreted("no C compiler")
     monkeypatch.setenv("CC", script(tmp_path / "cc3", "sleep 60"))
-    monkeypatch.setattr("drake_dae.trace.compiled.LIMIT", 0.05)
-    runs_interpreted(r"the C compiler '.*cc3' takes longer than 0\.15 s")
+    monkeypatch.setattr("drake_dae.trace.compiler.ANSWERS", 0.05)
+    runs_interpreted(r"the C compiler '.*cc3' takes longer than 0\.05 s")
     assert contents() == []
+
+
+def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
+    """Whether it hangs when it is asked for its version or when it compiles; no clock is read."""
+    asked = tmp_path / "asked"
+    only_version = f'echo "$@" >> {asked}; case "$*" in *--version*|*-dM*) exit 0;; esac; sleep 60'
+    for name, does in (("cc1", f'echo "$@" >> {asked}; sleep 60'), ("cc2", only_version)):
+        asked.write_text("")
+        monkeypatch.setenv("CC", script(tmp_path / name, does))
+        # Long enough for a process to start; what it waits for never comes.
+        monkeypatch.setattr("drake_dae.trace.compiler.ANSWERS", 1.0)
+        monkeypatch.setattr("drake_dae.trace.compiled.LIMIT", 1.0)
+        monkeypatch.setattr("drake_dae.trace.compiled.PATIENCE", 1.0)
+        runs_interpreted(rf"the C compiler '.*{name}' takes longer than 1 s")
+        before = asked.read_text()
+        runs_interpreted(rf"the C compiler '.*{name}' takes longer than 1 s")
+        assert asked.read_text() == before
+        with pytest.raises(MachineCodeError, match="takes longer than 1 s"):
+            find_compiler()
 
 
 def test_a_compiler_that_makes_nonsense(cache, monkeypatch, tmp_path):

@@ -11,10 +11,19 @@ from typing import Self
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import FloatArray, number_in, positive, unknown_name
 from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.splines import MOST_POINTS, SplineReference, TimeSpline
+from drake_dae.dae.references.splines import (
+    MOST_POINTS,
+    SplineReference,
+    TimeSpline,
+    rounded_up,
+)
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.files import read_text
+
+MOST = 1e15
+"""Of larger numbers a double has no digits that a robot could follow."""
 
 
 @checked(ReferenceSignalError)
@@ -25,21 +34,26 @@ class CsvReference(SplineReference):
     Between rows the columns go straight. The reference is that motion q, averaged over a window: a
     uniform B-spline over q at times that are `smoothing` apart, with order + 2 of them in a window.
     What that costs is, to first order, (order + 2) / 24 smoothing^2 q''; `deviation` tells how far
-    it is from the rows at most. Derivatives of noise grow as it is divided by powers of
-    `smoothing`. Half a window before the first row it begins to move, if q begins in motion.
+    it is from the rows at most, and more than `tolerance` is refused. Where q turns at a row, as a
+    path of few rows does, it costs more: to first order in `smoothing`. Derivatives of noise grow
+    as it is divided by powers of `smoothing`: for rows with noise choose both numbers. Half a
+    window before the first row it begins to move, if q begins in motion.
 
     Attributes:
         file: The file: a row of names, then rows of numbers; comma, semicolon or tab between.
         columns: The names of the columns, one for each output.
         time: The name of the column of times in s, which increase.
         smoothing: The time between points of the spline, in s; None for the median of that between
-            rows.
+            rows, halved until the reference is within the tolerance.
         start_time: When the first row is met, in s.
         order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+        tolerance: How far the reference may be off its rows, as a share of the range of each
+            column.
 
     Raises:
         ReferenceSignalError: A number is of no use. When the reference is used: there is no such
-            file or column, or it holds something else than numbers.
+            file or column, it holds something else than numbers, or the reference would be off its
+            rows by more than the tolerance.
     """
 
     file: str
@@ -48,6 +62,7 @@ class CsvReference(SplineReference):
     smoothing: float | None = None
     start_time: float = 0.0
     order: int = 4
+    tolerance: float = 0.02
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", tuple(self.columns))
@@ -55,6 +70,7 @@ class CsvReference(SplineReference):
             raise ReferenceSignalError("columns: empty, at least one name is needed")
         if self.smoothing is not None:
             positive("smoothing", self.smoothing, ReferenceSignalError)
+        positive("tolerance", self.tolerance, ReferenceSignalError)
         check_order(self.order)
 
     @property
@@ -72,14 +88,35 @@ class CsvReference(SplineReference):
     @cached_property
     def spline(self) -> TimeSpline:
         times = self.table[:, 0]
-        step = self.smoothing or float(np.median(np.diff(times)))
-        count = round(float(np.ceil(times[-1] / step - 1e-9))) + 1
-        if count > MOST_POINTS:
+        if self.smoothing is not None:
+            spline = self._smoothed(self.smoothing)
+        else:
+            spline = self._smoothed(max(float(np.median(np.diff(times))), times[-1] / MOST_POINTS))
+            while self._excess(spline) > 1.0 and 2 * len(spline.points) < MOST_POINTS:
+                spline = self._smoothed(spline.step / 2)
+        if self._excess(spline) > 1.0:
+            off = self._off(spline)
+            worst = int(np.argmax(off / self._allowed))
+            raise ReferenceSignalError(
+                f"'{self.file}': smoothed over {spline.step:.3g} s the reference is off its rows "
+                f"by {off[worst]:.3g} in '{self.columns[worst]}', and at most "
+                f"{self._allowed[worst]:.3g} is allowed, {self.tolerance:g} of the column's range. "
+                "Choose a smaller smoothing, give more rows where the path turns, or write a "
+                "larger tolerance"
+            )
+        return spline
+
+    def _smoothed(self, step: float) -> TimeSpline:
+        """The spline whose points are a time in s apart."""
+        times = self.table[:, 0]
+        count = float(np.ceil(times[-1] / step - 1e-9)) + 1
+        if count > MOST_POINTS + 1:
             least = times[-1] / MOST_POINTS
             raise ReferenceSignalError(
-                f"smoothing must be {least:.3g} s or more for {times[-1]:.3g} s, got {step:g} s"
+                f"smoothing must be {rounded_up(least)} s or more for {times[-1]:.3g} s, got "
+                f"{step:g} s"
             )
-        moments = step * np.arange(count)
+        moments = step * np.arange(int(count))
         points = np.column_stack([np.interp(moments, times, row) for row in self.table.T[1:]])
         # The k-th point has its largest weight at k steps after the first row.
         return TimeSpline(points, step, self.start_time - self.order / 2 * step, self.order)
@@ -87,19 +124,42 @@ class CsvReference(SplineReference):
     @property
     def deviation(self) -> FloatArray:
         """The largest distance of each column's rows from the reference, shape (size,)."""
-        function = self.derivatives([0] * self.size)
-        found = [function(self.start_time + time) for time in self.table[:, 0]]
+        return self._off(self.spline)
+
+    @property
+    def remark(self) -> str:
+        """How far it is off its rows."""
+        pairs = zip(self.columns, self.deviation, strict=True)
+        told = ", ".join(f"{column} by {off:.2g}" for column, off in pairs)
+        return (
+            f"CsvReference '{Path(self.file).name}': smoothed over {self.spline.step:.3g} s, it is "
+            f"off its rows at most in {told}"
+        )
+
+    def _off(self, spline: TimeSpline) -> FloatArray:
+        """How far a spline is off the rows at most, shape (size,)."""
+        found = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
         return np.abs(found - self.table[:, 1:]).max(axis=0)
+
+    def _excess(self, spline: TimeSpline) -> float:
+        """How far a spline is off the rows, beside how far it may be."""
+        return float(np.max(self._off(spline) / self._allowed))
+
+    @cached_property
+    def _allowed(self) -> FloatArray:
+        """How far the reference may be off the rows of each column, shape (size,)."""
+        values = self.table[:, 1:]
+        # Of a column that stays, round-off.
+        least = 1e-12 * np.abs(values).max(axis=0) + np.finfo(float).tiny
+        return np.maximum(self.tolerance * np.ptp(values, axis=0), least)
 
 
 def _read(file: Path, names: Sequence[str]) -> FloatArray:
     """Columns of a file, the first one increasing from 0, shape (k, len(names))."""
     try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
-            first = stream.readline()
-            stream.seek(0)
-            delimiter = max(",;\t", key=first.count)
-            cells = [row for row in csv.reader(stream, delimiter=delimiter) if any(row)]
+        lines = read_text(file).splitlines()
+        delimiter = max(",;\t", key=lines[0].count if lines else len)
+        cells = [row for row in csv.reader(lines, delimiter=delimiter) if any(row)]
     except (OSError, ValueError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
         raise ReferenceSignalError(f"cannot read '{file}': {reason}") from error
@@ -128,10 +188,8 @@ def _read(file: Path, names: Sequence[str]) -> FloatArray:
 
 def _number(cell: str, where: str) -> float:
     """A cell of the table as a finite number."""
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise ReferenceSignalError(f"{where}: expected a number, got '{cell[:40]}'")
+    value = number_in(cell)
+    if value is None or abs(value) > MOST:
+        wanted = "a number" if value is None else f"a number of at most {MOST:g}"
+        raise ReferenceSignalError(f"{where}: expected {wanted}, got '{cell[:40]}'")
     return value

@@ -45,6 +45,13 @@ class Pieces:
 
         return evaluate
 
+    def at_all(self, times: FloatArray) -> FloatArray:
+        """The values at times in s, shape (len(times), rows)."""
+        inside = np.clip(times, self.breaks[0], self.breaks[-1])
+        place = np.searchsorted(self.breaks[1:-1], inside, "right")
+        x = (inside - self.breaks[place]) / np.diff(self.breaks)[place]
+        return np.einsum("trp,tp->tr", self.factors[place], x[:, None] ** self._powers)
+
     def expression(self, time: ca.SX) -> ca.SX:
         """The values at a symbolic time, shape (rows, 1)."""
         count, rows, size = self.factors.shape

@@ -32,7 +32,7 @@ class Reference(ABC):
     6. A reference that is an expression of time says so in `expression`, so that all of them are
        traced as one function; the values are the same either way.
     7. A reference that names a file reads it when it is used, and gives itself an absolute path by
-       `beside`.
+       `beside`; what of the file is approximate `remark` tells.
     """
 
     @property
@@ -62,6 +62,11 @@ class Reference(ABC):
     def beside(self, folder: Path) -> Self:
         """The same, where a file that it names is relative to a folder."""
         return self
+
+    @property
+    def remark(self) -> str:
+        """What of its data is approximate, and by how much; empty if nothing is."""
+        return ""
 
 
 @checked(ReferenceSignalError)

@@ -220,5 +220,12 @@ def check_spline(corner: float, order: int, length: float) -> None:
     least = length * order / 2 / MOST_POINTS
     if corner < least:
         raise ReferenceSignalError(
-            f"corner must be {least:.3g} or more for a path of length {length:.3g}, got {corner:g}"
+            f"corner must be {rounded_up(least)} or more for a path of length {length:.3g}, got "
+            f"{corner:g}"
         )
+
+
+def rounded_up(value: float) -> str:
+    """A positive number as text with three digits, of which `float` makes no smaller number."""
+    text = f"{value:.3g}"
+    return text if float(text) >= value else f"{1.01 * value:.3g}"

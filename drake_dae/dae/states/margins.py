@@ -1,6 +1,6 @@
 """How far a matrix of the state is from losing its rank."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import casadi as ca
@@ -25,6 +25,7 @@ class Margin:
         state: Where `relative` is smallest, shape (n,).
         vanishing_row: The row that is zero there; None if none is.
         least: Below this `relative` counts as singular: `DaeSystem.least_margin`.
+        matrix: The matrix there.
     """
 
     singular_value: float
@@ -32,6 +33,7 @@ class Margin:
     state: FloatArray
     vanishing_row: int | None = None
     least: float = SINGULAR
+    matrix: FloatArray | None = field(default=None, compare=False, repr=False)
 
     @property
     def is_singular(self) -> bool:
@@ -72,6 +74,7 @@ def find_margin(
         state=state,
         vanishing_row=int(np.argmin(length)) if length.min() < least else None,
         least=least,
+        matrix=scaled.plain(state),
     )
 
 

@@ -75,7 +75,8 @@ class Violation:
         singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
             if the rank is lost.
         least: Below this it counts as lost, `DaeSystem.least_margin`.
-        combinations: The constraints that follow from others there, if the rank of A(x) is lost.
+        combinations: The constraints that follow from others there, if the rank of A(x) is lost;
+            the outputs, if that of B(x) is, or if they follow from the constraints.
         deciding: The parameters and signals that decide, where it is so at their defaults alone.
     """
 
@@ -141,10 +142,16 @@ class Violation:
                     f"{f'; gradients of constraints: {rows}' if rows else ''}"
                 )
             case Cause.NO_CONTROL:
+                why = (
+                    f"it follows from the constraints, {rows}"
+                    if rows
+                    else (
+                        "its derivatives repeat those of the constraints, or no control reaches it"
+                    )
+                )
                 return (
-                    f"the control never acts on output {names}: its derivatives repeat those of "
-                    "the constraints, or no control reaches it, so it has no relative degree and "
-                    "B(x) no row for it"
+                    f"the control never acts on output {names}: {why}, so it has no relative "
+                    "degree and B(x) no row for it"
                 )
             case (
                 Cause.CONSTRAINT_RANK
@@ -178,6 +185,7 @@ class Violation:
                     f"B(x) of (16) is singular{where}: the controlled outputs "
                     f"{', '.join(self.names)} cannot be steered independently; smallest singular "
                     f"value {value} ({scaled})"
+                    f"{f'; rows of B(x): {rows}' if rows else ''}"
                 )
 
 

@@ -1,5 +1,6 @@
-"""Which constraints follow from which others, where A(x) loses its rank."""
+"""Which constraints and outputs follow from which others, where A(x) or B(x) loses its rank."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -19,8 +20,8 @@ class Combination:
     """A row that is a combination of others: row = sum factors_j row_j.
 
     Attributes:
-        name: The constraint whose row it is.
-        others: The constraints that it follows from.
+        name: The constraint or the output whose row it is.
+        others: The constraints or outputs that it follows from.
         factors: Theirs, shape (len(others),), at the state where this was found.
         constant: Whether the factors are the same at all examined states.
     """
@@ -88,7 +89,7 @@ def find_dependence(
     # Chains may depend on each other below their last derivatives alone.
     by_gradients = dependent and are_dependent(matrices(where)[1] * system.scale)
     values = [matrices(state)[1 if by_gradients else 0] for state in examined]
-    return Dependence(tuple(_combinations(names, values)), everywhere, dependent)
+    return Dependence(tuple(combinations_of(names, values)), everywhere, dependent)
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
@@ -98,11 +99,28 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
         return ()
     names = [signal.name for signal in system.constraint_output_signals]
     values = samples.values(gradient=ca.jacobian(system.k, system.state))
-    return tuple(_combinations(names, [gradient for (gradient,) in values]))
+    return tuple(combinations_of(names, [gradient for (gradient,) in values]))
 
 
-def _combinations(names: list[str], values: list[FloatArray]) -> list[Combination]:
-    """The rows that follow from those before them at the first of some states."""
+def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
+    """Which of some outputs follow from the constraints, by their gradients."""
+    system, manifold = samples.system, samples.manifold
+    known = [signal.name for signal in manifold.residual_signals]
+    for row, signal in enumerate(system.output_signals):
+        if signal.name in names and not system.m[row, :].nnz():
+            both = ca.vertcat(manifold.residual_expression, system.l[row])
+            values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
+            rows = combinations_of([*known, signal.name], [gradient for (gradient,) in values])
+            yield from (one for one in rows if one.name == signal.name)
+
+
+def combinations_of(names: list[str], values: list[FloatArray]) -> list[Combination]:
+    """The rows that follow from those before them at the first of some states.
+
+    Args:
+        names: What the rows are about.
+        values: The matrix at each state.
+    """
     matrix, lengths = _scaled(values[0])
     kept: list[int] = []
     found = []

@@ -22,7 +22,10 @@ from drake_dae.dae.states.family import VISIBLE, Deciding, Family
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Cause, Violation
-from drake_dae.dae.structure.dependence import redundant_constraints
+from drake_dae.dae.structure.dependence import (
+    following_outputs,
+    redundant_constraints,
+)
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
@@ -196,7 +199,9 @@ def output_chains(
                 stuck.append(i)
         if stuck:
             those, deciding = tuple(names[i] for i in stuck), elsewhere.deciding(stuck)
-            raise Violation(5, Cause.NO_CONTROL, those, deciding=deciding).error()
+            found = tuple(following_outputs(samples, those))
+            violation = Violation(5, Cause.NO_CONTROL, those, combinations=found, deciding=deciding)
+            raise violation.error()
         undecided = still
     return OutputChains(
         chains=tuple(tuple(chain) for chain in chains),

@@ -19,6 +19,7 @@ from drake_dae.dae.structure.constrained import (
     guesses,
     with_numbers,
 )
+from drake_dae.dae.structure.dependence import combinations_of
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.system import DaeSystem
@@ -304,6 +305,12 @@ def control_violation(structure: Structure) -> Violation | None:
     """How a singular B(x) violates Assumption (4) or (5); None if it is regular."""
     causes = ((4, Cause.OUTPUT_DEGREE), (5, Cause.CONTROL_RANK))
     margin, degrees = structure.control_margin, structure.output_degrees
-    violation = rank_violation(margin, structure.system.output_signals, degrees, *causes)
+    signals = structure.system.output_signals
+    violation = rank_violation(margin, signals, degrees, *causes)
+    if violation is not None and violation.cause is Cause.CONTROL_RANK:
+        assert margin is not None
+        assert margin.matrix is not None
+        rows = combinations_of([signal.name for signal in signals], [margin.matrix])
+        violation = replace(violation, combinations=tuple(rows))
     matrix = structure.control_matrix
     return with_numbers(violation, 5, structure.manifold, structure.states, matrix)

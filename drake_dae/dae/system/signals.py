@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, numbers
+from drake_dae.arrays import FloatArray, brief, check_writable, numbers
 from drake_dae.errors import ModelError
 
 
@@ -26,6 +26,9 @@ class Signal:
     name: str
     unit: str = ""
 
+    def __post_init__(self) -> None:
+        check_writable("the name of a signal", self.name)
+
     def derivative(self, order: int) -> "Signal":
         """Its time derivative: x -> x', x'', ..., with the unit to match."""
         if order == 0:
@@ -36,6 +39,11 @@ class Signal:
 
 DERIVATIVES = 10
 """How many derivatives of an exogenous parameter there are symbols for; long chains need 8."""
+
+
+LARGEST = 1e60
+"""No parameter is larger, and none that is positive is smaller than its inverse: equations multiply
+five of them before they divide."""
 
 
 @checked(ModelError)
@@ -140,7 +148,8 @@ class Parameter:
         """Refuses values that make no sense for the parameter.
 
         Raises:
-            ModelError: A number is not finite, or not positive or negative where it must (not) be.
+            ModelError: A number is not finite, or not positive or negative where it must (not) be;
+                or it is beyond `LARGEST`.
         """
         if not np.all(np.isfinite(value)):
             raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
@@ -148,6 +157,11 @@ class Parameter:
             raise ModelError(f"parameter '{self.name}' must be positive, got {value}")
         if self.nonnegative and not np.all(value >= 0.0):
             raise ModelError(f"parameter '{self.name}' must not be negative, got {value}")
+        if np.any(np.abs(value) > LARGEST) or (self.positive and np.any(value < 1.0 / LARGEST)):
+            raise ModelError(
+                f"parameter '{self.name}' must be a number whose products a double holds, from "
+                f"{1.0 / LARGEST:g} to {LARGEST:g}, got {value}"
+            )
         if self.bounds is not None and not np.all((self.low <= value) & (value <= self.high)):
             raise ModelError(
                 f"parameter '{self.name}' must stay in its bounds, from {brief(self.bounds[0])} to "

@@ -17,6 +17,7 @@ from drake_dae.robots.surfaces.surface import (
     unit_vector,
     with_parameters,
 )
+from drake_dae.trace.smoothness import length_of
 
 
 @checked(ModelError)
@@ -92,7 +93,7 @@ class AxisNormalToSurface(Constraint):
         """n, shape (3, 1), and how it changes with the point, dn/dp in 1/m, shape (3, 3)."""
         p = ca.SX.sym("p", 3)
         gradient = self.surface.unit_normal(p)
-        normal = gradient / ca.norm_2(gradient)
+        normal = gradient / length_of(gradient)
         offset = frames.position(self.frame, self.point) - self.parameters[0].symbol
         both = ca.substitute(ca.horzcat(normal, ca.jacobian(normal, p)), p, offset)
         return both[:, 0], ca.sparsify(both[:, 1:])

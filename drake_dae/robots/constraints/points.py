@@ -16,6 +16,7 @@ from drake_dae.robots.constraints.friction import Friction, friction_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.picture import Picture
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
+from drake_dae.trace.smoothness import length_of
 
 
 @checked(ModelError)
@@ -296,12 +297,12 @@ class FixedDistance(Constraint):
         return (Signal(f"{self.name}.stretch", "m"),)
 
     def residual(self, frames: Frames) -> ca.SX:
-        return ca.norm_2(self._apart(frames)) - self.parameters[0].symbol
+        return length_of(self._apart(frames)) - self.parameters[0].symbol
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         apart = self._apart(kinematics)
         point = kinematics.position(self.frame_b, self.point_b)
-        away = apart / ca.norm_2(apart)
+        away = apart / length_of(apart)
         return (Application(point, away, ca.SX(3, 1), self.frame_b, self.frame_a),)
 
     def _apart(self, frames: Frames) -> ca.SX:

@@ -14,6 +14,7 @@ from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 from drake_dae.robots.surfaces.picture import Picture
 from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
+from drake_dae.trace.smoothness import length_of
 
 
 @checked(ModelError)
@@ -143,7 +144,7 @@ class RollingWheel(Constraint):
         n = ca.SX(self.normal)
         axle = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axle))
         along = ca.cross(axle, n)
-        heading = along / ca.norm_2(along)
+        heading = along / length_of(along)
         directions = ca.horzcat(heading, ca.cross(n, heading))
         return ca.cross(heading, axle), directions[:, : self._count]
 
@@ -246,5 +247,5 @@ class RollingBall(Constraint):
         """n, shape (3, 1), and t_1 beside t_2, shape (3, 2)."""
         n, along = self.surface.unit_normal(self._offset(frames)), ca.SX(self.along)
         across = along - n * ca.dot(n, along)
-        first = across / ca.norm_2(across)
+        first = across / length_of(across)
         return n, ca.horzcat(first, ca.cross(n, first))

@@ -18,8 +18,10 @@ from pydrake.multibody.tree import (
     UniformGravityFieldElement,
 )
 
+from drake_dae.dae.system.signals import LARGEST
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import PlantFrames, position_of
+from drake_dae.trace.smoothness import length_of
 
 SUPPORTED_FORCE_ELEMENTS = (
     UniformGravityFieldElement,
@@ -72,6 +74,13 @@ class Springs:
     ) -> None:
         self._elements = force_elements(plant)
         self._damping = np.concatenate([joint.default_damping_vector() for joint in joints])
+        for joint in joints:
+            largest = np.max(joint.default_damping_vector(), initial=0.0)
+            if largest > LARGEST:
+                raise ModelError(
+                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that "
+                    f"can be computed with is {LARGEST:g}"
+                )
         self._frames = frames
         self._q, self._v, self._velocity_map = q, v, velocity_map
 
@@ -120,5 +129,5 @@ class Springs:
                 start = self._frames.pose(element.bodyA().body_frame())
                 end = self._frames.pose(element.bodyB().body_frame())
                 apart = position_of(end, element.p_BQ()) - position_of(start, element.p_AP())
-                springs.append((element, ca.norm_2(apart)))
+                springs.append((element, length_of(apart)))
         return springs

@@ -15,13 +15,17 @@ from pydrake.math import RigidTransform
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, positive
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, describe_os_error
+from drake_dae.errors import ModelError
+from drake_dae.robots.surfaces.height_file import height_table, read_heights
 from drake_dae.robots.surfaces.mesh_file import heights_of_mesh, read_mesh
 from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
 from drake_dae.robots.surfaces.relief import CELLS, Relief, fit_relief
 from drake_dae.robots.surfaces.surface import Surface, Vector, tangents, triple, unit_vector
 
 Pair = tuple[float, float]
+
+MOST_LENGTH = 1e9
+"""No height and no vertex is farther away, in m."""
 
 
 class _Map(Surface):
@@ -113,7 +117,7 @@ class HeightMap(_Map):
         if (self.heights is None) == (self.file is None):
             raise ModelError("give either heights, row by row, or a file with them")
         if self.heights is not None:
-            rows = tuple(map(tuple, _table("heights", self.heights).tolist()))
+            rows = tuple(map(tuple, height_table("heights", self.heights).tolist()))
             object.__setattr__(self, "heights", rows)
             found = _table_relief(rows, self.size, self.scale, self.resolution)
         else:
@@ -210,12 +214,13 @@ def _table_relief(
 
 @lru_cache(maxsize=16)
 def _file_relief(source: _Source, size: Pair, scale: float, resolution: float | None) -> Relief:
-    return _map_relief(_read_heights(Path(source[0])), size, scale, resolution)
+    return _map_relief(read_heights(Path(source[0])), size, scale, resolution)
 
 
 def _map_relief(rows: FloatArray, size: Pair, scale: float, resolution: float | None) -> Relief:
     x, y = (_along(0.0, length, n) for length, n in zip(size, rows.shape[::-1], strict=True))
     apart = max(x[1] - x[0], y[1] - y[0])
+    _check_lengths("heights", scale * rows)
     return fit_relief(x, y, scale * rows, resolution or max(apart, max(size) / CELLS))
 
 
@@ -229,6 +234,7 @@ def _mesh_relief(
 ) -> Relief:
     vertices, triangles = read_mesh(Path(source[0]))
     axes = np.column_stack([*tangents(normal), np.array(normal)])
+    _check_lengths("vertices", scale * vertices)
     seen = scale * vertices @ axes
     if np.linalg.det(axes) < 0.0:
         triangles = triangles[:, ::-1]  # A mirror shows their backs.
@@ -245,53 +251,16 @@ def _mesh_relief(
     return fit_relief(x, y, heights_of_mesh(seen, triangles, x, y), resolution)
 
 
+def _check_lengths(what: str, lengths: FloatArray) -> None:
+    largest = float(np.max(np.abs(lengths)))
+    if not largest <= MOST_LENGTH:
+        raise ModelError(
+            f"{what} of up to {largest:.3g} m are no surface of a robot; is the scale right?"
+        )
+
+
 def _along(middle: float, length: float, count: int) -> FloatArray:
     return middle + length * np.linspace(-0.5, 0.5, count)
-
-
-def _read_heights(file: Path) -> FloatArray:
-    """The heights in a file, first row lowest."""
-    kind = file.suffix.lower()
-    rows: ArrayLike
-    try:
-        if kind == ".csv":
-            text = file.read_text("utf-8-sig").replace(",", " ").replace(";", " ")
-            rows = [list(map(float, line.split())) for line in text.splitlines() if line.split()]
-        elif kind == ".npy":
-            rows = np.load(file, allow_pickle=False)
-        elif kind == ".png":
-            from matplotlib.image import imread
-
-            pixels = imread(file)[::-1].astype(float)
-            rows = pixels if pixels.ndim == 2 else pixels[..., :3].mean(axis=2)
-        else:
-            raise ModelError(f"'{file.name}' is no .csv, .npy or .png")
-    except OSError as error:
-        raise ModelError(describe_os_error(error)) from None
-    except (SyntaxError, ValueError, EOFError) as error:  # matplotlib has SyntaxError for a PNG.
-        raise ModelError(f"'{file.name}' has no table of heights: {brief(str(error))}") from None
-    return _table(f"'{file.name}'", rows)
-
-
-def _table(what: str, rows: ArrayLike) -> FloatArray:
-    """Rows as an array.
-
-    Raises:
-        ModelError: They are no table of numbers, or too few.
-    """
-    try:
-        heights = np.asarray(rows, dtype=float)
-    except (TypeError, ValueError):
-        raise ModelError(f"{what}: rows of numbers of one length are needed") from None
-    if heights.ndim != 2 or min(heights.shape) < 2:
-        raise ModelError(
-            f"{what}: two rows of two heights are the least, got shape {heights.shape}"
-        )
-    bad = np.argwhere(~np.isfinite(heights))
-    if bad.size:
-        row, column = bad[0] + 1
-        raise ModelError(f"{what}: row {row}, column {column} is no height")
-    return heights
 
 
 def _millimetres(length: float) -> str:

@@ -1,5 +1,6 @@
 """Meshes from files, and what rays along an axis see of them."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import ReadObjToTriangleSurfaceMesh
 
-from drake_dae.arrays import FloatArray, brief, show
-from drake_dae.errors import ModelError
+from drake_dae.arrays import FloatArray, brief, number_in, show
+from drake_dae.errors import ModelError, describe_os_error
+from drake_dae.files import read_bytes
 
 Triangles = NDArray[np.int64]
 
@@ -19,14 +21,69 @@ def read_mesh(file: Path) -> tuple[FloatArray, Triangles]:
     Raises:
         ModelError: It cannot be read.
     """
-    if file.suffix.lower() == ".obj":
-        try:
-            mesh = ReadObjToTriangleSurfaceMesh(str(file))
-        except RuntimeError as error:
-            raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
-        vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
-        corners = [[triangle.vertex(i) for i in range(3)] for triangle in mesh.triangles()]
-        return vertices, np.array(corners)
+    try:
+        read_bytes(file)  # A pipe or a device would hold up those that read it next.
+    except OSError as error:
+        raise ModelError(describe_os_error(error)) from None
+    is_obj = file.suffix.lower() == ".obj"
+    vertices, triangles = _read_obj(file) if is_obj else _read_other(file)
+    if triangles.size == 0 or not np.all(np.isfinite(vertices)):
+        raise ModelError(f"no mesh in '{file.name}': it has no triangles, or no numbers")
+    named = triangles.min(), triangles.max()
+    if named[0] < 0 or named[1] >= len(vertices):
+        raise ModelError(
+            f"no mesh in '{file.name}': a triangle names a vertex beyond the {len(vertices)} there "
+            "are"
+        )
+    return vertices, triangles
+
+
+def _read_obj(file: Path) -> tuple[FloatArray, Triangles]:
+    """What Drake reads of an .obj file."""
+    check_obj(file)
+    try:
+        mesh = ReadObjToTriangleSurfaceMesh(str(file))
+    except (RuntimeError, SystemExit) as error:  # SystemExit for an assertion of Drake's own.
+        raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
+    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())], dtype=float)
+    corners = [[triangle.vertex(i) for i in range(3)] for triangle in mesh.triangles()]
+    return vertices, np.array(corners, dtype=np.int64)
+
+
+def check_obj(file: Path) -> None:
+    """Refuses an .obj file which Drake would read as another one, or not survive.
+
+    Drake takes a coordinate that is no number for zero, and follows an index to wherever it leads.
+
+    Raises:
+        ModelError: A coordinate is no finite number, or a face names no vertex.
+    """
+    lines = read_bytes(file).decode("utf-8", errors="replace").split("\n")
+    rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
+    total = sum(words[:1] == ["v"] for _, words in rows)
+    count = 0
+    for number, words in rows:
+        if words[:1] == ["v"]:
+            count += 1
+            if len(words) < 4 or any(number_in(word) is None for word in words[1:4]):
+                text = f"a vertex has three numbers, got {brief(' '.join(words))}"
+                raise ModelError(f"no mesh in '{file.name}': line {number}: {text}")
+        elif words[:1] == ["f"]:
+            for word in words[1:]:
+                if not _is_vertex(word.split("/")[0], count, total):
+                    text = f"a face names vertex '{word[:20]}' of {total}"
+                    raise ModelError(f"no mesh in '{file.name}': line {number}: {text}")
+
+
+def _is_vertex(word: str, before: int, total: int) -> bool:
+    """Whether a face's word is a number from 1, or counts back from -1."""
+    if not re.fullmatch(r"-?[0-9]{1,9}", word):
+        return False
+    return 1 <= int(word) <= total or -before <= int(word) <= -1
+
+
+def _read_other(file: Path) -> tuple[FloatArray, Triangles]:
+    """What the package trimesh reads of a file."""
     try:
         import trimesh
     except ImportError:
@@ -36,12 +93,9 @@ def read_mesh(file: Path) -> tuple[FloatArray, Triangles]:
         ) from None
     try:
         found: Any = trimesh.load(file, force="mesh")
-        vertices, triangles = np.array(found.vertices), np.array(found.faces)
+        return np.array(found.vertices), np.array(found.faces)
     except Exception as error:  # It has no exceptions of its own.
         raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
-    if triangles.size == 0 or not np.all(np.isfinite(vertices)):
-        raise ModelError(f"no mesh in '{file.name}': it has no triangles, or no numbers")
-    return vertices, triangles
 
 
 def heights_of_mesh(

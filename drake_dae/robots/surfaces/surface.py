@@ -18,6 +18,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.smoothness import length_of
 
 Vector = tuple[float, float, float]
 
@@ -242,5 +243,5 @@ def normalized(function: Callable[[ca.SX], ca.SX], offset: ca.SX) -> ca.SX:
     value = as_expression("an ImplicitSurface", "its function", function(p))
     if value.shape != (1, 1):
         raise ModelError(f"a surface function returns one number, this one has {value.shape}")
-    quotient = value / ca.norm_2(ca.gradient(value, p))
+    quotient = value / length_of(ca.gradient(value, p))
     return ca.substitute(quotient, p, offset)

@@ -23,6 +23,7 @@ from drake_dae.robots.surfaces.surface import (
     triple,
     unit_vector,
 )
+from drake_dae.trace.smoothness import length_of
 
 
 @checked(ModelError)
@@ -97,7 +98,7 @@ class Sphere(Surface):
         return self.center
 
     def distance(self, offset: ca.SX) -> ca.SX:
-        return _side(ca.norm_2(offset) - self.radius, self.inside)
+        return _side(length_of(offset) - self.radius, self.inside)
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
         x, y, z = _components(self.axis, offset)
@@ -149,7 +150,7 @@ class Cylinder(Surface):
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y, _ = _components(self.axis, offset)
-        return _side(ca.sqrt(x**2 + y**2) - self.radius, self.inside)
+        return _side(length_of(ca.vertcat(x, y)) - self.radius, self.inside)
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
         x, y, z = _components(self.axis, offset, self.zero)

@@ -17,6 +17,7 @@ from drake_dae.scenario.completion.postures import Posture, Postures
 from drake_dae.scenario.completion.referred import ReferredRows, value_at
 from drake_dae.scenario.completion.search import TRIES, best_posture, near_posture, nearest_posture
 from drake_dae.scenario.completion.shortage import check_independent, why_none
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts.written import made
 from drake_dae.scenario.scenario import Scenario
 
@@ -89,9 +90,10 @@ def complete(
     if missing < 0 or (missing == 0 and is_placed):
         return Completed(scenario)
     candidates = Candidates(scenario, links, given, bound)
-    postures = Postures(
-        links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
-    )
+    with at("plant_parameters or exogenous"):
+        postures = Postures(
+            links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
+        )
     # Rows that references name are known before the posture is: by the normal near the guess.
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
     if near is not None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter
+from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Touch
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.links import Links
@@ -85,6 +86,18 @@ class Posture:
         return float(np.min(np.linalg.svd(B, compute_uv=False), initial=1.0))
 
 
+def _value_of(parameter: Parameter, values: Mapping[str, FloatArray]) -> FloatArray:
+    """The value of a parameter, where one number may stand for all.
+
+    Raises:
+        ModelError: There are more or fewer.
+    """
+    value, size = values.get(parameter.name, parameter.value), parameter.value.size
+    if value.size not in (1, size):
+        raise ModelError(f"{parameter.name}: {size} numbers are needed, got {value.size}")
+    return np.broadcast_to(value, (size,))
+
+
 def _one_long(rows: FloatArray, scaled: FloatArray) -> FloatArray:
     """Rows divided by the lengths of others; zero where these are none."""
     length = np.linalg.norm(rows, axis=1, keepdims=True)
@@ -145,9 +158,7 @@ class Postures:
                 "bodies": bodies,
             },
         )
-        self._parameters = np.concatenate(
-            [np.broadcast_to(values.get(p.name, p.value), p.value.shape) for p in parameters]
-        )
+        self._parameters = np.concatenate([_value_of(p, values) for p in parameters])
         self.low, self.high = links.position_limits
         self._turns = np.array([signal.unit == "rad" for signal in links.position_signals])
         points = self._values(links.default_positions)["bodies"]

@@ -122,6 +122,27 @@ def _in_words(schema: Mapping[str, Any]) -> str:
     return _IN_WORDS.get(schema.get("type", ""), "something else")
 
 
+def without_tags(schema: Any) -> Any:
+    """A schema of the same data without the entries "_tag", as a plain reader of YAML gives them.
+
+    Where a tag chooses, any form fits.
+    """
+    if isinstance(schema, list):
+        return [without_tags(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    plain = {
+        ("anyOf" if key == "oneOf" else key): without_tags(value)
+        for key, value in schema.items()
+        if key != TAG
+    }
+    if TAG in schema.get("properties", {}):
+        plain["title"] = schema["properties"][TAG]["const"]
+    if TAG in schema.get("required", ()):
+        plain["required"] = [name for name in schema["required"] if name != TAG]
+    return plain
+
+
 def _tag(schema: Mapping[str, Any]) -> str:
     if "properties" in schema:
         return str(schema["properties"][TAG]["const"])

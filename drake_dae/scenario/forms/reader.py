@@ -6,6 +6,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import pydantic
 
+from drake_dae.arrays import can_be_written
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import problem, with_parts
@@ -32,6 +33,10 @@ class Reader(Generic[T]):
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all of them are told.
         """
+        unwritable = dict.fromkeys(_unwritable(data, ""))
+        if unwritable:
+            text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+            raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
             return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:
@@ -44,6 +49,21 @@ class Reader(Generic[T]):
     def write(self, value: T) -> Any:
         """The plain data of which `read` makes the same value."""
         return self._adapter.dump_python(value, mode="json")
+
+
+def _unwritable(data: Any, key: str) -> Iterator[str]:
+    """The dotted keys of texts in plain data that no file can hold."""
+    if isinstance(data, str) and not can_be_written(data):
+        yield key
+    pairs: Iterator[tuple[Any, Any]] = iter(())
+    if isinstance(data, Mapping):
+        pairs = iter(data.items())
+    elif isinstance(data, (list, tuple)):
+        pairs = iter(enumerate(data))
+    for name, inner in pairs:
+        if isinstance(name, str) and not can_be_written(name):
+            yield key
+        yield from _unwritable(inner, f"{key}.{name}" if key else str(name))
 
 
 def _free_names(schema: Mapping[str, Any], path: str) -> Iterator[str]:

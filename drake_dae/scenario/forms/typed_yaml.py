@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped]
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, can_be_written
 from drake_dae.errors import ScenarioError
 
 TAG = "_tag"
@@ -59,6 +59,13 @@ class _Loader(yaml.SafeLoader):
                 raise self._error(text, node)
             known[id(node)] = size
         return known[id(node)]
+
+    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
+        value = super().construct_scalar(node)
+        if not can_be_written(value):
+            text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+            raise self._error(text, node)
+        return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
         names = set()

@@ -15,7 +15,7 @@ def editor_schema() -> dict[str, Any]:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$comment": f"Tags, for an editor: {', '.join(custom_tags())}",
-        **_untagged(scenario_schema()),
+        **scenario_schema(tags=False),
         "patternProperties": {"^_": True},
     }
 
@@ -23,23 +23,6 @@ def editor_schema() -> dict[str, Any]:
 def custom_tags() -> list[str]:
     """All tags, as the YAML language server takes them: "!Sphere mapping"."""
     return [f"{tag} mapping" for tag in dict.fromkeys(_tags(scenario_schema()))]
-
-
-def _untagged(schema: Any) -> Any:
-    if isinstance(schema, list):
-        return [_untagged(one) for one in schema]
-    if not isinstance(schema, dict):
-        return schema
-    plain = {
-        ("anyOf" if key == "oneOf" else key): _untagged(value)
-        for key, value in schema.items()
-        if key != TAG
-    }
-    if TAG in schema.get("properties", {}):
-        plain["title"] = schema["properties"][TAG]["const"]
-    if TAG in schema.get("required", ()):
-        plain["required"] = [name for name in schema["required"] if name != TAG]
-    return plain
 
 
 def _tags(schema: Mapping[str, Any]) -> Iterator[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from pydrake.multibody.parsing import PackageMap
 
 from drake_dae.errors import ModelError
+from drake_dae.files import read_bytes
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.shipped import FOLDER
 
@@ -115,7 +116,7 @@ def _beside(name: str, file: Path) -> Path | None:
 def _names(package: Path) -> Iterator[str]:
     """The name in a package.xml, if there is one."""
     try:
-        text = package.read_text("utf-8", errors="replace")
+        text = read_bytes(package).decode("utf-8", errors="replace")
     except (OSError, ValueError):
         return
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)

@@ -18,6 +18,7 @@ from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning, Scen
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.descriptions import find_description
 from drake_dae.scenario.robot_file.efforts import Efforts, limit_joints, read_efforts
+from drake_dae.scenario.robot_file.includes import check_includes
 from drake_dae.scenario.robot_file.packages import add_packages, explained, find_packages
 from drake_dae.scenario.robot_file.readable.meshes import DRAWN, Copies, add_models
 from drake_dae.scenario.robot_file.readable.placing import add_floating_joints
@@ -88,7 +89,8 @@ def read_into(
             add_packages(robot.packages, packages)
             folders, missing = find_packages(name, packages, places)
             file = Path(packages.ResolveUrl(name) if is_url else name)
-            _check_one_robot(file)
+            check_includes(file, packages)
+            _check_text(file)
             models = add_models(file, parser, Path(scratch).resolve(), copies)
             for instance, joints in copies.floating.items():
                 add_floating_joints(plant, instance, joints)
@@ -106,6 +108,8 @@ def read_into(
         for key in plant.GetConstraintIds():
             plant.RemoveConstraint(key)
     told = [text for text in dropped.warnings if not _is_answered(text, robot)]
+    # The parser of SDFormat tells of a link twice, once without the place.
+    told = [text for text in told if not text.startswith("warning: ")] or told
     if told:
         raise ModelError("; ".join(_explained(copies.named(text)) for text in told))
     if scene_graph is not None:
@@ -245,9 +249,12 @@ class _Dropped(logging.Filter):
 
 
 def _explained(warning: str) -> str:
-    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint."""
-    place, _, text = warning.rpartition("warning: ")
-    place = place.removesuffix(": ") or "the file"
+    """A warning of Drake's parser, "<file>:<line>: warning: <text>", with the link or joint.
+
+    That of SDFormat may have no place.
+    """
+    before, _, text = warning.rpartition("warning: ")
+    place = before.removesuffix(": ") or "the robot's file"
     kind = "link" if "inertia" in text else "joint"
     if "inertia" in text:
         text = (
@@ -276,14 +283,31 @@ def _explained(warning: str) -> str:
     return f"{place}: {owner}{' '.join(text.split())}"
 
 
-def _check_one_robot(file: Path) -> None:
-    """Refuses a second robot in a URDF, which Drake would not read."""
+_WITH_COMMA = re.compile(r"(?:=\s*[\"']|>)\s*([-+.\deE\s]*\d,\d[-+.\deE,\s]*)[\"'<]")
+"""A value of XML that is but numbers, with a comma between two digits."""
+
+
+def _check_text(file: Path) -> None:
+    """Refuses what Drake would pass over: a second robot in a URDF, and what follows a comma."""
+    if file.suffix not in (".urdf", ".sdf", ".xml"):
+        return
+    text = re.sub(r"<!--.*?-->", _lines, file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
+    if comma := _WITH_COMMA.search(text):
+        line = text.count("\n", 0, comma.start(1)) + 1
+        raise ModelError(
+            f"'{file.name}', line {line}: '{comma[1].strip()}': numbers have a point and no comma, "
+            "and blanks between them"
+        )
     if file.suffix != ".urdf":
         return
-    text = re.sub(r"<!--.*?-->", "", file.read_text("utf-8", errors="replace"), flags=re.DOTALL)
     names = re.findall(r"<robot\b[^>]*", text)
     if len(names) > 1:
         raise ModelError(f"'{file.name}' has {len(names)} <robot>s, and only one is read")
+
+
+def _lines(found: re.Match[str]) -> str:
+    """As many lines as there were."""
+    return "\n" * found[0].count("\n")
 
 
 def _is_file(name: str) -> bool:

@@ -3,12 +3,14 @@
 import csv
 import html
 import json
+import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, BinaryIO, Self
-from zipfile import BadZipFile
+from typing import Any, BinaryIO, Self, TypeVar
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -18,6 +20,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.files import open_file
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
 from drake_dae.systems.plants.contact_events import ContactEvent
 
@@ -43,7 +46,8 @@ class Record:
 
     On disk it is one `record.npz` that NumPy alone reads: `numpy.load("record.npz")` has "time"
     in s, and for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units".
-    Events stand in it as "events.time", "events.kind", "events.impulses" and others.
+    Events stand in it as "events.time", "events.kind", "events.impulses" and others; and "about" is
+    JSON with the versions that made it and, of a run by the command, the scenario with all seeds.
 
     Velocities jump at impacts: the sample of that time is the one before it.
 
@@ -51,11 +55,14 @@ class Record:
         time: The times in s, shape (k,), strictly increasing.
         signals: Name of a signal -> its values.
         events: What happened to contacts that open and close, in the order of time.
+        about: What one needs to repeat the run, as plain data: "versions" of the library, of what
+            it stands on and of the machine, which `save` adds; and "scenario", if it is known.
     """
 
     time: FloatArray
     signals: Mapping[str, Recorded]
     events: tuple[ContactEvent, ...] = ()
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lengths = {"time": np.shape(self.time)[:1]} | {
@@ -119,7 +126,7 @@ class Record:
         }
         last = self.time[count - 1] if count else -np.inf
         events = tuple(event for event in self.events if event.time <= last)
-        return type(self)(self.time[:count], signals, events)
+        return type(self)(self.time[:count], signals, events, self.about)
 
     def event_rows(self) -> list[dict[str, Any]]:
         """The events as rows of plain values, for `pandas.DataFrame` or a `csv.DictWriter`.
@@ -172,6 +179,7 @@ class Record:
             arrays[f"{name}.names"] = np.array([s.name for s in recorded.signals], dtype=str)
             arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
         arrays |= event_arrays(self.events)
+        arrays["about"] = np.array(json.dumps({"versions": versions(), **self.about}))
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
     def to_csv(self, path: str | Path) -> None:
@@ -239,24 +247,19 @@ class Record:
             ModelError: The file holds something else.
         """
         try:
-            with open(path, "rb") as rows:
-                if rows.read(1) == b"{":
-                    rows.seek(0)
-                    return cls(*_read_rows(rows))
-            with np.load(path, allow_pickle=False) as file:
+            with open_file(path) as rows:
+                is_part = rows.read(1) == b"{"
+                rows.seek(0)
+                if is_part:
+                    return _read_rows(rows, cls)
+                file = np.load(rows, allow_pickle=False)
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
-                return cls(file["time"], signals, events_of_arrays(file))
-        except (
-            AttributeError,
-            EOFError,
-            KeyError,
-            OSError,
-            TypeError,
-            ValueError,
-            BadZipFile,
-        ) as error:
-            raise ModelError(f"{path} is not a record of a run: {error}") from None
+                about = json.loads(str(file["about"])) if "about" in file.files else {}
+                return cls(file["time"], signals, events_of_arrays(file), about)
+        except Exception as error:  # Those of zip files, of NumPy's headers and of JSON are many.
+            text = getattr(error, "strerror", None) or error
+            raise ModelError(f"{path} is not a record of a run: {text}") from None
 
 
 def _label(signal: Signal) -> str:
@@ -275,9 +278,22 @@ def _needed(module: str, asked: str) -> Any:
         raise ModelError(f"{asked} needs {module}: pip install 'drake_dae[data]'") from None
 
 
-def _read_rows(file: BinaryIO) -> tuple[FloatArray, dict[str, Recorded]]:
+def versions() -> dict[str, str]:
+    """The versions of the library, of what it stands on and of Python, and the machine."""
+    found = {"python": platform.python_version(), "machine": platform.platform()}
+    for name in ("drake_dae", "drake", "casadi", "numpy"):
+        with suppress(PackageNotFoundError):  # Drake may be built from its source.
+            found[name] = version(name)
+    return found
+
+
+R = TypeVar("R", bound=Record)
+
+
+def _read_rows(file: BinaryIO, kind: type[R]) -> R:
     """What a `RecordWriter` appended; bytes after the last whole row are left out."""
-    labels = json.loads(file.readline())["signals"]
+    head = json.loads(file.readline())
+    labels = head["signals"]
     named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
     stops = np.cumsum([1, *map(len, named.values())])
     data = file.read()
@@ -288,7 +304,8 @@ def _read_rows(file: BinaryIO) -> tuple[FloatArray, dict[str, Recorded]]:
     whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
     time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
     pairs = zip(named.items(), columns, strict=True)
-    return time[:, 0], {name: Recorded(values, signals) for (name, signals), values in pairs}
+    recorded = {name: Recorded(values, signals) for (name, signals), values in pairs}
+    return kind(time[:, 0], recorded, (), head.get("about", {}))
 
 
 def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:

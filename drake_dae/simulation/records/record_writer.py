@@ -4,10 +4,10 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.record import Record, versions
 from drake_dae.trace.given import result_of
 
 PERIOD = 1.0
@@ -44,10 +44,20 @@ class RecordWriter:
         path: The file.
         record: From a context and a time in s, or None, to what was recorded later, as
             `ClosedLoop.record`.
+        about: What one needs to repeat the run, as in `Record`.
+
+    Attributes:
+        path, about: The arguments.
     """
 
-    def __init__(self, path: str | Path, record: Callable[[Context, float | None], Record]) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        record: Callable[[Context, float | None], Record],
+        about: Mapping[str, Any] | None = None,
+    ) -> None:
         self.path = Path(path)
+        self.about = dict(about or {})
         self._record = record
         self._file: int | None = None
         self._end = 0
@@ -119,7 +129,7 @@ class RecordWriter:
         if self._file is None:
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         if self._end == 0:
-            data = _head(record) + data
+            data = _head(record, self.about) + data
         # At a place of its own: what a failed append left there is written over.
         done = 0
         while done < len(data):
@@ -129,8 +139,9 @@ class RecordWriter:
         self._time = float(record.time[stop - 1])
 
 
-def _head(record: Record) -> bytes:
+def _head(record: Record, about: Mapping[str, Any]) -> bytes:
     layout = {
+        "about": {"versions": versions(), **about},
         "rows": "little-endian float64: time in s, then the signals in this order",
         "signals": {
             name: [[signal.name, signal.unit] for signal in recorded.signals]

@@ -15,6 +15,9 @@ from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
 _SAME = 1e-9
 """Times that differ by less than this, in periods, are one."""
 
+MOST_ON_THE_WAY = 10_000
+"""So many computations may be on the way at once: each is kept, and moved at every sample."""
+
 
 @checked(ModelError)
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Sampling:
             several computations are on the way at once.
 
     Raises:
-        ModelError: The period is not positive, or the delay is negative.
+        ModelError: The period is not positive, or the delay is negative or very many periods.
     """
 
     period: float
@@ -38,6 +41,11 @@ class Sampling:
             raise ModelError(f"a sampling's period must be positive, got {self.period:g} s")
         if not (isfinite(self.delay) and self.delay >= 0.0):
             raise ModelError(f"a sampling's delay must be 0 or more, got {self.delay:g} s")
+        if not self.delay / self.period <= MOST_ON_THE_WAY:
+            raise ModelError(
+                f"a sampling's delay may be {MOST_ON_THE_WAY} periods at most, here "
+                f"{MOST_ON_THE_WAY * self.period:g} s, got {self.delay:g} s"
+            )
 
     @property
     def whole_periods(self) -> int:
@@ -90,6 +98,7 @@ class ControlHold(LeafSystem):
         super().__init__()
         self.set_name("control_hold")
         self.sampling = sampling
+        self.sample_period = sampling.period
         self._port = self.DeclareVectorInputPort("control", size)
         # What is held; then what was read and does not act yet, the oldest first.
         waiting = sampling.whole_periods + (sampling.rest > 0.0)

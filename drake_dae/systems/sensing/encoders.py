@@ -168,6 +168,7 @@ class StateSensor(LeafSystem):
         check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.period = encoders, positive("period", period)
+        self.sample_period = self.period
         self._resolution, self._bias, self._position_noise, self._velocity_noise = (
             _each(name, getattr(encoders, name), num_positions)
             for name in ("resolution", "position_bias", "position_noise", "velocity_noise")

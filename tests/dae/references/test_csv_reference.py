@@ -41,6 +41,61 @@ def test_deviation_is_the_largest_at_the_rows(tmp_path):
     assert np.all(path.deviation < 0.3 * 0.01)
 
 
+def raster(folder: Path, strokes: int, length: float, times: tuple[float, float]) -> Path:
+    """Strokes to and fro along y, each begun beside the last one, with rows at their ends alone."""
+    rows, time = ["time,y,z"], 0.0
+    for stroke in range(strokes):
+        for place, lasting in zip((stroke % 2, 1 - stroke % 2), times, strict=True):
+            rows.append(f"{time},{length * place},{0.02 * stroke}")
+            time += lasting
+    file = folder / "raster.csv"
+    file.write_text("\n".join(rows))
+    return file
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize(
+    ("strokes", "length", "times"),
+    [(6, 0.16, (2.0, 0.5)), (3, 16.0, (1.0, 1.0)), (2, 1e-3, (9, 1))],
+)
+def test_few_rows_are_met_within_the_tolerance(strokes, length, times, order, tmp_path):
+    """The reference itself is asked at the times of the rows, by the function that the law gets."""
+    file = str(raster(tmp_path, strokes, length, times))
+    for share in (0.02, 0.001):
+        path = CsvReference(file, ["y", "z"], order=order, tolerance=share)
+        function = path.derivatives([0, 0])
+        off = np.array([np.abs(function(row[0]) - row[1:]) for row in path.table])
+        assert np.all(off.max(axis=0) <= share * np.ptp(path.table[:, 1:], axis=0))
+        np.testing.assert_allclose(path.deviation, off.max(axis=0), atol=1e-14 * length)
+        assert f"y by {off[:, 0].max():.2g}, z by" in path.remark
+
+
+def test_smoothing_that_loses_the_rows_is_refused_with_what_is_lost(tmp_path):
+    """With 2 s between points, as rows have along strokes, half of each stroke is lost."""
+    file = str(raster(tmp_path, 6, 0.16, (2.0, 0.5)))
+    wide = CsvReference(file, ["z", "y"], smoothing=2.0, tolerance=1.0)
+    off = wide.deviation[1]
+    assert off > 0.03
+    with pytest.raises(ReferenceSignalError, match=rf"off its rows by {off:.3g} in 'y', and at"):
+        CsvReference(file, ["z", "y"], smoothing=2.0).derivatives([2, 2])
+
+
+def test_a_column_that_stays_is_met_to_round_off(tmp_path):
+    file = tmp_path / "still.csv"
+    file.write_text("time,y,z\n0,5.1,0\n1,5.1,0\n3,5.1,0\n")
+    assert np.all(CsvReference(str(file), ["y", "z"]).deviation < 1e-14)
+
+
+@pytest.mark.parametrize("length", [1000.1, 999.99, 5.0, 1.0 / 3.0])
+def test_the_least_smoothing_that_is_told_is_taken(length, tmp_path):
+    file = tmp_path / "long.csv"
+    file.write_text(f"time,y\n0,0\n{length / 2},1\n{length},0\n")
+    with pytest.raises(ReferenceSignalError, match="or more") as refused:
+        CsvReference(str(file), ["y"], smoothing=1e-9).derivatives([2])
+    least = float(str(refused.value).split()[3])
+    CsvReference(str(file), ["y"], smoothing=least).derivatives([2])
+
+
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_columns_are_found_by_name_and_held_at_the_ends(delimiter, tmp_path):
     path = CsvReference(str(wave(tmp_path, delimiter)), ["z", "y"], "t", start_time=1.0)
@@ -68,6 +123,9 @@ def test_a_file_is_looked_for_beside_the_one_that_names_it(tmp_path):
         ("t,y\n0,1\n1,two\n", "row 3, y: expected a number, got 'two'"),
         ("t,y\n0,1\n1\n", "row 3, y: expected a number, got ''"),
         ("t,y\n0,1\n1,inf\n", "row 3, y: expected a number, got 'inf'"),
+        ("t,y\n0,1\n1_0,2\n", "row 3, t: expected a number, got '1_0'"),
+        ("t;y\n0;1,5\n1;2,5\n", "row 2, y: expected a number, got '1,5'"),
+        ("t,y\n0,1\n1,1e300\n", "row 3, y: expected a number of at most 1e.15, got '1e300'"),
         ("t,y\n0,1\n1,2\n1,3\n", "t must increase, row 4 has 1 after 1"),
         (b"\xff\xfe\x00", "cannot read"),
     ],

@@ -20,6 +20,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.given import numpy_told
+from drake_dae.trace.smoothness import find_flaw
 
 X, Y = np.linspace(-0.2, 0.2, 33), np.linspace(-0.15, 0.15, 25)
 A, B = 0.02, 15.0
@@ -36,6 +37,59 @@ def derivatives(surface, order):
 
 
 # Formulas.
+
+
+@pytest.mark.parametrize(
+    ("formula", "distance", "places"),
+    [
+        (
+            "1.44 - x**2",
+            lambda p: (1.44 - p[0] ** 2) / (2 * abs(p[0])),
+            [(1.2, 0, 0), (-1.2, 0, 0)],
+        ),
+        ("exp(-y) - 0.5", lambda p: 1 - 0.5 * np.exp(p[1]), [(0, np.log(2), 0)]),
+        ("z**3 - 8", lambda p: (p[2] ** 3 - 8) / (3 * p[2] ** 2), [(0, 0, 2)]),
+        (
+            "sin(3*x)",
+            lambda p: np.sin(3 * p[0]) / abs(3 * np.cos(3 * p[0])),
+            [(0, 0, 0), (np.pi / 3, 0, 0)],
+        ),
+        (
+            "(x + 2*y)**2 - 1",
+            lambda p: ((p[0] + 2 * p[1]) ** 2 - 1) / (5**0.5 * 2 * abs(p[0] + 2 * p[1])),
+            [(1, 0, 0), (-1, 0, 0)],
+        ),
+    ],
+)
+def test_a_formula_of_one_length_is_smooth_where_its_gradient_is_not_zero(
+    formula, distance, places
+):
+    """|F'| of one variable is the root of a square, of which CasADi makes fabs.
+
+    Second differences of phi by hand, 1e-4 apart, are its second derivatives to 1e-6: h^2 of the
+    fourth derivatives, and round-off over h^2.
+    """
+    p, h = ca.SX.sym("p", 3), 1e-4
+    found = ImplicitSurface(formula).distance(p)
+    assert find_flaw(found, p, ca.SX(0, 1)) is None
+    hessian = ca.Function("hessian", [p], [ca.hessian(found, p)[0]])
+    for place in np.array(places, dtype=float):
+        steps = h * np.eye(3)
+        wanted = [
+            [
+                sum(i * j * distance(place + i * a + j * b) for i in (1, -1) for j in (1, -1))
+                / (4 * h**2)
+                for a in steps
+            ]
+            for b in steps
+        ]
+        np.testing.assert_allclose(np.array(hessian(place)), wanted, atol=2e-6)
+
+
+@pytest.mark.parametrize("text", ["1_0 - x", "0x10 - x", "0b1 - x", "x - 1e400", "x*1_000.5"])
+def test_numbers_of_python_alone_are_none_of_a_formula(text):
+    with pytest.raises(ModelError, match="is no number, or is too large a number"):
+        ImplicitSurface(text)
 
 
 @pytest.mark.parametrize(
@@ -304,8 +358,14 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
         (lambda f: HeightMap((0.4, 0.3), file=f / "none.npy"), "no file '"),
         (lambda f: HeightMap((0.4, 0.3), file=f / "a\0.npy"), "no file '"),
         (lambda f: HeightMap((0.4, 0.3), file=f), "is no .csv, .npy or .png"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "hole.csv"), "row 2, column 1 is no height"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "uneven.csv"), "rows of numbers of one length"),
+        (
+            lambda f: HeightMap((0.4, 0.3), file=f / "hole.csv"),
+            "row 2, column 1: expected a number, got 'nan'",
+        ),
+        (
+            lambda f: HeightMap((0.4, 0.3), file=f / "uneven.csv"),
+            "row 1 has 2 heights, row 2 has 1",
+        ),
         (lambda f: HeightMap((0.4, 0.3), file=f / "words.csv"), "has no table of heights"),
         (lambda f: HeightMap((0.4, 0.3), file=f / "words.png"), "'words.png'"),
         (lambda f: HeightMap((0.4, 0.3), file=f / "words.npy"), "'words.npy'"),

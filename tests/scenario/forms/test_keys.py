@@ -6,6 +6,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import build_scenario
+from drake_dae.dae.states.family import Deciding
 from drake_dae.dae.structure.assumptions import Cause, Violation
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.scenario.forms.keys import violated
@@ -18,7 +19,8 @@ PYTHON = re.compile(
 @pytest.mark.parametrize("cause", Cause)
 @pytest.mark.parametrize(("assumption", "key"), [(2, "constraints"), (5, "outputs")])
 def test_no_remedy_is_a_call_of_python(cause, assumption, key):
-    error = violated(Violation(assumption, cause, ("tool.z",), 2).error())
+    deciding = Deciding(("wall.stiffness",), (1.0,), (0.0,))
+    error = violated(Violation(assumption, cause, ("tool.z",), 2, deciding=deciding).error())
     ((found, text),) = error.problems
     assert found == key
     assert text.startswith(f"Assumption ({assumption}): ")

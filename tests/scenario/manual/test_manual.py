@@ -39,6 +39,7 @@ PURE = {
     ("!RollingBall", "along"),
     ("!ForceCombination", "weights"),
     ("!Circle", "turns"),
+    ("!Csv", "tolerance"),
     ("!Text", "along"),
     ("!Text", "up"),
     ("!DcMotors", "gear_ratio"),

@@ -61,6 +61,13 @@ def at(record, name, times):
     return record[name][index, 0]
 
 
+@pytest.mark.parametrize(("period", "delay"), [(1e-3, 1e6), (1e-12, 1.0), (1.0, 1e300)])
+def test_a_delay_of_more_samples_than_are_kept_is_refused(period, delay):
+    with pytest.raises(ModelError, match="10000 periods at most"):
+        Sampling(period, delay)
+    assert Sampling(period, 9_999.5 * period).late_samples == 10_000
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.3 * T, T, 1.3 * T, 2.0 * T])
 def test_held_control_is_that_of_the_map_by_hand(delay):
     """x_(k+1) = x_k + rest u_(k-n-1) + (T - rest) u_(k-n), u_k = -K x_k, and u_k = u_0 before.

@@ -187,7 +187,9 @@ class UnilateralRobotPlant(ModalPorts):
         return self._advance(context, state)
 
     def _start(self, context: Context, state: State) -> EventStatus:
-        vars(self._log(context)).update(vars(Log(time=context.get_time())))
+        log, now = self._log(context), context.get_time()
+        earlier = [event for event in log.events if event.time < now]  # Of a run that goes on.
+        vars(log).update(vars(Log(events=earlier, time=now)))
         if context.get_accuracy() is None:
             raise SimulationError(
                 f"{self.dae.name}: the context has no accuracy, and without one Drake does not "
@@ -224,7 +226,11 @@ class UnilateralRobotPlant(ModalPorts):
             return EventStatus.Succeeded()
         status = self._reset(context, state)
         # To begin closed is no event.
-        log.events = [event for event in log.events if event.kind is not ContactChange.CLOSING]
+        log.events = [
+            event
+            for event in log.events
+            if event.time < now or event.kind is not ContactChange.CLOSING
+        ]
         return status
 
     def _advance(self, context: Context, state: State) -> EventStatus:

@@ -1,0 +1,246 @@
+"""What the command line takes: commands, options and their words."""
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import drake_dae
+from drake_dae.arrays import number_in
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO
+
+TIME_LIMIT = 3600.0
+"""How long a run of a sweep may take where nobody says, in s."""
+
+
+def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command and its options.
+
+    Args:
+        arguments: Those after the command's name; those of this process if None.
+
+    Raises:
+        SystemExit: They mean nothing, which is told, or ask for help or the version.
+    """
+    parser = argparse.ArgumentParser(
+        prog="drake-dae",
+        description="Robots in contact: position and force tracking on Drake's systems framework.",
+    )
+    parser.add_argument("--version", action="version", version=drake_dae.__version__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    listed = commands.add_parser("list", help="name the shipped scenarios")
+    _add_json(listed, "print names and descriptions as JSON")
+    shown = commands.add_parser("show", help="print a scenario, to begin one with")
+    shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
+    shown.add_argument("--path", action="store_true", help="print where its file is instead")
+    commands.add_parser("keys", help="print all keys of a scenario, as a page in Markdown")
+    commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
+    named = argparse.ArgumentParser(add_help=False)
+    named.add_argument(
+        "scenario",
+        nargs="?",
+        default=DEFAULT_SCENARIO,
+        help=f"a shipped scenario or a YAML file (default: {DEFAULT_SCENARIO})",
+    )
+    named.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help='change the scenario, for example "integrator.accuracy=1e-8"; may be repeated',
+    )
+    named.add_argument(
+        "--compiled",
+        choices=["true", "false", "auto"],
+        help="whether functions become machine code, as the scenario's key `compiled`",
+    )
+    run = commands.add_parser(
+        "simulate",
+        parents=[named],
+        help="run a scenario",
+        epilog="exit code: 0 if the run came to its end, 1 for an error, also where it ended "
+        "early; with --check 2 if it missed its task: errors are not as predicted, without a "
+        "reason or to the end, or a contact, a drive or a joint would have to do what it cannot",
+    )
+    run.add_argument(
+        "--out", type=_path, help="folder for the results (default: runs/<scenario>-<time>)"
+    )
+    run.add_argument(
+        "--meshcat", action="store_true", help="show the robot while it runs, in a browser"
+    )
+    run.add_argument(
+        "--open", action="store_true", help="open the animation in a browser at the end"
+    )
+    run.add_argument(
+        "--rollout",
+        action="store_true",
+        help="run without Drake's Simulator, the whole loop as one function, which pays for many "
+        "runs (see sweep) rather than for one; the record has every fixed step, or 1000 rows under "
+        "error control, and is written at the end alone",
+    )
+    run.add_argument(
+        "--check", action="store_true", help="exit code 2 for a run that missed its task"
+    )
+    _add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
+    shown = commands.add_parser("view", help="open the animation of a run in the browser")
+    shown.add_argument("folder", type=_path, help="the folder of the run")
+    examine = commands.add_parser(
+        "analyze",
+        parents=[named],
+        help="examine a scenario without running it",
+        description="Examines the robot of a scenario (relative degrees, index, Assumptions "
+        "(1)-(5), zero dynamics) and what its reference takes: the nearest singularity, control "
+        "and joint forces against their limits, contact forces, joint limits, and when the "
+        "reference leaves what the robot can reach.",
+        epilog="exit code: 0 if no problem was found, 2 if one was (the lines PROBLEM), 1 for an "
+        "error",
+    )
+    _add_json(examine, "print JSON")
+    _add_sweep(commands, named)
+    _add_new(commands)
+    written = commands.add_parser(
+        "export",
+        parents=[named],
+        help="write law, plant and projection as C99",
+        description="Writes the law, the plant and the projection of a scenario as plain C99 "
+        "without dependencies, with sizes, names and units, and a test program: `make` in the "
+        "folder compiles it and compares it with Python.",
+    )
+    written.add_argument("--out", type=_path, help="folder for the files (default: <scenario>_c99)")
+    _add_json(written, "print as JSON what is written")
+    film = commands.add_parser(
+        "film",
+        help="film a run, into a GIF or a strip of pictures",
+        description="Renders what a run left in its folder, with the paths and the forces of its "
+        "contacts. It takes no screen, and no browser.",
+    )
+    film.add_argument("folder", type=_path, help="the folder of a run, as runs/seven_joint_wall")
+    film.add_argument(
+        "--out",
+        type=_path,
+        help="a .gif, or a .png for four moments side by side (default: film.gif in the folder)",
+    )
+    kept = commands.add_parser("cache", help="show the machine code that is kept, or remove it")
+    kept.add_argument("--clear", action="store_true", help="remove it all")
+    options = parser.parse_args(arguments)
+    if options.command == "simulate" and options.rollout and options.meshcat:
+        parser.error("--rollout shows nothing while it runs; leave out --meshcat")
+    return options
+
+
+def _add_new(commands: Any) -> None:
+    begin = commands.add_parser(
+        "new",
+        help="write a scenario for a robot of your own",
+        description="Writes a scenario for a robot of which only the file is known: it finds base, "
+        "chain and tip, locks what grasps or rolls, puts a surface where the tip reaches it well, "
+        "and has it circle and press there within the limits. Each line says why.",
+    )
+    begin.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
+    begin.add_argument(
+        "--surface",
+        choices=["plane", "cylinder", "sphere"],
+        default="plane",
+        help="what it works on (default: plane)",
+    )
+    begin.add_argument(
+        "--tip",
+        default="",
+        metavar="LINK[:x,y,z]",
+        help="the link or frame that touches, and the point in it in m (default: the end of the "
+        "longest chain)",
+    )
+    begin.add_argument(
+        "--out", type=_path, metavar="FILE", help="the file (default: <robot>_<surface>.yaml)"
+    )
+
+
+def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
+    study = commands.add_parser(
+        "sweep",
+        parents=[named],
+        help="run a scenario many times with other values",
+        description="Runs a scenario once for every combination of the values of some keys, on all "
+        "cores, and leaves a table with figures of each run, a summary and plots. Killed at any "
+        "moment and started again with the same command, it continues where it was.",
+        epilog="exit code: 0, or 1 for an error, also where the process of a run died or was too "
+        "slow: the same command tries that run again; with --check 2 if a run did not finish",
+    )
+    study.add_argument(
+        "--vary",
+        action="append",
+        required=True,
+        metavar="KEY=VALUES",
+        help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
+        '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
+        '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
+        '"force.seed=1..20:20"; may be repeated',
+    )
+    chosen = study.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--random",
+        type=_whole,
+        metavar="COUNT",
+        help="so many runs with random values, all in a range equally likely, instead of a grid",
+    )
+    chosen.add_argument(
+        "--together",
+        action="store_true",
+        help="the first values of all keys, then the second ones, instead of a grid",
+    )
+    study.add_argument("--seed", type=_whole, default=0, help="of the random values (default: 0)")
+    study.add_argument(
+        "--rollout",
+        action="store_true",
+        help="run without Drake's Simulator, the whole loop as one function, as `simulate "
+        "--rollout` does: many times as fast",
+    )
+    study.add_argument(
+        "--workers", type=_whole, metavar="COUNT", help="how many processes (default: one per core)"
+    )
+    study.add_argument(
+        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
+    )
+    study.add_argument(
+        "--time-limit",
+        type=_seconds,
+        default=TIME_LIMIT,
+        metavar="SECONDS",
+        help="how long a run may take by the clock, building included, until its process is ended "
+        f"and it counts as timed out (default: {TIME_LIMIT:g}; on a cluster there is none)",
+    )
+    study.add_argument("--check", action="store_true", help="exit code 2 if a run did not finish")
+    _add_json(study, "print outcomes and figures as JSON, and all else on stderr")
+    study.add_argument(
+        "--out", type=_path, help="folder for the results (default: runs/<scenario>-sweep)"
+    )
+
+
+def _path(text: str) -> Path:
+    """A path of the command line; "", as of a variable of the shell that is not set, is none."""
+    if not text:
+        raise argparse.ArgumentTypeError("a name is needed, got ''")
+    return Path(text)
+
+
+def _whole(text: str) -> int:
+    """A whole number of the command line; Python also reads 1_000 and digits of other alphabets."""
+    if not re.fullmatch("-?[0-9]{1,15}", text):
+        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    """A positive number of the command line."""
+    value = number_in(text)
+    if value is None or value <= 0.0:
+        raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got '{text}'")
+    return value
+
+
+def _add_json(command: argparse.ArgumentParser, what: str) -> None:
+    command.add_argument(
+        "--json", action="store_true", help=f'{what}; for an error, its text under "error"'
+    )

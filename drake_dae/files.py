@@ -1,0 +1,61 @@
+"""Files that a user names: read whole, where they are files at all and no larger than allowed."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+MOST_BYTES = 1 << 28
+"""A file of data is no larger: that many bytes of numbers take gigabytes in Python."""
+
+
+def open_file(path: str | Path) -> BinaryIO:
+    """Opens a file for reading, if it is one.
+
+    A pipe, which may wait for ever for its writer, and a device, which may never end, are refused.
+
+    Raises:
+        OSError: It cannot be read, or is no regular file.
+        ValueError: The path holds a null byte, or letters that no path holds.
+    """
+    # A pipe is opened without waiting for its writer.
+    number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        mode = os.fstat(number).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
+        return os.fdopen(number, "rb")
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
+    """The bytes of a file.
+
+    Args:
+        path: The file.
+        most: How many bytes it may have.
+
+    Raises:
+        OSError: It cannot be read, is no regular file, or is too large; see `open_file`.
+        ValueError: The path holds a null byte, or letters that no path holds.
+    """
+    with open_file(path) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        text = f"it is larger than {most:,} bytes, the most that is read"
+        raise OSError(errno.EFBIG, text, str(path))
+    return data
+
+
+def read_text(path: str | Path, most: int = MOST_BYTES) -> str:
+    """The text of a file in UTF-8, without a byte order mark, and with single line feeds.
+
+    The arguments and errors are those of `read_bytes`; UnicodeDecodeError is a ValueError.
+    """
+    text = read_bytes(path, most).decode("utf-8-sig")
+    return text.replace("\r\n", "\n").replace("\r", "\n")

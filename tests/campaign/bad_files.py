@@ -1,0 +1,449 @@
+"""Data, robots, records and command lines with a mistake, read by what users read them with."""
+
+import contextlib
+import io
+import json
+import os
+import random
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from campaign.outcomes import RAW, REFUSED, Outcome, checked
+
+from drake_dae import (
+    CsvReference,
+    HeightMap,
+    MeshSurface,
+    Record,
+    build_scenario,
+    load_scenario,
+    simulate,
+)
+from drake_dae.cli import main
+from drake_dae.scenario.robot_file.changes import finalize
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.shipped import FOLDER, find_scenario
+from drake_dae.studies.journal import open_journal, study_head
+
+ROBOTS = Path(__file__).parents[1] / "scenario" / "robots"
+
+CELLS = (
+    "",
+    "nan",
+    "inf",
+    "-inf",
+    "1e300",
+    "1e-320",
+    "1_0",
+    "0x1",
+    "1,5",
+    "\u0661",
+    "abc",
+    "\0",
+    "--1",
+    "1e",
+    "1" * 400,
+)
+"""What stands in the place of a number and is none, or none of use."""
+
+SIZES = ("(1000000, 1000000)", "(-3, 3)", "(3,)", "()", "(3, 3, 3)", "(2, 10)", "'a'", "(1e3, 3)")
+KINDS = ("<f8", "<f4", "<i2", "<c16", "|b1", "<U4", "|O", "<M8[s]", "nonsense", "<f16")
+
+
+def attempt(seed: int, folder: Path) -> Outcome:
+    """Reads something bad."""
+    choice = random.Random(seed)
+    kind = choice.choices(
+        (_data, _special, _robot, _record, _journal, _command), (6, 1, 4, 2, 2, 5)
+    )[0]
+    return kind(choice, folder)
+
+
+def _outcome(what: str, read: Callable[[], object], excuse: str) -> Outcome:
+    with checked(what) as outcome:
+        read()
+        outcome.residual = outcome.off = 0.0
+        outcome.accepted(excuse)
+    return outcome
+
+
+# Data.
+
+
+def _data(choice: random.Random, folder: Path) -> Outcome:
+    """A path, heights or a mesh with one wrong number, or with bytes that are others or missing."""
+    ending = choice.choice(("path.csv", "csv", "npy", "png", "obj"))
+    file = folder / f"data.{ending}"
+    kinds = {"path.csv": _path, "csv": _table, "npy": _npy, "png": _png, "obj": _obj}
+    how, data, excuse = kinds[ending](choice)
+    if choice.random() < 0.4:
+        how, data = _damaged(data, choice)
+        excuse = "what is left is data"
+    file.write_bytes(data)
+
+    def read() -> object:
+        if ending == "path.csv":
+            made = CsvReference(str(file), ["y", "z"], order=choice.randint(2, 6))
+            return made.derivatives([2, 2])(1.0)
+        if ending == "obj":
+            return MeshSurface(file)
+        return HeightMap((0.4, 0.3), file=file)
+
+    return _outcome(f"{ending}: {how}", read, excuse)
+
+
+def _path(choice: random.Random) -> tuple[str, bytes, str]:
+    rows = [[f"{0.5 * i}", f"{0.1 * i % 0.3:g}", f"{0.01 * i:g}"] for i in range(8)]
+    return _with_cell(rows, choice, ",", "time,y,z\n")
+
+
+def _table(choice: random.Random) -> tuple[str, bytes, str]:
+    rows = [[f"{np.sin(i + 2 * j) / 50:.4f}" for j in range(5)] for i in range(4)]
+    return _with_cell(rows, choice, choice.choice((",", ";", "\t")), "")
+
+
+def _with_cell(
+    rows: list[list[str]], choice: random.Random, between: str, head: str
+) -> tuple[str, bytes, str]:
+    row, cell = choice.choice(rows), choice.choice(CELLS)
+    place = choice.randrange(len(row))
+    row[place] = cell
+    split = cell == "1,5" and between == ","  # In a path the last columns are not looked at.
+    excuse = "another number" if cell == "1e-320" or (split and head) else ""
+    text = "\n".join(between.join(one) for one in rows)
+    return f"{cell[:8]!r} between {between!r}", (head + text).encode(), excuse
+
+
+def _npy(choice: random.Random) -> tuple[str, bytes, str]:
+    size, kind = choice.choice(SIZES), choice.choice(KINDS)
+    head = f"{{'descr': '{kind}', 'fortran_order': {choice.random() < 0.2}, 'shape': {size}, }}"
+    text = head.encode().ljust(117) + b"\n"
+    data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + np.zeros(20).tobytes()
+    good = size == "(2, 10)" and kind in ("<f8", "<f4", "<i2")
+    return f"{kind} of {size}", data, "numbers that fit" if good else ""
+
+
+def _png(choice: random.Random) -> tuple[str, bytes, str]:
+    from matplotlib.image import imsave
+
+    file = io.BytesIO()
+    imsave(file, np.random.default_rng(0).random((8, 8)), format="png")
+    return (*_damaged(file.getvalue(), choice), "what is left is a picture")
+
+
+def _obj(choice: random.Random) -> tuple[str, bytes, str]:
+    lines = [f"v {x} {y} {0.1 * x * y}" for x in range(3) for y in range(3)]
+    faces = [(1, 4, 5, 2), (2, 5, 6, 3), (4, 7, 8, 5), (5, 8, 9, 6)]
+    lines += ["f " + " ".join(map(str, face)) for face in faces]
+    index = choice.randrange(len(lines))
+    words = lines[index].split()
+    new = choice.choice((*CELLS, "0", "-99", "99", "2"))
+    words[choice.randrange(1, len(words))] = new
+    lines[index] = " ".join(words)
+    excuse = "another number" if new in ("2", "0", "1e-320") or new == "99" else ""
+    excuse = excuse if words[0] == "v" or new == "2" else ""
+    if words[0] == "v" and new in ("-99", "99"):
+        excuse = "another number"
+    return f"{lines[index][:40]!r}", "\n".join(lines).encode(), excuse
+
+
+def _damaged(data: bytes, choice: random.Random) -> tuple[str, bytes]:
+    """Bytes that end too early, or lack, have or change something in the middle."""
+    place = choice.randrange(max(1, len(data)))
+    how = choice.choice(("cut", "gap", "insert", "change", "twice"))
+    if how == "cut":
+        return f"cut at {place}", data[:place]
+    if how == "twice":
+        return "twice", data + data
+    if how == "gap":
+        return f"gap at {place}", data[:place] + data[place + choice.randint(1, 9) :]
+    some = bytes(choice.randrange(256) for _ in range(choice.randint(1, 4)))
+    rest = data[place:] if how == "insert" else data[place + len(some) :]
+    return f"{how} {some!r} at {place}", data[:place] + some + rest
+
+
+def _special(choice: random.Random, folder: Path) -> Outcome:
+    """A pipe, a device, a folder, a loop of links, or nothing in the place of a file."""
+    ending = choice.choice(("csv", "npy", "png", "obj", "stl", "yaml", "npz"))
+    file, kind = (
+        folder / f"data.{ending}",
+        choice.choice(("pipe", "zero", "folder", "loop", "none")),
+    )
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    elif kind != "none":
+        file.symlink_to(file if kind == "loop" else "/dev/zero")
+    readers: dict[str, Callable[[], object]] = {
+        "csv": lambda: CsvReference(str(file), ["y"]).derivatives([0]),
+        "obj": lambda: MeshSurface(file),
+        "stl": lambda: MeshSurface(file),
+        "yaml": lambda: load_scenario(file),
+        "npz": lambda: Record.load(file),
+    }
+    read = readers.get(ending, lambda: HeightMap((0.4, 0.3), file=file))
+    return _outcome(f"{kind} for .{ending}", read, "")
+
+
+# Robots.
+
+
+def _robot(choice: random.Random, folder: Path) -> Outcome:
+    """An SDFormat, MJCF, URDF or directives file with something damaged, or with a loop."""
+    file = choice.choice(
+        (
+            ROBOTS / "five_bar.sdf",
+            ROBOTS / "leaning_arm.xml",
+            FOLDER / "models" / "three_fingers.dmd.yaml",
+            FOLDER / "models" / "boom.urdf",
+            FOLDER / "models" / "held_box.urdf",
+        )
+    )
+    text, numbers = file.read_text("utf-8"), []
+    numbers = [i for i, word in enumerate(text.split(" ")) if any(c.isdigit() for c in word)]
+    how = choice.choice(("damage", "damage", "number", "number", "line", "include"))
+    if how == "number" and numbers:
+        words = text.split(" ")
+        place, new = choice.choice(numbers), choice.choice(CELLS)
+        words[place], how = new, f"{words[place][:20]!r} becomes {new[:8]!r}"
+        text = " ".join(words)
+    elif how == "include":
+        loops = {
+            ".sdf": "<include><uri>package://mine/robot.sdf</uri></include>",
+            ".xml": '<include file="robot.xml"/>',
+        }
+        place = text.rfind("</")
+        text = text[:place] + loops.get(file.suffix, "<include/>") + text[place:]
+    else:
+        how, data = _damaged(text.encode(), choice)
+        text = data.decode("utf-8", errors="replace")
+    name = "robot" + "".join(file.suffixes)
+    (folder / name).write_text(text, "utf-8")
+    (folder / "package.xml").write_text("<package format='2'><name>mine</name></package>")
+
+    def read() -> None:
+        plant, _ = read_robot(Robot(file=str(folder / name)))
+        finalize(plant)
+
+    return _outcome(f"{file.name}: {how}", read, "what is left is a robot")
+
+
+# Records and journals.
+
+
+def _record(choice: random.Random, folder: Path) -> Outcome:
+    """A record that is damaged, or whose arrays claim what they do not hold."""
+    file = folder / "record.npz"
+    Record(np.arange(3.0), {}).save(file)
+    how = choice.choice(("damage", "damage", "member", "rows"))
+    if how == "rows":
+        head = choice.choice(("[" * 9999, '{"signals": 1}', '{"signals": {"a": [[1]]}}', "{}", "{"))
+        file.write_bytes(head.encode() + b"\n" + bytes(100))
+    elif how == "member":
+        _, data, _ = _npy(choice)
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("time.npy", data)
+    else:
+        how, data = _damaged(file.read_bytes(), choice)
+        file.write_bytes(data)
+    return _outcome(f"record: {how}", lambda: Record.load(file), "what is left is a record")
+
+
+def _journal(choice: random.Random, folder: Path) -> Outcome:
+    """A line of a study's file with one entry that is another."""
+    head = study_head("1", {"duration": 1.0}, [{"a": 1}, {"a": 2}])
+    line = {"run": 0, "outcome": "finished", "reason": "", "figures": {"end [s]": 1.0}}
+    line |= {"exceeded": [], "seconds": 1.0}
+    key = choice.choice(list(line))
+    values = [-1, 2, 99, "0", True, None, 1.5, 1e300, [], {}, "x", float("nan"), [[1]], "\ud800"]
+    new = choice.choice(values)
+    text = json.dumps({**line, key: new})
+    if choice.random() < 0.1:
+        text = "[" * 50_000
+    other = json.dumps({**line, "run": 1})
+    file = folder / "runs.jsonl"
+    file.write_text("\n".join([json.dumps(head), text, other, ""]), "utf-8")
+
+    def read() -> None:
+        with open_journal(file, head) as journal:
+            assert set(journal.results) <= {0, 1}
+
+    fits = (key == "seconds" and new in (2, 99, 1.5, 1e300)) or (key == "figures" and new == {})
+    fits |= (key == "exceeded" and new in ([],)) or (key == "reason" and isinstance(new, str))
+    fits |= key == "exceeded" and isinstance(new, (str, dict))  # A list of letters, or of none.
+    return _outcome(f"journal: {key} = {new!r}", read, "it fits there" if fits else "")
+
+
+# Commands.
+
+WORDS = (
+    "two_link_wall",
+    "no_such",
+    "",
+    ".",
+    "/dev/zero",
+    "a\u00e9",
+    "--set",
+    "--set=duration=0.01",
+    "--set=duration=-1",
+    "--set=duration=1e400",
+    "--set=duration=1_0",
+    "--set=a.b=1",
+    "--set==",
+    "--set=sampling={period: 0.001, delay: 1.0e+6}",
+    "--set=write={}",
+    "--set=start={}",
+    "--set=references={tool.z: !Csv {file: /dev/zero, columns: [z]}}",
+    '--set=constraints.0.name="\\ud800"',
+    "--out=",
+    "--out",
+    "--out=results",
+    "--out=/dev/null/a",
+    "--json",
+    "--check",
+    "--rollout",
+    "--compiled=maybe",
+    "--compiled=false",
+    "--nonsense",
+    "-h",
+    "--surface=plane",
+    "--surface=cube",
+    "--tip=a:1,2,nan",
+    "--tip=a:1_0,2,3",
+    "--tip=:1,2,3",
+    "--path",
+)
+
+VARY = (
+    "start.errors.tool.z=-1e308..1e308:3",
+    "start.errors.tool.z=0..1e300:2",
+    "gains.all=[]",
+    "a=",
+    "=",
+    "force.seed=0..1e300",
+    "duration=1..0:3",
+    "duration=1..2",
+    "gains.all=0..1:999999999",
+    "x=[1, [2]]",
+    "plant_parameters.no=[1]",
+    "duration=[nothing, 1]",
+    "duration=[[[[1]]]]",
+    "duration=nan..1:2",
+)
+
+
+def _command(choice: random.Random, folder: Path) -> Outcome:
+    """A command line with random words, as far as it goes in a moment."""
+    command = choice.choice(
+        ("simulate", "analyze", "sweep", "film", "view", "new", "show", "list", "export")
+    )
+    words = [command, *choice.sample(WORDS, choice.randint(0, 3))]
+    if command == "sweep":
+        words += [
+            f"--vary={choice.choice(VARY)}",
+            *choice.choice(([], ["--random=2"], ["--together"])),
+        ]
+    if command in ("simulate", "export") and not any(w.startswith("--out") for w in words):
+        words.append("--out=results")
+    if command in ("simulate", "sweep", "analyze", "export"):
+        quick = ["--set=duration=0.01", "--set=write={plots: false, animation: false}"]
+        words[1:1] = ["two_link_wall", *quick] if choice.random() < 0.7 else quick
+    told, here = io.StringIO(), os.getcwd()
+    outcome = Outcome(f"drake-dae {' '.join(words)}"[:200], residual=0.0, off=0.0)
+    with checked(outcome.what) as caught:
+        os.chdir(folder)
+        try:
+            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+                code = main(words)
+        except SystemExit as error:
+            code = error.code
+        finally:
+            os.chdir(here)
+        text = told.getvalue()
+        if code == 0:
+            caught.residual = caught.off = 0.0
+            caught.text = "a command that makes sense"
+        elif code in (1, 2) and ("error: " in text or "PROBLEM" in text):
+            caught.kind, caught.text = REFUSED, text[-200:]
+        elif code == 2 and "--check" in words:
+            caught.text = "it missed its task"
+        else:
+            caught.kind, caught.text = RAW, f"exit code {code}: {text[-200:]}"
+    return caught
+
+
+# Several mistakes at once.
+
+SETTINGS = (
+    *("duration=1e300", "duration=1.0e-300", "integrator.max_step_size=1.0e-12", "compiled=maybe"),
+    *(
+        "integrator.accuracy=1.0e-300",
+        "integrator.start_time=1.0e+15",
+        "sampling={period: 1.0e-12}",
+    ),
+    *("sampling={period: 0.001, delay: 1.0e+6}", "sampling={period: 1.0e+300}", "saturation=true"),
+    *(
+        "encoders={resolution: 1.0e+9}",
+        "encoders={velocity_bandwidth: 1.0e-9}",
+        "robot.free=[link1]",
+    ),
+    *("force=!MeasuredForce {}", "force=!MeasuredForce {time_constant: 1.0e-9, gain: [1, 2]}"),
+    *(
+        "constraints.0.friction=1.0e+9",
+        "constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 0}",
+    ),
+    *(
+        "constraints.0.surface=!ImplicitSurface {function: 1.44 - x**2}",
+        "constraints=[]",
+        "outputs=[]",
+    ),
+    *("constraints.0.surface=!ImplicitSurface {function: 1_0 - x}", "plant=!MultibodyPlant {}"),
+    *(
+        "constraints.0.surface=!ImplicitSurface {function: sqrt(x**2) - 1.2}",
+        "plant=!Unilateral {}",
+    ),
+    *("references.tool.z=!Csv {file: /dev/zero, columns: [z]}", "references.tool.z=1.0e+300"),
+    *("references.tool.z=!Polyline {points: [[0.3], [0.3]], corner: 0, limits: {speed: 1}}",),
+    *("references.tool.z=!Sinusoids {offset: 0.3, amplitudes: [1.0e+9], frequencies: [1.0e+9]}",),
+    *("gains={all: [-1.0e+300]}", "gains={all: [-1.0e-300]}", "gains={all: [4]}", "gains={}"),
+    *("plant_parameters={link1.mass: 1.0e+300}", "plant_parameters={wall.position: [1, 2]}"),
+    *("start.errors={tool.z: 1.0e+9}", "start.positions={joint1: 1.0e+9}", "start={}", "forces=[]"),
+    *(
+        "actuation=[!FlexibleJoints {stiffness: 1.0e-300, inertia: 1.0e-300}]",
+        "robot.locked={joint1: 0}",
+    ),
+    *("exogenous={wall.position: [1, 2, 3]}", "exogenous={nothing: [0]}", "control_weights=[0, 0]"),
+    *("tolerances={outputs: {tool.z: 1.0e-300}}", "integral=[wall.force]", "compliances={}"),
+    *(
+        "observer={}",
+        "constraint_damping={all: [-1]}",
+        "task={phases: []}",
+        "loads=[{frame: tool}]",
+    ),
+)
+"""Each makes no sense, or little, or turns to another kind of run."""
+
+
+def several(seed: int, folder: Path) -> Outcome:
+    """A scenario with several mistakes at once, built and run for some steps."""
+    choice = random.Random(seed)
+    name = choice.choice(("two_link_wall", "two_link_wall", "two_link_motors", "five_bar"))
+    settings = choice.sample(SETTINGS, choice.randint(1, 4))
+    with checked(f"{name}: {'; '.join(settings)}") as outcome:
+        scenario = load_scenario(find_scenario(name), settings)
+        loop, context = build_scenario(scenario)
+        step = scenario.integrator.max_step_size
+        if scenario.sampling is not None:
+            step = min(step, scenario.sampling.period)
+        duration = min(scenario.duration, 0.01, 100 * step)
+        simulate(loop.diagram, context, duration, scenario.integrator)
+        record = loop.record(context)
+        outcome.residual = outcome.off = 0.0
+        finite = all(np.isfinite(one.values).all() for one in record.signals.values())
+        outcome.accepted("they fit together" if finite else "")
+    return outcome

@@ -1,0 +1,228 @@
+"""What commands tell programs, JSON and exit codes, and what of earlier runs they keep."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from drake_dae import Record, load_scenario
+from drake_dae.cli import main
+from drake_dae.commands import export
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.scenario import read_scenario
+from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
+from drake_dae.scenario.start import start_scenario
+
+BARE = ("--set=write.plots=false", "--set=write.animation=false")
+QUICK = ("--set=duration=0.2", *BARE)
+
+
+def told(arguments, capsys):
+    """The exit code, and what was printed as JSON."""
+    code = main([*map(str, arguments)])
+    return code, json.loads(capsys.readouterr().out)
+
+
+MISSED = {
+    # Steps of 0.05 s are too long for Euler's method, and nothing else is wrong.
+    "without a reason": [
+        "--set=integrator={integration_scheme: explicit_euler, use_error_control: false, "
+        "max_step_size: 0.05}",
+        "--set=duration=2",
+    ],
+    # The force would pull: -5 N.
+    "a contact that pulls": ["--set=references.wall.force=-5", "--set=duration=0.2"],
+    # The mass is another one, to the end.
+    "a plant that the law does not know": [
+        "--set=plant_parameters={link1.mass: 20}",
+        "--set=duration=1",
+    ],
+}
+
+
+@pytest.mark.parametrize("reason", MISSED)
+def test_a_run_that_missed_its_task_is_told_by_code_and_json(reason, tmp_path, capsys):
+    run = ["simulate", "two_link_wall", "--json", *BARE, *MISSED[reason]]
+    code, found = told([*run, "--check", f"--out={tmp_path / 'one'}"], capsys)
+    assert (code, found["missed"]) == (2, True)
+    assert found["tracking"] == ("as_predicted" if reason == "a contact that pulls" else "off")
+    assert bool(found["shortfalls"]) or found["tracking"] == "off"
+    # Whoever does not ask gets 0 for a run that came to its end.
+    code, again = told([*run, f"--out={tmp_path / 'two'}"], capsys)
+    assert (code, again["missed"]) == (0, True)
+
+
+def test_a_run_that_did_its_task_is_told_with_figures_and_files(tmp_path, capsys):
+    arguments = ["simulate", "two_link_wall", "--json", "--check", *QUICK, f"--out={tmp_path}"]
+    code, found = told(arguments, capsys)
+    assert code == 0
+    assert found["folder"] == str(tmp_path)
+    assert (found["missed"], found["tracking"], found["shortfalls"]) == (False, "as_predicted", [])
+    assert sorted(found["files"]) == sorted(path.name for path in tmp_path.iterdir())
+    record = Record.load(tmp_path / "record.npz")
+    assert found["simulated_time"] == pytest.approx(record.time[-1])
+    assert found["worst_output"] in [s.name for s in record.signals["tracking_error"].signals]
+    assert 0.0 <= found["off_prediction"] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simulate", "two_link_wall", "--set=duration=-1"], "duration"),
+        (["simulate", "no_such"], "no scenario file"),
+        (["analyze", "two_link_wall", "--set=gains={all: [4]}"], ""),
+        (["sweep", "two_link_wall", "--vary=a=1"], "a"),
+        (["export", "wall_polish"], "task"),
+    ],
+)
+def test_an_error_is_json_too(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = main([*arguments, "--json"])
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    if "error" in found:
+        assert code == 1
+        assert words in found["error"]
+        assert said.err.startswith("error: ")
+
+
+def test_the_list_is_json(capsys):
+    code, found = told(["list", "--json"], capsys)
+    assert code == 0
+    assert list(found) == list(shipped_scenarios())
+
+
+@pytest.mark.slow
+def test_a_study_is_json(tmp_path, capsys):
+    study = ["sweep", "two_link_wall", "--json", "--workers=1", *QUICK, f"--out={tmp_path}"]
+    code, found = told([*study, "--vary=start.errors.tool.z=[0, 0.01, 9]", "--check"], capsys)
+    assert code == 2
+    assert found["outcomes"] == {"finished": 2, "no start": 1}
+    assert [run["run"] for run in found["not_finished"]] == [2]
+    extent = found["figures"]["largest error of tool.z [m]"]
+    assert 0.0 <= extent["least"] <= extent["median"] <= extent["largest"] < 0.1
+    assert {*found["files"]} <= {path.name for path in tmp_path.iterdir()}
+
+
+# What it takes.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simulate", "--out", ""], "argument --out: a name is needed"),
+        (["sweep", "--vary", "a=1", "--out="], "argument --out: a name is needed"),
+        (["export", "--out="], "argument --out: a name is needed"),
+        (["new", "a.urdf", "--out="], "argument --out: a name is needed"),
+        (["film", ""], "argument folder: a name is needed"),
+        (["view", ""], "argument folder: a name is needed"),
+        (["sweep", "--vary", "a=1", "--random=1_0"], "expected a whole number, got '1_0'"),
+        (["sweep", "--vary", "a=1", "--time-limit=nan"], "expected a positive number of seconds"),
+    ],
+)
+def test_words_that_mean_nothing_are_wrong_usage(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("tip", ["a:1,2,nan", "a:1_0,2,3", "a:1,2", "a:1,2,3,4", "a:1,inf,2"])
+def test_the_point_of_a_tip_is_three_numbers(tip, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "a.urdf", f"--tip={tip}"]) == 1
+    assert "expected LINK or LINK:x,y,z with three numbers" in capsys.readouterr().err
+
+
+# What it keeps.
+
+
+def test_a_second_run_keeps_the_first_one_and_says_where(tmp_path, capsys):
+    folder = tmp_path / "run"
+    for duration in (0.1, 0.2, 0.3):
+        arguments = ["simulate", "two_link_wall", *BARE, f"--set=duration={duration}"]
+        assert main([*arguments, f"--out={folder}"]) == 0
+    assert f"the earlier run in {folder}/ is kept in {folder}-2/" in capsys.readouterr().out
+    for name, duration in (("run-1", 0.1), ("run-2", 0.2), ("run", 0.3)):
+        assert Record.load(tmp_path / name / "record.npz").time[-1] == pytest.approx(duration)
+        assert load_scenario(tmp_path / name / "scenario.yaml").duration == duration
+
+
+def test_a_record_has_what_repeats_the_run(tmp_path):
+    out = tmp_path / "run"
+    settings = ("--set=force.seed=7", *QUICK)
+    assert main(["simulate", "two_link_measured_force", *settings, f"--out={out}"]) == 0
+    record = Record.load(out / "record.npz")
+    assert {"drake_dae", "drake", "casadi", "numpy", "python"} <= {*record.about["versions"]}
+    assert record.about["scenario"]["force"]["seed"] == 7
+    # As a scenario of its own it gives the same numbers.
+    again = tmp_path / "again"
+    save_scenario(read_scenario(record.about["scenario"]), tmp_path / "again.yaml")
+    assert main(["simulate", str(tmp_path / "again.yaml"), f"--out={again}"]) == 0
+    other = Record.load(again / "record.npz")
+    for name in record.signals:
+        np.testing.assert_array_equal(record[name], other[name], err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGTERM])
+def test_a_film_that_is_ended_leaves_nothing_behind(sent, tmp_path):
+    folder = tmp_path / "run"
+    settings = ("--set=duration=5", *BARE)
+    assert main(["simulate", "two_link_wall", *settings, f"--out={folder}"]) == 0
+    before = sorted(path.name for path in folder.iterdir())
+    code = (
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from drake_dae.cli import main\nsys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", code, "film", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    limit = time.monotonic() + 60
+    while not list(folder.glob(".unfinished-*")):
+        assert process.poll() is None
+        assert time.monotonic() < limit
+        time.sleep(0.005)
+    process.send_signal(sent)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 128 + sent
+    assert said.splitlines()[-1] == "interrupted"
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+# Where it starts.
+
+TASKS = ("seven_joint_dome", "two_link_wall")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_all_commands_start_at_the_same_state(name, tmp_path, monkeypatch):
+    """Also where start.positions are left out, and the robot's default leads elsewhere."""
+    found = {}
+
+    def kept(loop, context, *_):
+        own = loop.plant.GetMyContextFromRoot(context)
+        found["export"] = own.get_continuous_state_vector().CopyToVector()
+        return []
+
+    monkeypatch.setattr(export, "export_code", kept)
+    settings = ["--set=start={}", "--set=duration=0.01", *BARE]
+    assert main(["export", name, *settings, f"--out={tmp_path / 'code'}"]) == 0
+    assert main(["simulate", name, *settings, f"--out={tmp_path / 'run'}"]) == 0
+    first = Record.load(tmp_path / "run" / "record.npz")["state"][0]
+    np.testing.assert_allclose(found["export"], first, atol=1e-9)
+    # And a loop that is started by what it was built from.
+    scenario = load_scenario(find_scenario(name), ["start={}"])
+    _, loop = build_completed(scenario)
+    context = start_scenario(scenario, loop)
+    own = loop.plant.GetMyContextFromRoot(context)
+    state = own.get_continuous_state_vector().CopyToVector()
+    np.testing.assert_allclose(state, first, atol=1e-9)

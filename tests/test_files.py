@@ -1,0 +1,329 @@
+"""Files that a user names: what is none, or holds what it should not, is refused in a sentence."""
+
+import io
+import json
+import os
+import signal
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import scenario
+
+from drake_dae import CsvReference, HeightMap, MeshSurface, Record, load_scenario
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
+from drake_dae.files import read_bytes, read_text
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.scenario import read_scenario
+
+SIZE = (0.4, 0.3)
+
+READERS = {
+    "a path": ("csv", lambda file: CsvReference(str(file), ["y"]).derivatives([0])),
+    "heights in .csv": ("csv", lambda file: HeightMap(SIZE, file=file)),
+    "heights in .npy": ("npy", lambda file: HeightMap(SIZE, file=file)),
+    "heights in .png": ("png", lambda file: HeightMap(SIZE, file=file)),
+    "a mesh": ("obj", MeshSurface),
+    "another mesh": ("stl", MeshSurface),
+    "a scenario": ("yaml", load_scenario),
+    "a record": ("npz", Record.load),
+    "a record of a run that was killed": ("part", Record.load),
+}
+
+
+@pytest.fixture
+def in_time():
+    """Ends what waits for ever."""
+
+    def late(*_):
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("what", READERS)
+@pytest.mark.parametrize("kind", ["pipe", "/dev/zero", "folder", "loop of links", "nothing"])
+def test_what_is_no_file_is_refused_at_once(what, kind, in_time, tmp_path):
+    ending, read = READERS[what]
+    file = tmp_path / f"data.{ending}"
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    elif kind != "nothing":
+        file.symlink_to(file if kind == "loop of links" else kind)
+    with pytest.raises(DrakeDaeError) as refused:
+        read(file)
+    assert len(str(refused.value)) < 300
+
+
+def test_a_file_is_read_whole_or_not_at_all(tmp_path):
+    file = tmp_path / "text"
+    file.write_bytes(b"\xef\xbb\xbfone\r\ntwo\rthree\n")
+    assert read_text(file) == "one\ntwo\nthree\n"
+    assert len(read_bytes(file, most=18)) == 18
+    with pytest.raises(OSError, match="larger than 17 bytes"):
+        read_bytes(file, most=17)
+
+
+# Heights.
+
+
+def table(text):
+    return text.encode()
+
+
+def npy(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+def header(text):
+    """An .npy file of a header alone."""
+    data = text.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(data)) + data
+
+
+def zipped():
+    file = io.BytesIO()
+    np.savez(file, a=np.eye(3))
+    return file.getvalue()
+
+
+def png(width, height):
+    size = struct.pack(">II", width, height)
+    return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size + b"\x08\0\0\0\0"
+
+
+CLAIMS = "{{'descr': '<f8', 'fortran_order': False, 'shape': {}, }}".format
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("a.csv", table("1,,3\n4,5,6\n"), "row 1, column 2: expected a number, got an empty cell"),
+        ("a.csv", table("1;2;3\n4;;6\n"), "row 2, column 2: expected a number, got an empty cell"),
+        ("a.csv", table("1,2,\n4,5,6\n"), "row 1, column 3: expected a number, got an empty cell"),
+        ("a.csv", table("0,5;0,7\n0,1;2\n"), "got '0,5'; write decimals with a point"),
+        ("a.csv", table('"0,5","0,7"\n"0,1","2"\n'), "got '0,5'; write decimals with a point"),
+        ("a.csv", table("0,5 0,7\n0,1 0,2\n"), "row 1, column 2: expected a number, got '5 0'"),
+        ("a.csv", table("1_0,2\n3,4\n"), "got '1_0'"),
+        ("a.csv", table("1,inf\n3,4\n"), "got 'inf'"),
+        ("a.csv", table("1,\u0661\n3,4\n"), "row 1, column 2: expected a number"),
+        ("a.csv", table("1,2\n3,1e300\n"), "heights of up to 1e+300 m are no surface"),
+        ("a.csv", table("1e308,2\n3,-1e308\n"), "heights of up to 1e+308 m are no surface"),
+        ("a.npy", npy(1j * np.eye(3)), "its entries are complex128, and no real numbers"),
+        ("a.npy", npy(np.zeros((3, 3), [("h", float)])), "its entries are [('h', '<f8')], and no"),
+        ("a.npy", npy(np.eye(3) > 0), "its entries are bool, and no real numbers"),
+        ("a.npy", npy(np.array([["1", "2"]] * 2)), "its entries are <U1, and no real numbers"),
+        ("a.npy", npy(np.full((3, 3), np.nan)), "row 1, column 1 is no height"),
+        ("a.npy", npy(1e200 * np.eye(3)), "heights of up to 1e+200 m are no surface"),
+        ("a.npy", zipped(), "it does not begin as an .npy file"),
+        ("a.npy", header(CLAIMS("(1000000, 1000000)")), "claims shape (1000000, 1000000)"),
+        ("a.npy", header(CLAIMS("(-3, 3)")), "no table of heights"),
+        ("a.npy", header(CLAIMS("(" * 50)), "no table of heights"),
+        ("a.npy", npy(np.eye(3))[:100], "no table of heights"),
+        ("a.png", png(100_000, 100_000), "100000 times 100000 pixels; at most"),
+        ("a.png", png(3, 3), "no table of heights"),
+        ("a.png", b"", "it does not begin as a .png file"),
+    ],
+)
+def test_heights_are_read_as_they_stand_or_not_at_all(name, data, words, tmp_path):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(ModelError) as refused:
+        HeightMap(SIZE, file=tmp_path / name)
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,0.1,0.2\n0.3,0.4,0.5\n",
+        "0;0.1;0.2\n0.3;0.4;0.5\n",
+        "0\t0.1\t0.2\n0.3\t0.4\t0.5",
+        "  0 0.1   0.2\n\n0.3 0.4 5e-1\n",
+        "0, 0.1, 0.2,\r\n0.3, 0.4, 0.5,\r\n",
+        '"0","0.1","0.2"\n"0.3","0.4","0.5"\n',
+        "\ufeff+0;.1;0.2\n0.3;0.4;0.5\n",
+    ],
+)
+def test_each_way_to_write_a_table_of_heights_is_read(text, tmp_path):
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    rows = [[0.0, 0.1, 0.2], [0.3, 0.4, 0.5]]
+    assert HeightMap(SIZE, file=tmp_path / "a.csv").relief.largest < 1e-9
+    found, wanted = HeightMap(SIZE, file=tmp_path / "a.csv"), HeightMap(SIZE, heights=rows)
+    places = np.linspace(-0.2, 0.2, 5), np.linspace(-0.15, 0.15, 5)
+    np.testing.assert_array_equal(found.relief.heights(*places), wanted.relief.heights(*places))
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"{SQUARE}f 1 2 9\n", "line 5: a face names vertex '9' of 4"),
+        (f"{SQUARE}f 1 2 0\n", "line 5: a face names vertex '0' of 4"),
+        (f"{SQUARE}f 1 2 -5\n", "line 5: a face names vertex '-5' of 4"),
+        (f"{SQUARE}f 1/1/1 2/2/2 7/1/1\n", "line 5: a face names vertex '7/1/1' of 4"),
+        (f"{SQUARE}f 1.5 2 3\n", "line 5: a face names vertex '1.5' of 4"),
+        ("f 1 2 3\n", "line 1: a face names vertex '1' of 0"),
+        (f"v nan 0 0\n{SQUARE}f 2 3 4\n", "line 1: a vertex has three numbers, got 'v nan 0 0'"),
+        (f"v 1 inf 0\n{SQUARE}f 2 3 4\n", "line 1: a vertex has three numbers"),
+        (f"v 1 2\n{SQUARE}f 2 3 4\n", "line 1: a vertex has three numbers, got 'v 1 2'"),
+        (f"v 1e200 0 0\n{SQUARE}f 2 3 4\nf 1 2 3\n", "vertices of up to 1e+200 m are no surface"),
+    ],
+)
+def test_a_mesh_with_wrong_vertices_is_refused_with_the_line(text, words, tmp_path):
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(ModelError) as refused:
+        MeshSurface(tmp_path / "a.obj")
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("faces", ["f 1 2 4 3", "f -4 -3 -1\nf 1 4 3", "f 1/1 2/2 4/3\nf 1//1 4 3"])
+def test_each_way_to_write_faces_is_read(faces, tmp_path):
+    (tmp_path / "a.obj").write_text(f"{SQUARE}{faces}\n")
+    assert MeshSurface(tmp_path / "a.obj").relief.largest < 1e-9
+
+
+# Records.
+
+
+def deep(count=100_000):
+    return "[" * count + "]" * count
+
+
+def member(name, data):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(name, data)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        f'{{"signals": {deep()}}}\n'.encode(),
+        b'{"signals": 1}\n',
+        b'{"signals": {"state": [[1]]}}\n' + bytes(7),
+        member("time.npy", header(CLAIMS("(1000000, 1000000)"))),
+        member("time.npy", npy(np.arange(3.0))[:-4]),
+        member("other.npy", npy(np.arange(3.0))),
+        zipped()[:-20],
+    ],
+)
+def test_what_is_no_record_is_refused(data, tmp_path):
+    (tmp_path / "record.npz").write_bytes(data)
+    with pytest.raises(ModelError, match=r"not a record|signals"):
+        Record.load(tmp_path / "record.npz")
+
+
+# Robots.
+
+INERTIA = """<sdf version="1.9"><model name="m"><link name="base"/>
+<link name="arm"><inertial><mass>{}</mass><inertia><ixx>{}</ixx><iyy>1</iyy><izz>1</izz></inertia>
+</inertial></link>
+<joint name="j" type="revolute"><parent>base</parent><child>arm</child><axis><xyz>0 0 1</xyz></axis>
+</joint></model></sdf>"""
+
+
+@pytest.mark.parametrize(
+    ("mass", "moment"), [("1", "9"), ("1", "-1"), ("1", "nan"), ("0", "1"), ("-1", "1")]
+)
+def test_an_inertia_of_no_body_in_sdformat_is_told_by_its_link(mass, moment, tmp_path):
+    (tmp_path / "arm.sdf").write_text(INERTIA.format(mass, moment))
+    with pytest.raises(ModelError, match="link 'arm': mass or inertia of no body"):
+        read_robot(Robot(file=str(tmp_path / "arm.sdf")))
+
+
+MJCF = "<mujoco>{}<worldbody><body name='b'><joint/><geom size='1'/></body></worldbody></mujoco>"
+SDF = (
+    "<sdf version='1.9'><model name='m'><include><uri>{}</uri></include><link name='a'/></model>"
+    "</sdf>"
+)
+INCLUDE = '<include file="{}"/>'.format
+ADD = "directives:\n- add_directives: {{file: 'package://mine/{}'}}\n".format
+
+
+@pytest.mark.parametrize(
+    ("files", "chain"),
+    [
+        ({"a.xml": MJCF.format(INCLUDE("a.xml"))}, "a.xml -> a.xml"),
+        (
+            {"a.xml": MJCF.format(INCLUDE("b.xml")), "b.xml": MJCF.format(INCLUDE("a.xml"))},
+            "a.xml -> b.xml -> a.xml",
+        ),
+        ({"a.sdf": SDF.format("package://mine/a.sdf")}, "a.sdf -> a.sdf"),
+        ({"a.dmd.yaml": ADD("a.dmd.yaml")}, "a.dmd.yaml -> a.dmd.yaml"),
+        (
+            {"a.dmd.yaml": ADD("b.dmd.yaml"), "b.dmd.yaml": ADD("a.dmd.yaml")},
+            "a.dmd.yaml -> b.dmd.yaml -> a.dmd.yaml",
+        ),
+        (
+            {"0.xml": MJCF.format(2 * INCLUDE("1.xml"))}
+            | {f"{i}.xml": MJCF.format(2 * INCLUDE(f"{i + 1}.xml")) for i in range(1, 30)},
+            "includes more than 1000 files",
+        ),
+    ],
+)
+def test_a_robot_that_includes_itself_is_refused(files, chain, tmp_path):
+    (tmp_path / "package.xml").write_text("<package format='2'><name>mine</name></package>")
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises((ModelError, ScenarioError)) as refused:
+        read_robot(Robot(file=str(tmp_path / next(iter(files)))))
+    assert chain in str(refused.value)
+
+
+# Names.
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        'constraints.0.name="\\ud800"',
+        'description="half \\udfff of a letter"',
+        'plant_parameters={"\\udc80.mass": 1}',
+    ],
+)
+def test_a_name_that_no_file_can_hold_is_refused(setting):
+    with pytest.raises(ScenarioError, match="half of a letter"):
+        scenario("two_link_wall", setting)
+
+
+def test_a_signal_has_a_name_that_a_record_can_hold(tmp_path):
+    with pytest.raises(ModelError, match=r"half of a letter .*'\\ud800'"):
+        Signal("\ud800")
+    name = "\u00fc \U0001f916"
+    record = Record(np.arange(2.0), {})
+    record.save(tmp_path / "record.npz")
+    assert Signal(name).derivative(1).name == f"{name}'"
+    assert json.dumps(Record.load(tmp_path / "record.npz").about)
+
+
+@pytest.mark.parametrize(
+    ("data", "key"),
+    [
+        ({"robot": {"file": "a.urdf"}, "description": "\ud800"}, "description"),
+        ({"robot": {"file": "a.urdf"}, "forces": ["a", "\udfff"]}, "forces.1"),
+        ({"robot": {"file": "a.urdf"}, "start": {"positions": {"\udc00": 1.0}}}, "start.positions"),
+    ],
+)
+def test_plain_data_may_not_hold_it_either(data, key):
+    with pytest.raises(ScenarioError, match=f"{key}: .*half of a letter"):
+        read_scenario(data)
+
+
+def test_the_length_of_a_path_does_not_matter(tmp_path):
+    with pytest.raises(DrakeDaeError):
+        load_scenario(Path("a" * 5000))
