@@ -39,7 +39,7 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
 from drake_dae.pictures.course import Loop
 from drake_dae.robots.actuation.stage import Stage

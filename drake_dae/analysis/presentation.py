@@ -13,7 +13,7 @@ from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.structure.structure import why_no_law
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
-from drake_dae.dae.zero_dynamics.pinned_motion import Cause, PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause, PinnedMotion
 from drake_dae.dae.zero_dynamics.returns import Return, close, find_multiple
 from drake_dae.dae.zero_dynamics.settling import Fate, carry_in_halves, fate_of, leave
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict

@@ -17,8 +17,8 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.zero_dynamics.periods import find_period
-from drake_dae.dae.zero_dynamics.pinned_motion import Cause
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
 from drake_dae.trace.given import result_of
 

@@ -9,8 +9,8 @@ import scipy.linalg
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.isolation import Isolation, isolation
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     balanced_norm,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.stability import ROUNDED, ComplexArray
 
 ISOLATED = 1e-6

@@ -6,9 +6,9 @@ import numpy as np
 import scipy  # Which loads its heavy parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
-from drake_dae.dae.zero_dynamics.pinned_motion import Cause, Ending, PinnedMotion
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause, Ending, PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.given import result_of
 

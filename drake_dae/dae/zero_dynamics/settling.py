@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Passage
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
-from drake_dae.dae.zero_dynamics.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
 from drake_dae.dae.zero_dynamics.returns import Return, find_multiple, find_return
 from drake_dae.dae.zero_dynamics.stability import (
     Stability,

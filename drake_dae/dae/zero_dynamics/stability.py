@@ -8,7 +8,7 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 
 LINEARIZED = 1e-11
 """The error of a linearization, relative to the terms that add up to each of its entries."""

@@ -11,7 +11,7 @@ from drake_dae.analysis.report import Analysis
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel

@@ -18,7 +18,7 @@ from drake_dae.dae.manifold.search import CONSISTENT
 from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.zero_dynamics.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import Linearization, newton, shortest_steps
