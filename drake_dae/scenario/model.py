@@ -22,6 +22,7 @@ from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import KnownForce
@@ -38,6 +39,10 @@ from drake_dae.scenario.scenario import Scenario
 
 _LARGE = 30.0
 """So many times as long as the robot, a surface from a file seems to be in millimetres."""
+
+
+_MASSLESS = 1e-12
+"""An eigenvalue of M(q) below it, relative to the largest, is zero up to round-off."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -224,6 +229,7 @@ def robot_links(
                 "length"
             )
     links = MultibodyExpressions(plant)
+    _check_mass(plant)
     try:
         plant_constraints(links)
     except ModelError as error:
@@ -231,6 +237,27 @@ def robot_links(
             f"{error}. With leave_out: [constraints] under robot the file stays as it is"
         ) from None
     return links, loop_constraints(cuts, plant)
+
+
+def _check_mass(plant: MultibodyPlant) -> None:
+    """Refuses joints that move no mass: no force decides how they accelerate.
+
+    Raises:
+        ModelError: M(q) is singular in the default configuration.
+    """
+    values, modes = np.linalg.eigh(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+    if values[0] > _MASSLESS * values[-1]:
+        return
+    found = {}
+    for name, joint in joint_names(plant).items():
+        own = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
+        if np.any(np.abs(modes[own, 0]) > 0.1):
+            found[name] = joint.child_body().name()
+    raise ModelError(
+        f"joints that move no mass: {', '.join(found)}. Links without it, which no force can move: "
+        f"{', '.join(found.values())}; give them <inertial> with mass and inertia, or lock the "
+        "joints by robot.locked"
+    )
 
 
 def _constraints(

@@ -108,6 +108,31 @@ def test_a_base_that_stands_needs_no_mass_and_a_link_has_that_of_its_mesh(
             plant_of(file)
 
 
+@pytest.mark.parametrize("name", ["arm.urdf", "arm.xml"])
+def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
+    texts = {
+        "arm.urdf": robot(
+            "arm",
+            link("base", 1),
+            link("upper", 1),
+            '<link name="lower"/>',
+            joint("j1", "base", "upper", "0 1 0"),
+            joint("j2", "upper", "lower", "0 1 0"),
+        ),
+        "arm.xml": MJCF.format(base="", mark="").replace('mass="1" ', 'mass="0" '),
+    }
+    text = texts[name].replace('diaginertia="0.02 0.01 0.01"', 'diaginertia="0 0 0"')
+    own = Robot(
+        str(written(tmp_path, text, name)),
+        base=Base("base") if name == "arm.urdf" else None,
+        actuators="all",
+    )
+    with pytest.raises(
+        ScenarioError, match=r"robot\.file: joints that move no mass: j2\. .*lower;"
+    ):
+        robot_links(own, SceneGraph())
+
+
 # Limits.
 
 
