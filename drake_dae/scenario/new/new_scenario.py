@@ -13,7 +13,6 @@ from pydrake.systems.analysis import SimulatorConfig
 from drake_dae.arguments import checked
 from drake_dae.errors import DrakeDaeError, RobotFileWarning, ScenarioError
 from drake_dae.robots.constraints import PointOnSurface
-from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.outputs import PointCoordinates
 from drake_dae.robots.surfaces.surface import Vector
@@ -74,7 +73,6 @@ def new_scenario(
     is_url = file.startswith("package://")
     robot = new_robot(file if is_url or not file else str(Path(file).resolve()), tip, point)
     links, _ = robot_links(robot.robot, SceneGraph())
-    _check_mass(links, robot)
     tried: list[str] = []
     usable: tuple[Scenario, Task] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
@@ -116,20 +114,6 @@ def _beside(found: Feasibility) -> tuple[str, ...]:
         return ()
     rank = (assumption for assumption in analysis.assumptions if assumption.number == 5)
     return tuple(assumption.reason for assumption in rank)
-
-
-def _check_mass(links: Links, robot: NewRobot) -> None:
-    """Refuses a chain that a force cannot move, as one without inertias."""
-    plant = links.plant
-    assert plant is not None
-    mass = np.linalg.eigvalsh(plant.CalcMassMatrix(plant.CreateDefaultContext()))
-    if mass[0] > 1e-12 * mass[-1]:
-        return
-    joints = joint_names(plant)
-    bodies = [joints[name].child_body() for name in robot.chain]
-    empty = ", ".join(body.name() for body in bodies if body.default_mass() == 0.0)
-    text = f"links without mass, which no force can move: {empty or 'of the chain'}"
-    raise ScenarioError(("robot.file", f"{text}; give them <inertial> with mass and inertia"))
 
 
 def _scenario(robot: NewRobot, task: Task, links: Links) -> Scenario:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint
@@ -9,6 +10,7 @@ from pydrake.multibody.tree import QuaternionFloatingJoint
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
+from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.changes import change_robot, finalize
@@ -16,6 +18,9 @@ from drake_dae.scenario.robot_file.loops import cut_loops, loop_constraints
 from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
+
+_MASSLESS = 1e-12
+"""An eigenvalue of M(q) below it, relative to the largest, is zero up to round-off."""
 
 
 @at("robot.file")
@@ -72,6 +77,7 @@ def robot_links(
                 "length"
             )
     links = MultibodyExpressions(plant)
+    _check_mass(plant)
     try:
         plant_constraints(links)
     except ModelError as error:
@@ -79,3 +85,31 @@ def robot_links(
             f"{error}. With leave_out: [constraints] under robot the file stays as it is"
         ) from None
     return links, loop_constraints(cuts, plant)
+
+
+def _check_mass(plant: MultibodyPlant) -> None:
+    """Refuses joints that move no mass: no force decides how they accelerate.
+
+    Raises:
+        ModelError: M(q) is singular in the default configuration, and in others.
+    """
+    context = plant.CreateDefaultContext()
+    default = plant.GetPositions(context)
+    random = np.random.default_rng(0)
+    # A point mass at the end of a straight arm makes M(q) singular there alone.
+    for step in (np.zeros_like(default), *random.uniform(-1.0, 1.0, (3, default.size))):
+        plant.SetPositions(context, default + step)
+        values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
+        null = modes[:, values <= _MASSLESS * values[-1]]
+        if not null.size:
+            return
+    found = {}
+    for name, joint in joint_names(plant).items():
+        own = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
+        if np.any(np.abs(null[own]) > 0.1):
+            found[name] = joint.child_body().name()
+    raise ModelError(
+        f"joints that move no mass: {', '.join(found)}. Links without it, which no force can move: "
+        f"{', '.join(found.values())}; give them <inertial> with mass and inertia, or lock the "
+        "joints by robot.locked"
+    )

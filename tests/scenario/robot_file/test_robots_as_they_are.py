@@ -108,6 +108,61 @@ def test_a_base_that_stands_needs_no_mass_and_a_link_has_that_of_its_mesh(
             plant_of(file)
 
 
+@pytest.mark.parametrize("name", ["arm.urdf", "arm.xml"])
+def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
+    texts = {
+        "arm.urdf": robot(
+            "arm",
+            link("base", 1),
+            link("upper", 1),
+            '<link name="lower"/>',
+            joint("j1", "base", "upper", "0 1 0"),
+            joint("j2", "upper", "lower", "0 1 0"),
+        ),
+        "arm.xml": MJCF.format(base="", mark="").replace('mass="1" ', 'mass="0" '),
+    }
+    text = texts[name].replace('diaginertia="0.02 0.01 0.01"', 'diaginertia="0 0 0"')
+    own = Robot(
+        str(written(tmp_path, text, name)),
+        base=Base("base") if name == "arm.urdf" else None,
+        actuators="all",
+    )
+    with pytest.raises(
+        ScenarioError, match=r"robot\.file: joints that move no mass: j2\. .*lower;"
+    ):
+        robot_links(own, SceneGraph())
+
+
+def test_all_joints_that_move_no_mass_are_named(tmp_path):
+    names = ("base", "upper", "lower", "hand")
+    joints = [joint(f"j{k}", names[k], names[k + 1], "0 1 0") for k in range(3)]
+    heavy, empty = [link(name, 1) for name in names[:2]], [f'<link name="{n}"/>' for n in names[2:]]
+    file = written(tmp_path, robot("arm", *heavy, *empty, *joints))
+    with pytest.raises(ScenarioError, match=r"move no mass: j1, j2\. .*: lower, hand;"):
+        robot_links(Robot(str(file), base=Base("base"), actuators="all"), SceneGraph())
+
+
+def test_a_point_mass_moves_by_both_joints_though_not_where_the_arm_is_straight(tmp_path):
+    """|M(q)| = (m l^2 sin q_2)^2 of a mass m at the end of two links of l without mass."""
+    mass = '<inertial><origin xyz="0 0 0.4"/><mass value="2"/><inertia {}/></inertial>'
+    none = " ".join(f'{key}="0"' for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    parts = [
+        link("base", 1),
+        '<link name="upper"/>',
+        f'<link name="lower">{mass.format(none)}</link>',
+        joint("j1", "base", "upper", "0 1 0"),
+        joint("j2", "upper", "lower", "0 1 0", (0.0, 0.0, 0.4)),
+    ]
+    file = written(tmp_path, robot("arm", *parts))
+    links, _ = robot_links(Robot(str(file), base=Base("base"), actuators="all"), SceneGraph())
+    plant = links.plant
+    context = plant.CreateDefaultContext()
+    for bend in (0.0, 0.7):
+        plant.SetPositions(context, [0.3, bend])
+        found = np.linalg.det(plant.CalcMassMatrix(context))
+        assert found == pytest.approx((2.0 * 0.4**2 * np.sin(bend)) ** 2, abs=1e-12)
+
+
 # Limits.
 
 
