@@ -94,6 +94,11 @@ def draw(path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
+def _paper_place(folder: str) -> str:
+    """What sorts folders of dae as in the paper, and those inside after their own."""
+    return f"{PAPER.index(folder.split('/')[0]):02}{folder}"
+
+
 def _files(found: dict[str, set[str]], name: str) -> dict[str, list[str]]:
     """The files of a room by folder, "" first; dae names its folders among its files, in order."""
     files = defaultdict(list)
@@ -105,7 +110,7 @@ def _files(found: dict[str, set[str]], name: str) -> dict[str, list[str]]:
         paper = [place for file in PAPER for place in (file, f"{file}/")]
         files[""] += [f"{folder}/" for folder in files if folder]
         files[""].sort(key=paper.index)
-        return dict(sorted(files.items(), key=lambda own: own[0] and f"{PAPER.index(own[0]):02}"))
+        return dict(sorted(files.items(), key=lambda own: own[0] and _paper_place(own[0])))
     return dict(sorted(files.items()))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number, show
+from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold.manifold import Manifold
@@ -17,6 +17,7 @@ from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence
+from drake_dae.dae.structure.mass_matrix import check_mass_matrix
 from drake_dae.dae.structure.redundancy import find_redundant
 from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
 from drake_dae.dae.system.system import DaeSystem
@@ -203,7 +204,7 @@ def examine_constraints(
         if error.violation is not None:
             raise _as_redundant(system, error.violation).error() from None
         raise
-    _check_mass_matrix(system, samples.states)
+    check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
     # Where friction turns it around the contact jams, which is decided at the states of a motion.
@@ -228,7 +229,7 @@ def check_system(system: DaeSystem) -> None:
         AssumptionError: There are more constraints than states.
         ModelError: The mass matrix is not symmetric and positive definite.
     """
-    _check_mass_matrix(system, system.nominal_state[None])
+    check_mass_matrix(system, system.nominal_state[None])
     if system.num_constraints > system.num_states:
         names = tuple(signal.name for signal in system.constraint_output_signals)
         raise Violation(2, Cause.COUNT, names).error()
@@ -326,27 +327,3 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
         state=None,
         singular_value=None,
     )
-
-
-def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Refuses what is no mass matrix: its factorization LDL^T reads one triangle alone.
-
-    Raises:
-        ModelError: It is not symmetric and positive definite at a state.
-    """
-    function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
-    for state in states:
-        mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
-        length = np.sqrt(np.abs(np.diag(mass)))
-        if np.all(np.isfinite(mass)) and np.all(length > 0.0):
-            scaled = mass / length / length[:, None]
-            symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
-            if symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
-                continue
-        raise ModelError(
-            f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
-            f"{show(state)}. An equation in which no derivative stands is a constraint 0 = k(x) "
-            "with a constraint input; where it holds an unknown z that has no derivative, lift it: "
-            "make z a state with z' = v, v a new constraint input, and keep the equation as "
-            "constraint"
-        )

@@ -5,8 +5,6 @@ its numbers at consistent states, with the default parameters and signals at res
 there must be zero with all other numbers.
 """
 
-import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -18,7 +16,6 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.family import VISIBLE, Deciding, Family
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Cause, Violation
@@ -26,18 +23,12 @@ from drake_dae.dae.structure.dependence import (
     following_outputs,
     redundant_constraints,
 )
+from drake_dae.dae.structure.elsewhere import Elsewhere, Row
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized, multiply
-
-_Row = Callable[[FloatArray, FloatArray, float], Sized]
-"""A row of numbers at a state, with values of all parameters, and what is negligible in it."""
-
-DOUBTFUL = 1e-13
-"""What is above this, relative to the others in its row or column, may be meant."""
 
 MANY = 10
 """A function that is zero at this many random states is zero."""
@@ -65,7 +56,7 @@ def constraint_chains(
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]
-    undecided, elsewhere = list(range(system.num_constraints)), _Elsewhere()
+    undecided, elsewhere = list(range(system.num_constraints)), Elsewhere()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
@@ -150,7 +141,7 @@ def output_chains(
     round_off, need_force = np.zeros((count, controls), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
-    elsewhere, numbers = _Elsewhere(), _Rows(samples, elimination)
+    elsewhere, numbers = Elsewhere(), _Rows(samples, elimination)
     following, rows = elimination.l_star, elimination.n_star
     undecided = list(range(count))
     while True:
@@ -225,65 +216,6 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
     return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
 
 
-class _Elsewhere:
-    """What is zero with the default parameters and not with other ones, by constraint or output."""
-
-    def __init__(self) -> None:
-        self._found: dict[int, Violation] = {}
-
-    def look(self, index: int, violation: Violation, samples: Samples, row: _Row) -> None:
-        """Looks whether a row that is zero with the default parameters is zero with others, too.
-
-        Args:
-            index: Which constraint or output the row belongs to; the first that is not zero counts.
-            violation: What it is if it is not.
-            samples: The states at which it is zero.
-            row: The row at a state, with values of all parameters.
-
-        Warns:
-            NegligibleWarning: It counts as zero, and may be meant.
-        """
-        if index in self._found:
-            return
-        system = samples.system
-
-        @np.errstate(all="ignore")  # Not finite is no answer.
-        def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
-            value, size = row(state, parameters, negligible)
-            return bool(np.any(np.abs(value) > VISIBLE * size))
-
-        family = Family(samples.manifold, samples.states)
-        deciding = family.deciding(lambda x, p: acts(x, p, system.negligible))
-        if deciding:
-            self._found[index] = replace(violation, deciding=deciding)
-        defaults = system.parameter_values
-        if system.negligible > DOUBTFUL and all(
-            acts(state, defaults, DOUBTFUL) for state in samples.states
-        ):
-            warnings.warn(
-                f"{system.name}: what acts on derivative {violation.order} of "
-                f"'{violation.names[0]}' is less than {system.negligible:g} of the others, the "
-                "system's `negligible`, and counts as zero. If it is meant, choose other units, or "
-                "set a smaller number",
-                NegligibleWarning,
-                stacklevel=5,
-            )
-
-    def refuse(self, index: int) -> None:
-        """Refuses a constraint or output whose degree is another one with other parameters.
-
-        Raises:
-            AssumptionError: It is; with the numbers that decide.
-        """
-        if index in self._found:
-            raise self._found[index].error()
-
-    def deciding(self, indices: Sequence[int]) -> Deciding | None:
-        """The numbers that decide about some on which nothing acts with the default ones."""
-        found = (self._found[i].deciding for i in indices if i in self._found)
-        return next(found, None)
-
-
 class _Rows:
     """How inputs act, at a state with values of all parameters.
 
@@ -296,7 +228,7 @@ class _Rows:
         self._system, self._scale = samples.system, samples.scale
         self._elimination = elimination
 
-    def along(self, function: ca.SX, key: str) -> _Row:
+    def along(self, function: ca.SX, key: str) -> Row:
         """The derivative of a function along g, h or h*."""
         system = self._system
         gradient = ca.jacobian(function, system.state)
@@ -313,7 +245,7 @@ class _Rows:
 
         return row
 
-    def feedthrough(self, index: int) -> _Row:
+    def feedthrough(self, index: int) -> Row:
         """A row of n*."""
 
         def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:

@@ -49,7 +49,6 @@ class TrackingController(ParameterizedSystem, Controller):
     Output ports:
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, one entry per output.
-
         integral: The integrals of errors, shape (k,), if the law has any; its state. They start at
             zero, or where `set_integral` puts them. Where an entry of `hold` is not 0, or an
             integral has come to its limit and its error would carry it on, it stays (anti-windup).
