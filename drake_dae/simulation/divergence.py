@@ -28,7 +28,7 @@ KNOWN = 1e-6
 """A smaller size, relative to the largest number that a run starts with, may be round-off: it tells
 nothing of an output, which is then not judged."""
 
-EVERY = 8
+EVERY = 32
 """After so many steps one is looked at: an output is computed for it."""
 
 

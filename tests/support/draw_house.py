@@ -108,7 +108,7 @@ def _files(found: dict[str, set[str]], name: str) -> dict[str, list[str]]:
             files["/".join(parts[1:-1])].append(parts[-1])
     if name == "dae":
         paper = [place for file in PAPER for place in (file, f"{file}/")]
-        files[""] += [f"{folder}/" for folder in files if folder]
+        files[""] += [f"{folder}/" for folder in files if folder and "/" not in folder]
         files[""].sort(key=paper.index)
         return dict(sorted(files.items(), key=lambda own: own[0] and _paper_place(own[0])))
     return dict(sorted(files.items()))
