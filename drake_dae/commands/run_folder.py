@@ -8,11 +8,12 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.pictures.plots import PLOTS
+from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
 
 SCENARIO = "scenario.yaml"
 PART = "record.part"
@@ -148,7 +149,7 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
     """
     place = None
     try:
-        with TemporaryDirectory(prefix=_STAGE, dir=folder) as place:
+        with _workplace(folder) as place:
             yield Path(place)
             for name in names:
                 Path(place, name).replace(folder / name)
@@ -157,3 +158,25 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
         if place is None or str(error.filename or place).startswith(place):
             error.filename, error.filename2 = str(folder / names[0]), None
         raise
+
+
+@contextmanager
+def _workplace(folder: Path) -> Iterator[str]:
+    """A folder inside of another one, which goes at the end also when a signal comes.
+
+    A signal waits while the folder is made and while it is removed.
+    """
+    place = None
+    ending, last = Ending(), Ending()
+    try:
+        with ending_signals(ending):
+            place = mkdtemp(prefix=_STAGE, dir=folder)
+        if ending.signal is not None:
+            end_at_once(ending.signal)
+        yield place
+    finally:
+        if place is not None:
+            with ending_signals(last):
+                shutil.rmtree(place)
+        if last.signal is not None:
+            end_at_once(last.signal)

@@ -3,12 +3,14 @@
 import errno
 import fcntl
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from drake_dae.commands.run_folder import FILES, MARK, PART, SCENARIO, run_folder, stage
 from drake_dae.errors import ModelError
+from drake_dae.simulation.records.interruption import end_at_once, ending_signals
 
 
 @pytest.fixture
@@ -138,3 +140,34 @@ def test_an_error_names_the_file(path, tmp_path):
         fail(place)
     assert caught.value.filename == ("/mesh.obj" if path == "elsewhere" else str(tmp_path / "one"))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("call", ["mkdir", "rmdir"])
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("error", [None, OSError(errno.ENOSPC, "No space left")])
+def test_a_signal_while_the_place_is_made_or_removed(call, sent, error, tmp_path, monkeypatch):
+    """It comes after the place is there, or before it is gone: nothing stays, and it is heard."""
+    plain, came = getattr(os, call), []
+
+    def interrupted(*arguments, **options):
+        if call == "mkdir":
+            plain(*arguments, **options)
+        if not came:
+            came.append(sent)
+            signal.raise_signal(sent)
+        if call == "rmdir":
+            plain(*arguments, **options)
+
+    monkeypatch.setattr(os, call, interrupted)
+
+    def write():
+        with ending_signals(end_at_once), stage(tmp_path, "one") as place:
+            (place / "one").write_text("1")
+            if error is not None:
+                raise error
+
+    with pytest.raises(KeyboardInterrupt) as ended:
+        write()
+    assert ended.value.args == (sent,)
+    assert came == [sent]
+    assert not list(tmp_path.glob(".*"))

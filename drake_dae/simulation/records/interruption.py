@@ -1,12 +1,17 @@
 """Signals that ask a run to end."""
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, what batch systems and `kill` send, and a terminal that is closed."""
+
+AGAIN = 1e-3
+"""After so many seconds a signal that came within a call of CasADi's comes again."""
 
 
 @contextmanager
@@ -17,22 +22,41 @@ def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
     ignored, as under nohup, stays so.
 
     Args:
-        handle: Gets the signal, between two instructions of Python.
+        handle: Gets the signal, between two instructions of Python; those that CasADi calls do not
+            count, since it loses exceptions that are raised in them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     previous = {}
+
+    def received(number: int, frame: FrameType | None) -> None:
+        if _is_called_by_casadi(frame):
+            # Again, a moment later.
+            later = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+            later.daemon = True
+            later.start()
+        else:
+            handle(signal.Signals(number))
+
     try:
         for number in ENDING_SIGNALS:
             if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
                 continue
-            previous[number] = signal.signal(number, lambda n, _: handle(signal.Signals(n)))
+            previous[number] = signal.signal(number, received)
         yield
     finally:
         for number, handler in previous.items():
             # None: the handler before was not Python's.
             signal.signal(number, handler or signal.SIG_DFL)
+
+
+def _is_called_by_casadi(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "casadi.casadi":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def end_at_once(number: signal.Signals) -> None:
