@@ -132,7 +132,10 @@ def _corners(model: RobotModel, state: FloatArray, scene_graph: SceneGraph | Non
         body = drawn.get_body(BodyIndex(number))
         pose = drawn.EvalBodyPoseInWorld(context, body)
         for geometry in drawn.GetVisualGeometriesForBody(body):
-            box = inspector.GetObbInGeometryFrame(geometry)
+            try:
+                box = inspector.GetObbInGeometryFrame(geometry)
+            except RuntimeError:  # A mesh of a kind that Drake does not read, or of no size.
+                continue
             if box is not None:
                 stands = pose @ inspector.GetPoseInFrame(geometry) @ box.pose()
                 found.append(stands.multiply(signs * box.half_width()[:, None]).T)

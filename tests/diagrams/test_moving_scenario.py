@@ -72,7 +72,7 @@ def test_the_analysis_knows_what_moves():
     ("setting", "message"),
     [
         ("exogenous={plate.positio: []}", "exogenous: no parameter 'plate.positio'; did you mean"),
-        ("exogenous={plate.rpy: []}", "exogenous.plate.rpy: 0 values, but the parameter has 3"),
+        ("exogenous={plate.rpy: []}", "plate.rpy: 3 numbers are needed, got 0"),
         (
             "exogenous={plate.rpy: [!PointToPoint {start: [0, 0, 0], end: [1, 0, 0], duration: 1,"
             " order: 1}]}",

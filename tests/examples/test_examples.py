@@ -33,6 +33,7 @@ CLAIMS = {
     "section_two": (1e-12, 1e-9, 1e-10),
     "unicycle": (1e-12,),
     "quadruple_tank": (1e-12, 1e-12),
+    "own_diagram": (1e-9,),
 }
 
 

@@ -218,7 +218,8 @@ def _draw_room(axes: Axes, name: str, box: Box, files: dict[str, list[str]]) -> 
     column = _column(files)
     for folder, labels in files.items():
         if folder:
-            axes.text(x + 1.7, y + 1.6, f"{folder}/", size=9, weight="bold", color=colour, zorder=4)
+            label = folder if len(folder) < 20 else f".../{folder.split('/')[-1]}"
+            axes.text(x + 1.7, y + 1.6, f"{label}/", size=9, weight="bold", color=colour, zorder=4)
         for line in _lines(labels, width - column):
             for offset, label in line:
                 _draw_label(axes, x + column + 1.6 + offset, y, label, colour)

@@ -6,7 +6,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import FloatArray, brief, vector
+from drake_dae.arrays import FloatArray, brief, numbers, vector
+from drake_dae.dae.system.contacts import Contact
 from drake_dae.dae.system.expressions import as_functions, as_signals, check_unique
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
 from drake_dae.dae.system.signals import Parameter, Signal, is_symbol
@@ -34,11 +35,19 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         )
     check_choice(name, given["compiled"])
     for key in ("least_margin", "negligible"):
-        if not 1e-15 <= given[key] < 1.0:
+        number = numbers(f"{name}: {key}", given[key])
+        if number.ndim or not 1e-15 <= number < 1.0:
             raise ModelError(
                 f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
-                f"{given[key]:g}"
+                f"{brief(given[key])}"
             )
+    if not (
+        isinstance(given["contacts"], (list, tuple))
+        and all(isinstance(contact, Contact) for contact in given["contacts"])
+    ):
+        raise ModelError(
+            f"{name}: contacts must be a list of Contacts, got {brief(given['contacts'])}"
+        )
     state = ca.vec(state)
     parameters = _parameters(name, given["parameters"])
     for contact in given["contacts"]:

@@ -286,7 +286,9 @@ def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
     """Parameter name -> value at the start, where it is not the default."""
     begin = scenario.integrator.start_time
     moving = {
-        name: np.concatenate([value_at(one, getattr(one, "size", 1), begin) for one in references])
+        name: np.concatenate(
+            [np.zeros(0), *(value_at(one, getattr(one, "size", 1), begin) for one in references)]
+        )
         for name, references in scenario.exogenous.items()
     }
     return {**{k: np.atleast_1d(v) for k, v in scenario.plant_parameters.items()}, **moving}

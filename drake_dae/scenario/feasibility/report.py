@@ -87,6 +87,11 @@ class Feasibility:
     behind: tuple[LinkBehind, ...] = ()
 
     @property
+    def wrong_sides(self) -> tuple[str, ...]:
+        """The problems with links behind a surface."""
+        return tuple(f"{one}{WRONG_SIDE}" for one in self.behind)
+
+    @property
     def problems(self) -> tuple[str, ...]:
         """What is violated, exceeded or out of reach, one text each; empty if nothing is."""
         return (
@@ -94,7 +99,7 @@ class Feasibility:
             *map(_exceeded, _beyond((*self.controls, *self.joint_forces))),
             *map(_pulling, _beyond(self.constraint_forces)),
             *map(_left, _beyond(self.joints)),
-            *(f"{one}{WRONG_SIDE}" for one in self.behind),
+            *self.wrong_sides,
         )
 
     def __repr__(self) -> str:

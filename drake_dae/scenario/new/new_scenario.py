@@ -74,7 +74,7 @@ def new_scenario(
     robot = new_robot(file if is_url or not file else str(Path(file).resolve()), tip, point)
     links, _ = robot_links(robot.robot, SceneGraph())
     tried: list[str] = []
-    usable: tuple[Scenario, Task] | None = None
+    usable: tuple[Scenario, Task, Feasibility] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
     for share, place in product(_SHARES, places):
         task = circle(place, surface, share)
@@ -84,8 +84,8 @@ def new_scenario(
                 whole = complete_scenario(_scenario(robot, task, links)).scenario
                 found = find_feasibility(whole)
             problems = found.problems
-            if usable is None and not set(problems) - set(_beside(found)):
-                usable = whole, task
+            if usable is None and not set(problems) - {*_beside(found), *found.wrong_sides}:
+                usable = whole, task, found
         except DrakeDaeError as error:
             problems = (str(error),)
         if not problems:
@@ -94,8 +94,11 @@ def new_scenario(
         where = f"{task.name} at ({x:g}, {y:g}, {z:g}) m, {task.path} of {task.radius:g} m"
         tried.append(f"{where}: {shorten(problems[0], 160, placeholder=' ...')}")
     if usable is not None:
-        whole, task = usable
-        robot = replace(robot, remarks={**robot.remarks, "outputs": _BESIDE})
+        whole, task, found = usable
+        remarks = {"outputs": _BESIDE} if _beside(found) else {}
+        if found.wrong_sides:
+            remarks["constraints"] = "; ".join(map(str, found.behind))
+        robot = replace(robot, remarks={**robot.remarks, **remarks})
         return whole, scenario_text(whole, robot, task, Path(folder).resolve())
     raise ScenarioError(
         (

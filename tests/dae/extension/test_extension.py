@@ -201,6 +201,8 @@ def test_found_and_asked_for_are_the_same():
         np.testing.assert_array_equal(left, right)
 
 
+# Turned at random, they have sums that cancel to nothing much above round-off.
+@pytest.mark.filterwarnings("ignore::drake_dae.errors.NegligibleWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", some(range(12)))
 def test_hidden_integrators_are_found(seed):

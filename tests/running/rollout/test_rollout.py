@@ -1,5 +1,6 @@
 """Rollouts against Drake's Simulator on the same closed loop."""
 
+import re
 import shutil
 
 import numpy as np
@@ -189,7 +190,7 @@ def test_a_failure_is_that_of_the_simulation(settings, compiled):
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
     with pytest.raises(SimulationError) as raised:
-        simulate(loop.diagram, context, chosen.duration, chosen.integrator)
+        simulate(loop.diagram, context, chosen.duration, chosen.integrator, may_diverge=True)
     wanted = raised.value
     (found,) = rollout(
         loop, start, parameters, grid(10.0, 0.01), config=chosen.integrator, compiled=compiled
@@ -198,7 +199,7 @@ def test_a_failure_is_that_of_the_simulation(settings, compiled):
     tolerance = 1e-3 if chosen.integrator.use_error_control else 1e-9
     assert found.failure.time == pytest.approx(wanted.time, abs=tolerance)
     assert found.failure.state.shape == wanted.state.shape
-    assert f"t = {found.failure.time:.6g} s, state [" in str(found.failure)
+    assert re.search(rf"t = {found.failure.time:.6g} s, state (\[|grown to )", str(found.failure))
     assert str(found.failure)[:20] == str(wanted)[:20]
     assert found.record.time[-1] <= found.failure.time < found.record.time[-1] + 0.02
     assert np.isfinite(found.record["state"]).all()
