@@ -14,6 +14,7 @@ from drake_dae.compiler.compile import compile_diagram, with_twins
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Record
 from drake_dae.trace.compiled import Compiled
 
@@ -102,12 +103,17 @@ def program_of(loop: ClosedLoop | Diagram) -> Program:
     """The program of a closed loop or of any diagram, made once.
 
     Raises:
-        ModelError: Something in it cannot be traced; its name and why.
+        ModelError: Something in it cannot be traced, its name and why; or a diagram has no output.
     """
     if isinstance(loop, Diagram):
         compiled = compile_diagram(loop)
-        signals = compiled.signals
-        return Program(compiled, signals, lambda record: record, loop.get_name() or "the diagram")
+        if not compiled.outputs:
+            raise ModelError(
+                "the diagram has no output port with a vector, so that a rollout has nothing to "
+                "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
+            )
+        name = loop.get_name() or "the diagram"
+        return Program(compiled, compiled.signals, lambda record: record, name)
     if "program" not in loop.memory:
         compiled = compile_diagram(loop.diagram, list(loop.signals))
         name, choice = loop.plant.get_name(), loop.plant.dae.compiled

@@ -101,6 +101,8 @@ class Settings:
                     f"{', '.join(FIXED)}, or use_error_control"
                 )
             tableau = FIXED[scheme]
+        elif not scale.size:  # Without a state there is no error.
+            tableau = FIXED["explicit_euler"]
         relative = max(SHARE * config.accuracy, SMALLEST)
         return cls(config.max_step_size, tableau, relative * scale, relative, stop)
 

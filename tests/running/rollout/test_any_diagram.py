@@ -294,3 +294,32 @@ def test_error_control_takes_the_same_steps_of_what_changes_fast(matrix, begin):
     for run in (one, other):
         found = run.record["x"][-1]
         np.testing.assert_allclose(found, exact, rtol=0.0, atol=2e-4 * np.abs(exact).max() + 1e-6)
+
+
+@both
+@pytest.mark.parametrize("config", [fixed(0.01), SimulatorConfig()])
+def test_a_diagram_without_continuous_state_rolls_out(config, compiled):
+    """To 1e-14: a sine, and what it was at the last sample."""
+    builder = DiagramBuilder()
+    sine = builder.AddSystem(Sine(1.0, 2.0, 0.0, 1))
+    hold = builder.AddSystem(ZeroOrderHold(0.03, 1))
+    builder.Connect(sine.get_output_port(0), hold.get_input_port())
+    builder.ExportOutput(sine.get_output_port(0), "sine")
+    builder.ExportOutput(hold.get_output_port(), "held")
+    diagram = builder.Build()
+    start, parameters = start_values(diagram, diagram.CreateDefaultContext())
+    times = [0.0, 0.05, 0.1]
+    (found,) = rollout(diagram, start, parameters, times, config=config, compiled=compiled)
+    assert found.failure is None
+    np.testing.assert_allclose(found.record["sine"][:, 0], np.sin([0, 0.1, 0.2]), atol=1e-14)
+    np.testing.assert_allclose(found.record["held"][1:, 0], np.sin([0.06, 0.18]), atol=1e-14)
+
+
+def test_a_diagram_without_outputs_has_nothing_to_record():
+    builder = DiagramBuilder()
+    sine = builder.AddSystem(Sine(1.0, 2.0, 0.0, 1))
+    gain = builder.AddSystem(Gain(2.0, 1))
+    builder.Connect(sine.get_output_port(0), gain.get_input_port())
+    diagram = builder.Build()
+    with pytest.raises(ModelError, match="nothing to record: export one"):
+        start_values(diagram, diagram.CreateDefaultContext())
