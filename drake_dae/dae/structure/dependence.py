@@ -14,6 +14,10 @@ from drake_dae.dae.states.samples import Samples
 from drake_dae.trace.newton import are_dependent
 from drake_dae.trace.round_off import SINGULAR, equilibration
 
+_ON_MANIFOLD = 1e-8
+"""A state on N* may leave so much of a constraint, and an output that is a constraint times a factor
+has that in its gradient."""
+
 
 @dataclass(frozen=True)
 class Combination:
@@ -110,26 +114,30 @@ def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combin
         if signal.name in names and not system.m[row, :].nnz():
             both = ca.vertcat(manifold.residual_expression, system.l[row])
             values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
-            rows = combinations_of([*known, signal.name], [gradient for (gradient,) in values])
+            gradients = [gradient for (gradient,) in values]
+            rows = combinations_of([*known, signal.name], gradients, _ON_MANIFOLD)
             yield from (one for one in rows if one.name == signal.name)
 
 
-def combinations_of(names: list[str], values: list[FloatArray]) -> list[Combination]:
+def combinations_of(
+    names: list[str], values: list[FloatArray], least: float = SINGULAR
+) -> list[Combination]:
     """The rows that follow from those before them at the first of some states.
 
     Args:
         names: What the rows are about.
         values: The matrix at each state.
+        least: What is left of a row that follows from others, relative to its length, is below it.
     """
     matrix, lengths = _scaled(values[0])
     kept: list[int] = []
     found = []
     for i, name in enumerate(names):
         factors, error = _fit(matrix, kept, i)
-        if error >= SINGULAR:
+        if error >= least:
             kept.append(i)
             continue
-        used = [j for j, factor in zip(kept, factors, strict=True) if abs(factor) > SINGULAR]
+        used = [j for j, factor in zip(kept, factors, strict=True) if abs(factor) > least]
         plain = _fit(matrix, used, i)[0] * lengths[i] / lengths[used]
         others = []
         for value in values[1:]:

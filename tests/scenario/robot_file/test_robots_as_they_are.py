@@ -331,7 +331,8 @@ def colours(folder: Path, *materials: str, top: str = "") -> list[float]:
         frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(f"l{k}").index())
         (geometry,) = inspector.GetGeometries(frame, Role.kIllustration)
         properties = inspector.GetProperties(geometry, Role.kIllustration)
-        colour = properties.GetPropertyOrDefault("phong", "diffuse", None)
+        has_colour = properties.HasProperty("phong", "diffuse")
+        colour = properties.GetProperty("phong", "diffuse") if has_colour else None
         found.append(-1.0 if colour is None else colour.r())
     return found
 
