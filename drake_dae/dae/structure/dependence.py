@@ -15,8 +15,8 @@ from drake_dae.trace.newton import are_dependent
 from drake_dae.trace.round_off import SINGULAR, equilibration
 
 _ON_MANIFOLD = 1e-8
-"""A state on N* may leave so much of a constraint, and an output that is a constraint times a factor
-has that in its gradient."""
+"""A state on N* may leave this much of a constraint. An output that is a constraint times a factor
+has it in its gradient."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,15 @@ def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combin
         if signal.name in names and not system.m[row, :].nnz():
             both = ca.vertcat(manifold.residual_expression, system.l[row])
             values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
-            gradients = [gradient for (gradient,) in values]
+            gradients = [_without_residuals(gradient, system.scale) for (gradient,) in values]
             rows = combinations_of([*known, signal.name], gradients, _ON_MANIFOLD)
             yield from (one for one in rows if one.name == signal.name)
+
+
+def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
+    # Alone in its column, a residual counts as much as any other entry.
+    sizes = np.abs(gradients * scale)
+    return np.where(sizes < _ON_MANIFOLD * sizes.max(axis=1, keepdims=True), 0, gradients)
 
 
 def combinations_of(
