@@ -17,6 +17,7 @@ def each(few, many):
     return [*few, *(pytest.param(seed, marks=pytest.mark.slow) for seed in many)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", each(FEW, MANY))
 def test_a_bad_input_is_refused_or_runs_with_a_reason(seed: int, tmp_path: Path):
     outcome = bad_inputs.attempt(seed, tmp_path)
@@ -45,6 +46,7 @@ def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Pa
 
 
 # In drop 46 a corner dips into the floor and comes out again, nearly within one step.
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", each((*range(9), 46), range(9, 16)))
 def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path: Path):
     outcome = drops.attempt(seed, tmp_path, duration=0.5)

@@ -45,6 +45,7 @@ MISSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason", MISSED)
 def test_a_run_that_missed_its_task_is_told_by_code_and_json(reason, tmp_path, capsys):
     run = ["simulate", "two_link_wall", "--json", *BARE, *MISSED[reason]]

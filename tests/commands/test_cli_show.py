@@ -38,6 +38,7 @@ def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
     assert words in line
 
 
+@pytest.mark.slow
 def test_the_page_and_the_schema_are_printed(capsys):
     assert main(["keys"]) == 0
     assert capsys.readouterr().out == keys_page() + "\n"

@@ -22,6 +22,7 @@ def motion_of(system: DaeSystem) -> Derivatives:
     return Derivatives(system, ca.vertcat(ca.SX(0, 1), *chains))
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_along_the_constrained_motion(problem):
     """Three orders of a function of the state, and of v, against Lie derivatives by hand's v."""
     system = problem.system

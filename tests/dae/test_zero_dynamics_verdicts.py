@@ -163,6 +163,7 @@ AT_INFINITY = {
 """Rates that fall to zero far away, and are zero nowhere."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AT_INFINITY)
 @pytest.mark.parametrize("others", [0, 1, 2])
 def test_what_only_falls_is_no_equilibrium(name, others):
@@ -191,6 +192,7 @@ DEGENERATE = {
 """Rates, and where they are zero."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEGENERATE)
 @pytest.mark.parametrize("others", [0, 1])
 def test_an_equilibrium_without_a_slope_is_one(name, others):
@@ -211,6 +213,7 @@ def test_an_equilibrium_without_a_slope_is_one(name, others):
         assert (told.verdict is Verdict.UNDECIDED) is not steep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [1e-9, 1e-6, 0.3, 1e6])
 @pytest.mark.parametrize("others", [0, 1])
 def test_slow_and_fast_states_have_one_equilibrium(rate, others):
@@ -230,6 +233,7 @@ DEFECTIVE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEFECTIVE)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_defective_matrix_is_decided(name, sign):
@@ -257,6 +261,7 @@ def test_several_equilibria_of_a_slow_state_are_several():
 # In a region.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("region", "inside"),
     [((-2.0, 2.0), 1), ((0.5, 1.5), 0), ((-1.6, -0.5), 0), (None, None)],

@@ -144,6 +144,7 @@ def test_forces_and_squeezes_of_the_fingers_are_those_of_drake():
             assert squeeze == pytest.approx(wanted, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_squeeze_moves_nothing():
     """Other squeezes at one state: other forces, in the null space, and the same acceleration."""
     loop, _, record = run("three_fingers", *FINE)

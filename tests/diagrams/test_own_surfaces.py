@@ -150,6 +150,7 @@ def test_wrong_surfaces_are_told_at_their_key(surface, key, words):
     assert found == f"constraints.0.surface{key}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "is_told"), [(1.0, True), (1e-3, False), (1e-2, False)])
 def test_a_mesh_that_seems_to_be_in_millimetres_is_told(scale, is_told, tmp_path):
     """A sheet of 400 by 400 units, and an arm of 1.5 m."""

@@ -125,6 +125,7 @@ def test_push_grows_and_fades_smoothly():
     assert Push("tool", (1.0, 0.0, 0.0)).reference.derivatives([0, 0, 0])(1e6)[0] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

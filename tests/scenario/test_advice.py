@@ -72,6 +72,7 @@ def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
     assert completed.scenario == run
 
 
+@pytest.mark.slow
 def test_run_tells_its_advice_and_what_it_identified(tmp_path, capsys):
     out = tmp_path / "run"
     write = "write={record: false, plots: false, animation: false}"

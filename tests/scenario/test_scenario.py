@@ -51,6 +51,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_wall", "two_link_flexible_motors", "wall_polish"])
 def test_a_schema_without_tags_is_for_plain_readers(name):
     """Of YAML without its tags, as a plain validator gets it."""

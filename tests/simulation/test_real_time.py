@@ -51,6 +51,7 @@ def test_a_run_that_fails_or_is_too_short_has_none(fails, duration):
     assert attainable_rate(slow, slow.CreateDefaultContext(), duration, CONFIG) is None
 
 
+@pytest.mark.slow
 def test_it_is_told_before_the_run(tmp_path, monkeypatch, capsys):
     wanted = ["--set", "integrator.target_realtime_rate=2", "--set", "duration=0.1"]
     writes = [w for key in ("plots", "animation") for w in ("--set", f"write.{key}=false")]

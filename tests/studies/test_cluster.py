@@ -39,6 +39,7 @@ def test_two_workers_give_the_table_of_processes(tmp_path):
             assert there.table()["outcome"] == ["finished"] * 6 + ["no start"] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("address", ["", "nowhere", "127.0.0.1:1", "tcp://127.0.0.1:1", "x://y"])
 def test_where_no_scheduler_answers_it_says_so(address, tmp_path, monkeypatch):
     pytest.importorskip("distributed")

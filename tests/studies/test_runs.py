@@ -106,6 +106,7 @@ def test_what_is_advised_is_advised_anew_where_the_contact_is_another_one():
     assert structure_key(given, base) != structure_key(base, base)
 
 
+@pytest.mark.slow
 def test_another_structure_is_built():
     base = scenario_data(scenario("two_link_wall", *SHORT))
     variations = [

@@ -225,6 +225,7 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
     assert "1 run died or took too long; the same command tries again: 1" in error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variations", "words"),
     [

@@ -110,6 +110,7 @@ OPTIMIZED = ("two_link_wall", "two_link_motors", "seven_joint_wall", "cart_wall"
 """Others would take two minutes together to compile by -O1."""
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", SLOW)
 def test_machine_code_agrees_with_the_interpreter(name, monkeypatch):
@@ -294,6 +295,7 @@ def test_a_compiler_that_fails(cache, monkeypatch, tmp_path):
     assert contents() == []
 
 
+@pytest.mark.slow
 def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
     """Whether it hangs when it is asked for its version or when it compiles; no clock is read."""
     asked = tmp_path / "asked"

@@ -72,6 +72,7 @@ def test_twenty_four_systems_of_units_have_one_answer(name):
 FREE = ("circuit", "linear", "cart", "rolling_disk", "scalar")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(PROBLEMS) - set(FREE)))
 def test_sizes_change_as_units_do(name):
     system = PROBLEMS[name]().system
@@ -111,6 +112,7 @@ def test_a_scale_that_is_none_is_refused(scale):
         )
 
 
+@pytest.mark.slow
 def test_redundant_constraints_are_left_out_in_any_units():
     """A bead on a wire that two equal rods hold: one follows from the other, whatever the units."""
     system = DaeSystem.from_functions(

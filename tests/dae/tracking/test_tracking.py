@@ -29,6 +29,7 @@ def starts(problem: Problem) -> np.ndarray:
     return np.cumsum([0, *(degree + 1 for degree in problem.output_degrees)])
 
 
+@pytest.mark.slow
 def test_the_closed_loop_has_exactly_the_predicted_error(problem):
     """(30), (31) from a start with an error, by an independent integrator and elimination."""
     law = TrackingLaw(problem.system, poles(-3.0))
@@ -48,6 +49,7 @@ def test_the_closed_loop_has_exactly_the_predicted_error(problem):
         assert np.abs(late).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(problem):
     """By elimination, equations (9), (10), (13), (14), off N* too; to the round-off of the control.
 

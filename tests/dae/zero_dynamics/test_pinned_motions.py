@@ -43,6 +43,7 @@ def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, P
     return dynamics, times, motion
 
 
+@pytest.mark.slow
 def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
     """By the closed forms of the problem: k and its derivatives, z = l + m (alpha + beta u)."""
     _, times, motion = following(problem)
@@ -77,6 +78,7 @@ def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     np.testing.assert_allclose(motion.controls, controls, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_margins_are_the_singular_values_of_a_and_b(problem):
     _, _, motion = following(problem, 5)
     for i, x in enumerate(motion.states):

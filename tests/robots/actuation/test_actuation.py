@@ -59,6 +59,7 @@ def test_dynamics_are_those_of_a_dense_solve(name, kind):
     assert not any(plant.HasOutputPort(port) for port in stage_ports)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DEGREES)
 @pytest.mark.parametrize("name", ARMS)
 def test_degrees_are_found(name, kind):

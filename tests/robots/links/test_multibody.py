@@ -53,6 +53,7 @@ def test_gravity_is_the_bias_at_rest(seed):
     assert_close(-H - springs, gravity, "gravity", scale=np.abs(H).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_accelerations_are_those_of_the_continuous_plant(seed):
     """Holds damping, springs, actuation and rotors to what Drake simulates.

@@ -292,6 +292,7 @@ def test_a_map_stands_where_its_point_and_normal_say():
     np.testing.assert_allclose(np.ptp(vertices[:, 1:], axis=0), [0.4, 0.3], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["obj", "stl"])
 def test_a_mesh_is_sampled_along_the_normal(kind, tmp_path):
     """In millimetres, from two sides; a sheet of triangles is off the wave by a^2 b^2 / 8."""

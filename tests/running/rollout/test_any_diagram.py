@@ -42,6 +42,7 @@ def fixed(step=1e-3):
     )
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("hold", [0.0, 0.004])
 def test_a_loop_wired_by_hand_rolls_out(hold, compiled):

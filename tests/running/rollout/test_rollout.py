@@ -69,6 +69,7 @@ def assert_equal_records(found, wanted, tolerance) -> None:
         )
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(
     ("name", "scheme"),
@@ -173,6 +174,7 @@ def test_rows_within_a_thousand_short_steps_are_those_of_long_ones():
         np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(
     "settings",
@@ -232,6 +234,7 @@ def test_many_runs_are_those_of_one_each(compiled):
     np.testing.assert_array_equal(same[1].record["state"], found[1].record["state"])
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(
     "sensor",
@@ -264,6 +267,7 @@ def test_sensors_measure_as_in_drake(sensor, compiled):
     assert_equal_records(found.record, wanted, 1e-12)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("case", ["position", "measured", "direct"])
 def test_integrals_are_those_of_drake(case, compiled):
@@ -307,6 +311,7 @@ def test_integrals_are_those_of_drake(case, compiled):
     assert_equal_records(found.record, wanted, 1e-12)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(("pole", "integral"), [(-80, []), (-40, ["integral=[tool.z]"])])
 def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
@@ -409,6 +414,7 @@ def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
         )
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_dome"])
 def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, compiled):
@@ -427,6 +433,7 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
     np.testing.assert_allclose(found.record["state"], expected["state"], rtol=0.0, atol=1e-13)
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(
     "settings",

@@ -31,6 +31,7 @@ def reaching(folder, z, positions, kind="revolute"):
     return load_scenario(folder / "far.yaml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["revolute", "continuous"])
 @pytest.mark.parametrize("two", [1e-4, -2e-4, 0.003, 2.7])
 def test_a_start_near_a_singular_guess_stays_within_limits(kind, two, tmp_path):

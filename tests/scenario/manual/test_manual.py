@@ -173,6 +173,7 @@ def plain(data):
     return [plain(one) for one in data] if isinstance(data, list) else data
 
 
+@pytest.mark.slow
 def test_editors_accept_shipped_scenarios_and_no_wrong_keys():
     schema = json.loads(json.dumps(editor_schema()))
     validator = jsonschema.Draft202012Validator(schema)

@@ -292,6 +292,7 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
     return loop, whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -71,6 +71,7 @@ def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], Lea
     assert last() is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feedback", [False, True])
 def test_a_loop_that_ran_is_freed_with_its_context_and_logs(feedback: bool):
     made = loop(feedback)

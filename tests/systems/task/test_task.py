@@ -177,6 +177,7 @@ def test_another_context_is_another_run(whole):
 HOLDING = Approach(0.1, over=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reaction", ["approach", "hold", "stop", "fail"])
 def test_lost_contact_leads_to_the_chosen_reaction(reaction):
     """A hand pulls with 40 N where the arm presses with 10 N."""

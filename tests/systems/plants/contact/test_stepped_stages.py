@@ -115,6 +115,7 @@ def test_energy_swings_and_does_not_grow():
     assert energy[-100:].max() == pytest.approx(energy[:100].max(), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stages",
     [

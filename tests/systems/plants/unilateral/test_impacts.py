@@ -160,6 +160,7 @@ def test_impacts_that_rub_are_in_their_cones_and_gain_no_energy(tangents, count,
     assert less > 0 or count == 1
 
 
+@pytest.mark.slow
 def test_contacts_of_a_mechanism_of_one_freedom_find_impulses():
     """Each moves along its own slope; impulses pierce nothing, and rub in their cones."""
     for seed in range(6):
@@ -206,6 +207,7 @@ def test_a_box_that_lands_on_four_feet():
             )
 
 
+@pytest.mark.slow
 def test_a_wedged_body_bounces_less_or_not_at_all():
     """Between two walls that rub it as it sinks in: no impulse moves it along, nor apart.
 
