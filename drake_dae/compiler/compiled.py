@@ -86,7 +86,7 @@ class CompiledDiagram:
         """The diagram."""
         return self.wires.diagram
 
-    @property
+    @cached_property
     def sizes(self) -> dict[str, int]:
         """How many entries each argument of the functions has."""
         return {name: int(column.numel()) for name, column in self._columns.items()}
@@ -177,15 +177,12 @@ class CompiledDiagram:
         return bool(self.twins)
 
     @cached_property
-    def own_parameters(self) -> Mapping[System, ca.Function]:
-        """System -> (time, state, held, parameters) -> its own, those that move as they are then.
-
-        Of the blocks that are not content with any state.
-        """
+    def moved_parameters(self) -> Mapping[System, ca.Function]:
+        """Plant with moving parameters -> (time, state, held, parameters) -> all of its own."""
         return {
             system: self._function("parameters", [self._expressions.parameters(block)])
             for system, block in self.blocks.items()
-            if block.check_start is not None
+            if block.check_start is not None and block.moving
         }
 
     def newton(self, count: int) -> ca.Function:

@@ -119,11 +119,16 @@ def _plants(
     compiled: CompiledDiagram, time: float, state: FloatArray, held: FloatArray, row: FloatArray
 ) -> list[tuple[slice, FloatArray, Block]]:
     """The blocks with a manifold: where the state of each stands, and its parameters now."""
-    places = dict(compiled.states)
-    return [
-        (places[system], function(time, state, held, row).full()[:, 0], compiled.blocks[system])
-        for system, function in compiled.own_parameters.items()
-    ]
+    states, parameters = dict(compiled.states), dict(compiled.parameters)
+    found = []
+    for system, block in compiled.blocks.items():
+        if block.check_start is None:
+            continue
+        now = row[parameters[system]]
+        if system in compiled.moved_parameters:
+            now = compiled.moved_parameters[system](time, state, held, row).full()[:, 0]
+        found.append((states[system], now, block))
+    return found
 
 
 def _project(
