@@ -1,18 +1,14 @@
 """The command: what it prints, what it leaves, and how it ends."""
 
-import os
-import pty
 import re
 import signal
-import subprocess
-import sys
 import time
 import warnings
 import webbrowser
 
 import numpy as np
 import pytest
-from command_line import BARE, QUICK, SHORT, command, error_line
+from command_line import BARE, QUICK, SHORT, command, error_line, shown_on_a_terminal
 from recordings import animation
 
 import drake_dae
@@ -321,25 +317,9 @@ def test_meshcat_tells_where_and_asks_drake_for_real_time(tmp_path, capsys):
 @pytest.mark.slow
 def test_a_bar_on_a_terminal(tmp_path):
     """One that does not know its width, as in some containers."""
-    ours, theirs = pty.openpty()
     settings = ["--set", "duration=0.5", "--set", "integrator.target_realtime_rate=1"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "drake_dae", "simulate", "two_link_wall", *BARE, *settings],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        stderr=theirs,
-        env=os.environ | {"PYTHONUTF8": "1"},
-    )
-    os.close(theirs)
-    shown = b""
-    try:
-        while part := os.read(ours, 4096):
-            shown += part
-    except OSError:
-        pass  # Linux says so when the other end is closed.
-    os.close(ours)
-    assert process.wait(timeout=30) == 0
-    steps = shown.decode().rstrip().split("\r")
+    shown = shown_on_a_terminal(["simulate", "two_link_wall", *BARE, *settings], cwd=tmp_path)
+    steps = shown.rstrip().split("\r")
     assert len(steps) > 3
     assert re.search(r"100%\|.*\| 0\.50/0\.50 s, \d+\.\d x real time", steps[-1])
 

@@ -1,12 +1,9 @@
 """`drake-dae sweep`: what it prints and leaves, and what it refuses."""
 
-import os
-import pty
 import re
-import subprocess
-import sys
 
 import pytest
+from command_line import shown_on_a_terminal
 
 from drake_dae.cli import main
 from drake_dae.studies.study import FILES
@@ -79,23 +76,10 @@ def test_wrong_usage_exits_with_2(options, capsys):
 @pytest.mark.slow
 @pytest.mark.thorough
 def test_a_bar_with_the_time_left_on_a_terminal(tmp_path):
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "drake_dae", "sweep", "two_link_wall", *SHORT, "--out", tmp_path,
-         "--workers=1", "--vary", "start.errors.tool.z=[0, 0.01, 0.02, 3]"],
-        stdout=subprocess.DEVNULL,
-        stderr=theirs,
-        env=os.environ | {"PYTHONUTF8": "1"},
-    )  # fmt: skip
-    os.close(theirs)
-    shown = b""
-    try:
-        while part := os.read(ours, 4096):
-            shown += part
-    except OSError:
-        pass  # Linux says so when the other end is closed.
-    os.close(ours)
-    assert process.wait(timeout=60) == 0
-    steps = shown.decode().rstrip().split("\r")
-    assert re.search(r"  0%\|.*\| 0/4 runs, \? left", shown.decode())
+    vary = ["--vary", "start.errors.tool.z=[0, 0.01, 0.02, 3]"]
+    shown = shown_on_a_terminal(
+        ["sweep", "two_link_wall", *SHORT, "--out", tmp_path, "--workers=1", *vary]
+    )
+    steps = shown.rstrip().split("\r")
+    assert re.search(r"  0%\|.*\| 0/4 runs, \? left", shown)
     assert re.search(r"100%\|.*\| 4/4 runs, 00:00 left, 1 not finished", steps[-1])

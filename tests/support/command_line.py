@@ -1,5 +1,7 @@
 """The command line in a process of its own, and what short runs are asked for."""
 
+import os
+import pty
 import subprocess
 import sys
 
@@ -20,6 +22,28 @@ def command(*arguments, **options):
         text=True,
         **options,
     )
+
+
+def shown_on_a_terminal(arguments, **options):
+    """What a command writes to stderr where that is a terminal that does not know its width."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "drake_dae", *map(str, arguments)],
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        env=os.environ | {"PYTHONUTF8": "1"},
+        **options,
+    )
+    os.close(theirs)
+    shown = b""
+    try:
+        while part := os.read(ours, 4096):
+            shown += part
+    except OSError:
+        pass  # Linux says so when the other end is closed.
+    os.close(ours)
+    assert process.wait(timeout=60) == 0
+    return shown.decode()
 
 
 def error_line(capsys):

@@ -313,14 +313,18 @@ def test_2_a_constraint_that_no_force_reaches(derivatives_taken):
     assert len(derivatives_taken) == 0
 
 
-def test_5_an_output_that_repeats_the_constraint_is_found_at_once(derivatives_taken):
-    """By Theorem 2.1, before its derivatives fill the state; h* is zero by cancellation alone."""
+@pytest.mark.parametrize("residual", [0.0, 1e-10])
+def test_5_an_output_that_repeats_the_constraint_is_found_at_once(residual, derivatives_taken):
+    """By Theorem 2.1, before its derivatives fill the state; h* is zero by cancellation alone.
+
+    What a state leaves of the constraint stands alone in the column of x3.
+    """
     system = beside_an_integrator(
         20,
         g=lambda x: [0, untidy_one(x[4]), *[0] * 18],
         h=lambda x: [0, untidy_one(x[3]), *[0] * 18],
         k=lambda x: x[0] * (2 + x[6]) + x[5] ** 2 - 0.75,
-        l=lambda x: (x[0] * (2 + x[6]) + x[5] ** 2 - 0.75) * (1 + x[3]),
+        l=lambda x: (x[0] * (2 + x[6]) + x[5] ** 2 - 0.75 + residual) * (1 + x[3]),
         m=lambda x: 0,
     )
     error = violation(system)
