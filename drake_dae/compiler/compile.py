@@ -96,11 +96,15 @@ def _compiled(
             first = columns["parameters"].numel()
             fixed.append((system, name, slice(first, first + symbol.numel())))
             columns["parameters"] = ca.vertcat(columns["parameters"], symbol)
-    given = [columns[name] for name in ARGUMENTS]
-    rate = expressions.checked(
-        lambda: [expressions.output(system, DERIVATIVE) for system, _ in places["state"]]
-    )
-    row = expressions.checked(lambda: [expressions.port(port) for port in chosen])
+    given = [columns[name] for name in (*ARGUMENTS, "noise")]
+    asked: dict[str, tuple[ca.SX, ca.SX]] = {
+        "rate": expressions.checked(
+            lambda: [expressions.output(system, DERIVATIVE) for system, _ in places["state"]]
+        ),
+        "row": expressions.checked(lambda: [expressions.port(port) for port in chosen]),
+    }
+    rates = _rates(expressions, blocks, places["held"])
+    asked |= {f"update_{i}": values for i, (_, values, _) in enumerate(rates)}
     return CompiledDiagram(
         wires,
         context,
@@ -110,12 +114,14 @@ def _compiled(
         tuple(places["parameters"]),
         tuple(fixed),
         tuple(places["noise"]),
-        dense_function("rate", given, rate),
-        dense_function("row", given, row),
-        tuple(_rates(expressions, blocks, places["held"], [*given, columns["noise"]])),
+        tuple(
+            Rate(*key, dense_function("update", given, expressions.expanded(values)), held)
+            for key, values, held in rates
+        ),
         blocks,
         expressions,
         columns,
+        asked,
     )
 
 
@@ -151,12 +157,9 @@ def _stacked(
 
 
 def _rates(
-    expressions: Expressions,
-    blocks: Mapping[System, Block],
-    held: Sequence[Place],
-    given: Sequence[ca.SX],
-) -> list[Rate]:
-    """The updates of all blocks, those of one instant together."""
+    expressions: Expressions, blocks: Mapping[System, Block], held: Sequence[Place]
+) -> list[tuple[tuple[float, float, bool], tuple[ca.SX, ca.SX], tuple[int, ...]]]:
+    """The updates of all blocks, those of one instant together: when, what, and of which places."""
     parts = dict(held)
     groups: dict[tuple[float, float, bool], list[tuple[Block, Computation]]] = {}
     for block in blocks.values():
@@ -171,8 +174,7 @@ def _rates(
     found = []
     for key, members in groups.items():
         places = [i for block, _ in members for i in _entries(parts[block.system])]
-        function = dense_function("update", given, expressions.checked(partial(asked, members)))
-        found.append(Rate(*key, function, tuple(places)))
+        found.append((key, expressions.checked(partial(asked, members)), tuple(places)))
     return found
 
 

@@ -59,9 +59,6 @@ class CompiledDiagram:
         outputs: The names of the output ports of the diagram that are computed.
         states, held, parameters, noise: Where the columns of each block stand.
         fixed: The input ports without a wire whose values are parameters: (system, name, part).
-        rate: (time, state, held, parameters) -> the derivative of the state, and a number that is
-            finite if it is of use.
-        row: The same -> all outputs below each other, and such a number.
         rates: The updates, one function for each period and offset.
         blocks: The blocks by their systems, in the order of Drake's states.
     """
@@ -74,12 +71,11 @@ class CompiledDiagram:
     parameters: tuple[Place, ...]
     fixed: tuple[tuple[System, str, slice], ...]
     noise: tuple[Place, ...]
-    rate: ca.Function
-    row: ca.Function
     rates: tuple[Rate, ...]
     blocks: Mapping[System, Block]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
+    _asked: Mapping[str, Sequence[ca.SX]] = field(repr=False)
 
     @property
     def diagram(self) -> Diagram:
@@ -90,6 +86,37 @@ class CompiledDiagram:
     def sizes(self) -> dict[str, int]:
         """How many entries each argument of the functions has."""
         return {name: int(column.numel()) for name, column in self._columns.items()}
+
+    @cached_property
+    def rate(self) -> ca.Function:
+        """(time, state, held, parameters) -> the derivative of the state, shape (n,), and validity.
+
+        The second value is a number that is finite if the first is of use.
+        """
+        return self._function("rate", self._asked["rate"])
+
+    @cached_property
+    def row(self) -> ca.Function:
+        """(time, state, held, parameters) -> all outputs below each other, and validity."""
+        return self._function("row", self._asked["row"])
+
+    @cached_property
+    def staged(self) -> Mapping[str, ca.Function]:
+        """Name -> function, for who computes what the time alone determines once for each time.
+
+        "given" is (time, parameters) -> a column; "rate", "row", "newton" and "update_0", ... are
+        as the functions of the same names, and take this column after the parameters.
+        """
+        functions = {**self._asked, "newton": self._newton(1)}
+        column, values, meant = self._expressions.given_column()
+        given = [self._columns["time"], self._columns["parameters"]]
+        found = {"given": dense_function("given", given, [values])}
+        for name, asked in functions.items():
+            arguments = [*(self._columns[each] for each in ARGUMENTS), column]
+            if name.startswith("update"):
+                arguments.append(self._columns["noise"])
+            found[name] = dense_function(name, arguments, meant(asked))
+        return found
 
     @cached_property
     def scale(self) -> FloatArray:
@@ -194,6 +221,9 @@ class CompiledDiagram:
         Args:
             count: How many steps.
         """
+        return self._function("newton", self._newton(count))
+
+    def _newton(self, count: int) -> list[ca.SX]:
         state = ca.SX(self._columns["state"])
         left = ca.SX(0.0)
         for system, part in self.states:
@@ -207,7 +237,7 @@ class CompiledDiagram:
                 change = projection.newton(x, start, parameters)[0]
                 x, left_here = x + ca.DM(projection.scale) * change, ca.norm_2(change)
             state[part], left = x, ca.fmax(left, left_here) if left.nnz() else left_here
-        return self._function("newton", [state, left])
+        return [state, left]
 
     @property
     def signals(self) -> dict[str, tuple[Signal, ...]]:
@@ -235,6 +265,7 @@ class CompiledDiagram:
         return self._function("arguments", list(call.arguments))
 
     def _function(self, name: str, values: Sequence[ca.SX]) -> ca.Function:
+        values = self._expressions.expanded(values)
         return dense_function(name, [self._columns[each] for each in ARGUMENTS], values)
 
 

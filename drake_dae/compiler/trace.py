@@ -32,6 +32,8 @@ class Call:
         arguments: Its arguments as expressions.
         results: Its results as expressions.
         needed: The calls that the arguments need.
+        is_given: Whether it needs the time and parameters alone. Its results are then symbols of
+            their own, so that they can be computed once for all that happens at a time.
     """
 
     block: Block
@@ -39,11 +41,15 @@ class Call:
     arguments: tuple[ca.SX, ...]
     results: tuple[ca.SX, ...]
     needed: tuple["Call", ...]
+    is_given: bool
 
     @property
     def valid(self) -> ca.SX:
-        """What is finite if the results are of use."""
-        return self.results[-1] if self.computation.traced is not None else ca.SX(0)
+        """What is finite if the results are of use; what is but passed on was checked before."""
+        if self.computation.traced is not None:
+            return self.results[-1]
+        made = [result for result in self.results if not result.is_valid_input()]
+        return ca.sum1(ca.vertcat(ca.SX(0), *made))
 
 
 class Expressions:
@@ -63,6 +69,7 @@ class Expressions:
         time: The time in s.
         calls: All computations so far, each after those that it needs.
         used: The blocks so far, by their systems.
+        given: Each symbol of what the time and parameters alone determine, with its expression.
         symbols: (system, STATE, HELD, PARAMETERS, NOISE, or the name of an input port with a fixed
             value) -> its symbols.
 
@@ -80,6 +87,7 @@ class Expressions:
         self.time = ca.SX.sym("time")
         self.calls: list[Call] = []
         self.used: dict[System, Block] = {}
+        self.given: list[tuple[ca.SX, ca.SX]] = []
         self.symbols: dict[tuple[System, str], ca.SX] = {}
         self._wires, self._context, self._twins = wires, context, dict(twins or {})
         self._found: dict[tuple[System, Computation], Call] = {}
@@ -142,11 +150,54 @@ class Expressions:
         self._open.pop()
         needed = tuple(self._needed.pop().values())
         results = computation.function.call(arguments)
-        found = Call(block, computation, tuple(arguments), tuple(results), needed)
+        is_given = not {STATE, HELD, NOISE} & set(computation.sources)
+        is_given = is_given and all(one.is_given for one in needed)
+        if is_given:
+            results = [self._named(result) for result in results]
+        found = Call(block, computation, tuple(arguments), tuple(results), needed, is_given)
         self._found[key] = found
         self.calls.append(found)
         self._note(found)
         return found
+
+    def _named(self, value: ca.SX) -> ca.SX:
+        """Symbols for a value that the time and parameters alone determine."""
+        value = self.expanded([value])[0]
+        symbol = ca.SX.sym("given", value.sparsity())
+        self.given.append((symbol, value))
+        return symbol
+
+    def expanded(self, values: Sequence[ca.SX]) -> list[ca.SX]:
+        """Expressions in which no symbol of `given` is left."""
+        if not self.given:
+            return list(values)
+        symbols, meant = zip(*self.given, strict=True)
+        found: list[ca.SX] = ca.substitute(list(values), list(symbols), list(meant))
+        return found
+
+    def given_column(self) -> tuple[ca.SX, ca.SX, Callable[[Sequence[ca.SX]], list[ca.SX]]]:
+        """Symbols of `given`, each value once; their values; and what puts them in expressions.
+
+        Constants and parameters that stand there as they are come without a symbol.
+
+        Plant and law often have the same references and the same moving parameters: only where
+        these are the same symbols, what both compute from them is found to be the same.
+        """
+        values = ca.cse(ca.vertcat(ca.SX(0, 1), *(ca.vec(value) for _, value in self.given)))
+        symbols = ca.vertcat(ca.SX(0, 1), *(ca.vec(symbol) for symbol, _ in self.given))
+        first: dict[int, int] = {}
+        meant = ca.SX(symbols)
+        for i in range(values.numel()):
+            value = values[i]
+            is_plain = value.is_constant() or value.is_symbolic()
+            meant[i] = value if is_plain else symbols[first.setdefault(value.element_hash(), i)]
+        chosen = list(first.values())
+
+        def put_in(asked: Sequence[ca.SX]) -> list[ca.SX]:
+            found: list[ca.SX] = ca.substitute(list(asked), [symbols], [meant])
+            return found
+
+        return symbols[chosen], values[chosen], put_in
 
     def _note(self, found: Call) -> None:
         """Keeps that what is being computed needs a call, and what that needs."""
@@ -162,7 +213,7 @@ class Expressions:
         self._needed.append({})
         value = ca.vertcat(ca.SX(0, 1), *ask())
         needed = self._needed.pop().values()
-        valid = sum((call.valid for call in needed), ca.sum1(value) if value.numel() else ca.SX(0))
+        valid = sum((call.valid for call in needed), ca.SX(0))
         return value, valid
 
     def source(self, block: Block, name: str) -> ca.SX:

@@ -38,6 +38,8 @@ def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
         times: When rows are written, in s: an update at the time of a row makes no step of its own.
     """
     due: dict[float, int] = {}
+    if not compiled.rates:
+        return Events(np.empty(0), np.empty(0, dtype=np.int64))
     for number, rate in enumerate(compiled.rates):
         first = int(np.ceil((times[0] - rate.offset) / rate.period - SAME))
         last = int(np.floor((times[-1] - rate.offset) / rate.period + SAME))
@@ -48,7 +50,7 @@ def events_of(compiled: CompiledDiagram, times: FloatArray) -> Events:
     # of times that differ by round-off follow each other.
     moments = np.array(sorted(due), dtype=float)
     bits = np.array([due[moment] for moment in moments.tolist()], dtype=np.int64)
-    shortest = min((rate.period for rate in compiled.rates), default=0.0)
+    shortest = min(rate.period for rate in compiled.rates)
     near = np.clip(np.searchsorted(times, moments), 1, times.size - 1)
     for candidate in (times[near - 1], times[near]):
         is_near = np.abs(candidate - moments) <= SAME * shortest

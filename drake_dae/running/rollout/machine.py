@@ -110,11 +110,12 @@ def _source(program: Program) -> str:
         "HELD": compiled.sizes["held"],
         "NOISE": compiled.sizes["noise"],
         "WIDTH": program.width,
+        "GIVEN": calls["given"].numel_out(0),
         "PROJECTS": int(compiled.projects),
     }
     for name, function in calls.items():
         # At least as many as the initializers in stepper.c.
-        sizes[f"{name.upper()}_ARG"] = max(5, function.sz_arg())
+        sizes[f"{name.upper()}_ARG"] = max(6, function.sz_arg())
         sizes[f"{name.upper()}_RES"] = max(2, function.sz_res())
     tables = {
         "dop_a": DOP853.A,
@@ -146,7 +147,7 @@ def _updated(number: int, rate: Rate) -> str:
     count = len(rate.places)
     return f"""  if (due >> {number} & 1 && unrestricted == {int(rate.is_unrestricted)}) {{
     double values[{count + 1}], valid;
-    const double *arg[UPDATE_{number}_ARG] = {{&time, x, held, g->parameters, noise}};
+    const double *arg[UPDATE_{number}_ARG] = {{&time, x, held, g->parameters, g->given, noise}};
     double *res[UPDATE_{number}_RES] = {{values, &valid}};
     int i;
     dae_update_{number}(arg, res, 0, 0, 0);

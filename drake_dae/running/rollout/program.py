@@ -89,9 +89,7 @@ class Program:
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
         """Name -> function, of all that machine code is made of."""
-        compiled = self.compiled
-        updates = {f"update_{i}": rate.function for i, rate in enumerate(compiled.rates)}
-        return {"rate": compiled.rate, "row": compiled.row, "newton": compiled.newton(1)} | updates
+        return dict(self.compiled.staged)
 
     @property
     def num_operations(self) -> int:

@@ -35,9 +35,11 @@ typedef struct {
 /* Unrestricted updates, the projection, discrete updates: in this order. */
 enum { UNRESTRICTED = 1, PROJECTION = 2, DISCRETE = 4, ALL = 7 };
 
-/* What does not change within a step. */
+/* What does not change within a step, and what the time alone determines. */
 typedef struct {
   const double *held, *parameters;
+  double given[GIVEN + 1];
+  double time; /* to which it belongs; not a number before the first */
 } Given;
 
 static int is_finite(const double *vector, int size) {
@@ -48,12 +50,22 @@ static int is_finite(const double *vector, int size) {
   return 1;
 }
 
+/* A row, the last stage of a step and the first of the next one have one time. */
+static void set_time(double time, Given *g) {
+  const double *arg[GIVEN_ARG] = {&time, g->parameters};
+  double *res[GIVEN_RES] = {g->given};
+  if (!GIVEN || time == g->time) return;
+  dae_given(arg, res, 0, 0, 0);
+  g->time = time;
+}
+
 /* The derivative of the state; where it has no value all of it is nan. */
-static int rates(double time, const double *x, const Given *g, double *rate) {
+static int rates(double time, const double *x, Given *g, double *rate) {
   double valid;
-  const double *arg[RATE_ARG] = {&time, x, g->held, g->parameters};
+  const double *arg[RATE_ARG] = {&time, x, g->held, g->parameters, g->given};
   double *res[RATE_RES] = {rate, &valid};
   int i, good;
+  set_time(time, g);
   dae_rate(arg, res, 0, 0, 0);
   good = isfinite(valid) != 0;
   for (i = 0; !good && i < SIZE; i++) rate[i] = NAN;
@@ -61,21 +73,23 @@ static int rates(double time, const double *x, const Given *g, double *rate) {
 }
 
 /* One row of the record. */
-static int write(double time, const double *x, const Given *g, double *row) {
+static int write(double time, const double *x, Given *g, double *row) {
   double valid;
-  const double *arg[ROW_ARG] = {&time, x, g->held, g->parameters};
+  const double *arg[ROW_ARG] = {&time, x, g->held, g->parameters, g->given};
   double *res[ROW_RES] = {row, &valid};
+  set_time(time, g);
   dae_row(arg, res, 0, 0, 0);
   return isfinite(valid) != 0;
 }
 
 /* The state on N*, by Newton steps; 0 where Python has to decide. */
-static int project(double time, double *x, const Given *g) {
+static int project(double time, double *x, Given *g) {
   double at[SIZE + 1], found[SIZE + 1], left;
-  const double *arg[NEWTON_ARG] = {&time, at, g->held, g->parameters};
+  const double *arg[NEWTON_ARG] = {&time, at, g->held, g->parameters, g->given};
   double *res[NEWTON_RES] = {found, &left};
   int attempt;
   if (!PROJECTS) return 1;
+  set_time(time, g);
   memcpy(at, x, SIZE * sizeof(double));
   for (attempt = 0; attempt < 8; attempt++) {
     dae_newton(arg, res, 0, 0, 0);
@@ -90,11 +104,12 @@ static int project(double time, double *x, const Given *g) {
 }
 
 /* The updates of one kind that are due, all at once. */
-static int apply(double time, const double *x, double *held, const Given *g, const double *noise,
+static int apply(double time, const double *x, double *held, Given *g, const double *noise,
                  long long due, int unrestricted) {
   double fresh[HELD + 1];
   int good = 1;
-  (void)time, (void)x, (void)g, (void)noise, (void)due, (void)unrestricted;
+  (void)time, (void)x, (void)noise, (void)due, (void)unrestricted;
+  set_time(time, g);
   memcpy(fresh, held, HELD * sizeof(double));
 $updates
   memcpy(held, fresh, HELD * sizeof(double));
@@ -102,7 +117,7 @@ $updates
 }
 
 /* What happens at the start of a step: the projection, and the updates that are due. */
-static int update(Run *run, double *x, double *held, const Given *g, long long num_events,
+static int update(Run *run, double *x, double *held, Given *g, long long num_events,
                   const double *events, const long long *due, const double *noise) {
   while (run->pending) {
     int now = run->event < num_events && events[run->event] <= run->time;
@@ -157,7 +172,7 @@ static void weigh(double step, int count, const double *b, const double *x, doub
 
 /* The state and the rate at a stage of an explicit Runge-Kutta method. */
 static void stage(Run *run, double time, double step, int count, const double *a, double c,
-                  const double *x, const Given *g, double (*k)[SIZE], double *trial) {
+                  const double *x, Given *g, double (*k)[SIZE], double *trial) {
   double at[SIZE];
   weigh(step, count, a, x, k, at);
   if (!rates(time + c * step, at, g, k[count])) note(run, time + c * step, at, trial);
@@ -174,6 +189,7 @@ __attribute__((visibility("default"))) int run_fixed(
   int s, status;
   g.held = held;
   g.parameters = parameters;
+  g.time = NAN;
   for (;;) {
     double end, step;
     if (run->row < num_rows && run->time >= times[run->row]) {
@@ -219,7 +235,7 @@ static double weighted(const double *vector, const double *unit) {
 
 /* A first step, as SciPy finds it (Hairer, Norsett and Wanner, section II.4). */
 static double first_step(Run *run, const double *x, const double *rate, const double *absolute,
-                         double relative, double longest, const Given *g) {
+                         double relative, double longest, Given *g) {
   double unit[SIZE], other[SIZE], change[SIZE], d0, d1, d2, h0, h1;
   int i;
   for (i = 0; i < SIZE; i++) unit[i] = absolute[i] + fabs(x[i]) * relative;
@@ -263,6 +279,7 @@ __attribute__((visibility("default"))) int run_controlled(
   int i, j, s, status, valid, known = 0, is_on = 0;
   g.held = held;
   g.parameters = parameters;
+  g.time = NAN;
   while (run->row < num_rows && run->time >= times[run->row]) {
     if (run->row == num_rows - 1) {
       status = update(run, x, held, &g, num_events, events, due, noise);
