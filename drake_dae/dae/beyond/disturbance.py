@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.arrays import unknown_name
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.signals import Parameter
@@ -104,6 +104,8 @@ class Observation:
         wanted: (x, R, t, parameters) -> x with those velocities with which the outputs move as the
             reference does t later, r' + t r'', and the constraints stay, shape (n,); None where
             outputs and constraints do not determine them.
+        moving: (x, parameters) -> R with the rates r' that the outputs have, and zeros: the motion
+            that there is, as if it were wanted.
         rows: The states whose rates d enters.
         frictions: The names of the coefficients of friction, and which constraint input each is
             for.
@@ -113,6 +115,7 @@ class Observation:
     friction: TracedFunction
     directions: TracedFunction
     wanted: TracedFunction | None
+    moving: TracedFunction
     rows: tuple[int, ...]
     frictions: dict[str, int]
 
@@ -143,7 +146,8 @@ class Observation:
         drift = ca.substitute(system.f[rows], d, 0 * d) + ca.substitute(moved, still, x)
         inputs = action[rows] + ca.mtimes(system.h[rows, :], u)
         outputs = {"momentum": momentum, "drift": drift, "inputs": inputs}
-        function = system.trace("momentum", outputs, {"control": u, "constraint_input": v})
+        given = {"control": u, "constraint_input": v}
+        function = system.trace("momentum", outputs, given, often=False)
 
         # What a coefficient of friction of one does; it takes the power mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
@@ -155,7 +159,7 @@ class Observation:
         ]
         pressed = {"constraint_input": v}
         rubbing = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
-        friction = system.trace("friction", rubbing, pressed)
+        friction = system.trace("friction", rubbing, pressed, often=False)
 
         reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
         projector = ca.SX.eye(len(rows)) + reaction
@@ -169,59 +173,79 @@ class Observation:
             "free": projector,
             "planes": ca.substitute(planes, x[rows], 0 * x[rows]),
         }
-        directions = system.trace("directions of friction", found, pressed)
-        wanted = _wanted(structure, rows)
-        return cls(function, friction, directions, wanted, tuple(rows), frictions)
+        directions = system.trace("directions of friction", found, pressed, often=False)
+        wanted, moving = _wanted(structure, rows)
+        return cls(function, friction, directions, wanted, moving, tuple(rows), frictions)
 
 
-def shares(forces: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
-    """How much of each force c is in d, by the accelerations that they make, shape (c,):
+def shares(forces: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
+    """How much of each force c is in d, by the accelerations that they make, shape (c, 1):
 
         (c^T W d) / (c^T W c).
 
     Args:
         forces: The forces as columns, shape (k, c).
         metric: W, shape (k, k).
-        d: What is shared, shape (k,).
+        d: What is shared, shape (k, 1).
     """
-    matched = metric @ forces
-    return np.asarray(d @ matched / np.maximum(np.sum(forces * matched, axis=0), _TINY))
+    matched = ca.mtimes(metric, forces)
+    squares = ca.sum1(forces * matched).T
+    return ca.mtimes(matched.T, d) / ca.fmax(squares, _TINY)
 
 
-def beside(planes: FloatArray, metric: FloatArray, d: FloatArray) -> FloatArray:
+def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
     """What is left of d beside all T y, by the accelerations that they make, in its shape.
 
     Args:
         planes: T, shape (k, j), of any rank.
         metric: W, shape (k, k).
-        d: What is shared, shape (k,), or as columns.
+        d: What is shared, as columns.
     """
-    matched = metric @ planes
-    found = np.linalg.lstsq(planes.T @ matched, matched.T @ d, rcond=_FLAT)[0]
-    return np.asarray(d - planes @ found)
+    squares = ca.sum1(planes * ca.mtimes(metric, planes))
+    least = _FLAT * ca.mmax(squares) if squares.numel() else 0
+    found: list[tuple[ca.SX, ca.SX]] = []
+    for column in ca.horzsplit(planes):
+        for direction, matched in found:  # Modified Gram-Schmidt, in the metric W.
+            column -= direction * ca.dot(matched, column)
+        matched = ca.mtimes(metric, column)
+        square = ca.dot(column, matched)
+        matched = ca.if_else(square > least, 1, 0) / ca.fmax(square, _TINY) * matched
+        found.append((column, matched))
+        d -= ca.mtimes(column, ca.mtimes(matched.T, d))
+    return d
 
 
-def _wanted(structure: Structure, rows: Sequence[int]) -> TracedFunction | None:
-    """x with the velocities that the reference wants then; None where it does not tell them."""
+def _wanted(
+    structure: Structure, rows: Sequence[int]
+) -> tuple[TracedFunction | None, TracedFunction]:
+    """x with the velocities that the reference wants then, None where it does not tell them; and R.
+
+    R is the reference that wants the velocities which there are.
+    """
     system, layout = structure.system, Layout(structure.output_degrees)
     # Behind springs forces have a degree, too.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
-    if any(structure.output_degrees[i] < 2 for i in steered):
-        return None
-    reference = ca.SX.sym("R", layout.reference_size)
+    starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}
+    rates = {i: structure.output_chains[i][1] for i in starts}
+    own = ca.SX.zeros(layout.reference_size)
+    for i, rate in rates.items():
+        own[starts[i] + 1] = rate
+    moving = system.trace("velocities of outputs", {"R": own}, often=False)
+    if len(starts) < len(steered):
+        return None, moving
+    reference, ahead = ca.SX.sym("R", layout.reference_size), ca.SX.sym("t")
     kept = Layout(structure.constraint_degrees).ends.tolist()
-    ahead, starts = ca.SX.sym("t"), {i: int(layout.lowest[i]) for i in steered}
-    goals = {i: reference[j + 1] + ahead * reference[j + 2] for i, j in starts.items()}
-    rates = [structure.output_chains[i][1] - goals[i] for i in steered]
-    left = ca.vertcat(ca.SX(0, 1), *rates, structure.manifold.residual_expression[kept, :])
-    slope = ca.jacobian(left, system.state[list(rows), :])
+    left = [rates[i] - reference[j + 1] - ahead * reference[j + 2] for i, j in starts.items()]
+    left += [structure.manifold.residual_expression[kept, :]]
+    slope = ca.jacobian(ca.vertcat(*left), system.state[list(rows), :])
     if slope.shape[0] != slope.shape[1]:
-        return None
+        return None, moving
     factors = Factorization(slope)
     state = ca.SX(system.state)
-    state[list(rows), :] -= factors.solve(left)
+    state[list(rows), :] -= factors.solve(ca.vertcat(*left))
     inputs = {"reference": reference, "ahead": ahead}
-    return system.trace("wanted velocities", {"state": state}, inputs, factors.pivot)
+    wanted = system.trace("wanted velocities", {"state": state}, inputs, factors.pivot, often=False)
+    return wanted, moving
 
 
 def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:

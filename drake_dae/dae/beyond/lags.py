@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from math import comb
 
+import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
@@ -55,10 +56,10 @@ class Lags:
                 slopes[j - 1, degree - i] = rate**j * (-1) ** (j - i) * comb(j, i)
         return cls(rate, degree, found[:size, :size], found[:size, size], slopes)
 
-    def after(self, lags: FloatArray, signal: FloatArray) -> FloatArray:
-        """s at the next sample, shape (n + 1, k), where it was `lags` and d is of shape (k,)."""
-        return np.asarray(self.step @ lags + np.outer(self.gain, signal))
+    def after(self, lags: ca.SX, signal: ca.SX) -> ca.SX:
+        """s at the next sample, one column for each, shape (k, n + 1); d is of shape (k, 1)."""
+        return ca.mtimes(lags, self.step.T) + ca.mtimes(signal, self.gain[None, :])
 
-    def derivatives(self, lags: FloatArray) -> FloatArray:
-        """r', ..., r^(n), shape (n, k)."""
-        return np.asarray(self.slopes @ lags)
+    def derivatives(self, lags: ca.SX) -> ca.SX:
+        """r', ..., r^(n), one column for each, shape (k, n)."""
+        return ca.mtimes(lags, self.slopes.T)

@@ -53,8 +53,10 @@ def samples(parts: Parts, context: Context, calls: Mapping[str, Call]) -> dict[s
             "time": np.array([time]),
         }
         if whole is not None:
-            values |= whole_values(whole, whole.start(context), state)
-            values["loop_parameters"] = whole.values(context)
+            at_start, of_blocks = whole.start(context), whole.values(context)
+            held = whole.begun(context.get_time(), *at_start, of_blocks)
+            values |= whole_values(whole, (at_start[0], held), state)
+            values["loop_parameters"] = of_blocks
         for name, call in calls.items():
             # The residual on N* is but round-off.
             values["state"] = near if name == "residual" else state

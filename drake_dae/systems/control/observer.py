@@ -2,27 +2,24 @@
 
 from collections.abc import Sequence
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, EventStatus, State
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import Booleans, FloatArray, numbers, positive
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation, beside, shares
-from drake_dae.dae.beyond.lags import Lags
+from drake_dae.arrays import FloatArray, numbers, positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, not_traced
+from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation, Update
+from drake_dae.systems.control.observer_functions import ObserverFunctions
 from drake_dae.systems.control.observer_rates import Observing
-from drake_dae.trace.functions import TracedFunction
 
-_SHARP = 10.0
-"""Friction here is that of a motion so many times as fast: full from v_s / 10 on."""
+_READ = ("estimated_state", "measured_force", "reference")
 
 
 @checked(ModelError)
@@ -131,79 +128,45 @@ class DisturbanceObserver(ParameterizedSystem):
             raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
         if not control_delay >= 0.0:
             raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
-        self._lag, self._delay = control_lag, control_delay
-        self.observation = found = Observation.of(law.structure)
-        size, names = len(found.rows), list(found.frictions)
-        rates = observing.rate, observing.force_rate or observing.rate
-        self._lags, self._force_lags = (
-            Lags.of(rate, sample_period, max(law.exogenous_degrees)) for rate in rates
+        self._functions = found = ObserverFunctions(
+            law, observing, sample_period, control_lag, control_delay
         )
+        self.observation = observation = found.observation
+        size, names = len(observation.rows), list(observation.frictions)
         self.disturbance_signals = tuple(
-            Signal(f"disturbance of {system.state_signals[i].name}") for i in found.rows
+            Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
         )
         self.friction_signals = tuple(Signal(name) for name in names)
-        self._mu = [system.parameter_slice(name) for name in names]
-        self._contacts = list(found.frictions.values())
-        self._order = self._told(names, law.exogenous_degrees)
-        self._ports = [
-            self.DeclareVectorInputPort("estimated_state", system.num_states),
-            self.DeclareVectorInputPort("control", system.num_controls),
-            self.DeclareVectorInputPort("measured_force", system.num_constraints),
-        ]
-        self._hold = self.DeclareVectorInputPort("hold", 1)
-        self._reference = self.DeclareVectorInputPort("reference", law.layout.reference_size)
-        # r, mu, the derivatives of r, 0, and what r lags behind; then, of the sample before, p, its
-        # rate without inputs, u.
-        start = [system.parameter_values[place] for place in self._mu]
-        count = self._lags.degree * size
-        self._estimate = self.DeclareDiscreteState(
-            np.concatenate([np.zeros(size), *start, np.zeros(count + 1 + count)])
-        )
-        self._before = self.DeclareDiscreteState(np.full(2 * size + system.num_controls, np.nan))
+        self._mu = slice(size, size + len(names))
+        sizes = {
+            "estimated_state": system.num_states,
+            "control": system.num_controls,
+            "measured_force": system.num_constraints,
+            "hold": 1,
+            "reference": law.layout.reference_size,
+        }
+        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
+        start = np.zeros(found.memory.column.numel())
+        for j, name in enumerate(names, size):
+            start[j : j + 1] = system.parameter_values[system.parameter_slice(name)]
+        self._held = self.DeclareDiscreteState(start)
         # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-        sources = {self.discrete_state_ticket(self._estimate)}
-        read = (self._ports[0], self._ports[2], self._reference)
-        self.DeclareVectorOutputPort(
-            "exogenous",
-            len(self._order),
-            weakly(self._calc_exogenous),
-            sources | {self.input_port_ticket(port.get_index()) for port in read},
-        )
-        for name, places_of in (
-            ("disturbance", list(range(size))),
-            ("friction", list(range(size, size + len(names)))),
+        sources = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
+        for name, calc, count, read in (
+            ("exogenous", self._calc_exogenous, found.exogenous.outputs[0].size, _READ),
+            ("disturbance", self._calc_disturbance, size, ()),
+            ("friction", self._calc_friction, len(names), ()),
+            ("hold", self._calc_hold, 1, ("measured_force", "hold")),
         ):
-            calc = weakly(self._copy, places_of)
-            self.DeclareVectorOutputPort(name, len(places_of), calc, sources)
-        ports = (self._ports[2], self._hold)
-        self.DeclareVectorOutputPort(
-            "hold",
-            1,
-            weakly(self._calc_hold),
-            {self.input_port_ticket(port.get_index()) for port in ports},
-        )
+            tickets = {self.input_port_ticket(self._ports[port].get_index()) for port in read}
+            self.DeclareVectorOutputPort(name, count, weakly(calc), sources | tickets)
 
     @property
     def further_signals(self) -> dict[str, Sequence[Signal]]:
         """Name of an output port that a record has -> names and units of its entries."""
         known = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
         return {name: signals for name, signals in known.items() if signals}
-
-    def _told(self, names: Sequence[str], degrees: Sequence[int]) -> list[int]:
-        """Where the estimate has what the port `exogenous` tells."""
-        size = len(self.observation.rows)
-        following = size + len(names)
-        still = following + self._lags.degree * size
-        heads = {DISTURBANCE: list(range(size))}
-        heads |= {name: [size + j] for j, name in enumerate(names)}
-        order, left = list[int](), iter(degrees)
-        for p in self.dae.exogenous.moving:
-            for i, head in enumerate(heads[p.name]):
-                of_d = [following + j * size + i for j in range(self._lags.degree)]
-                known = of_d if p.name == DISTURBANCE else [still] * self._lags.degree
-                order += [head, *known[: next(left)]]
-        return order
 
     def set_friction(self, context: Context, friction: ArrayLike) -> None:
         """Starts the coefficients of friction at values, shape (c,), or a number for all.
@@ -213,126 +176,52 @@ class DisturbanceObserver(ParameterizedSystem):
         """
         self.check_context(context)
         given, most = numbers("friction", friction), self.observing.largest_friction
-        if given.shape not in ((), (len(self._mu),)) or not np.all((given >= 0) & (given <= most)):
+        count = len(self.friction_signals)
+        if given.shape not in ((), (count,)) or not np.all((given >= 0) & (given <= most)):
             raise ModelError(
-                f"friction must be from 0 to {most:g}, a number or shape ({len(self._mu)},), got "
+                f"friction must be from 0 to {most:g}, a number or shape ({count},), got "
                 f"{friction!r}"
             )
-        values = context.get_discrete_state(self._estimate).CopyToVector()
-        size = len(self.observation.rows)
-        values[size : size + len(self._mu)] = given
-        context.SetDiscreteState(self._estimate, values)
+        values = context.get_discrete_state(self._held).CopyToVector()
+        values[self._mu] = given
+        context.SetDiscreteState(self._held, values)
+
+    def _given(self, context: Context, *names: str) -> list[FloatArray]:
+        return [self._ports[name].Eval(context) for name in names]
+
+    def _holds(self, context: Context) -> FloatArray:
+        """What the input port `hold` has; 0 without a wire."""
+        port = self._ports["hold"]
+        return np.asarray(port.Eval(context)) if port.HasValue(context) else np.zeros(1)
 
     def _sample(self, context: Context, state: State) -> EventStatus:
-        observation, observing, period = self.observation, self.observing, self.sample_period
-        size = len(observation.rows)
-        x, u, force = (port.Eval(context) for port in self._ports)
-        estimate = context.get_discrete_state(self._estimate).CopyToVector()
-        count = self._lags.degree * size
-        head = size + len(self._mu)
-        r, mu, rates, _, lags = np.split(estimate, [size, head, head + count, head + count + 1])
-        chain = np.vstack([lags.reshape(-1, size), r])
-        parameters = self._parameters(context, 0.0 * mu)
-        before = context.get_discrete_state(self._before).CopyToVector()
-        p_0, rate_0, u_0 = np.split(before, [size, 2 * size])
-        is_first = np.isnan(p_0[0])
-        acted = u if is_first else self._lag * u_0 + (1.0 - self._lag) * u
-        p, rate, inputs = self._run(observation.momentum, context, x, acted, force, parameters)
-        rubbing, speeds = self._friction(context, self._faster(x), force, parameters)
-        is_slow, is_lost = speeds < _SHARP * observing.least_speed, self._is_lost(force)
-        found = self._run(observation.directions, context, x, force, parameters)
-        metric, free, planes = (one.reshape((size, -1), order="F").copy() for one in found)
-        if not is_first:
-            d = (p - p_0) / period - (rate_0 + rate) / 2.0 - inputs - rubbing @ mu
-            steps = [one.after(chain, d) - chain for one in (self._lags, self._force_lags)]
-            sticks = is_slow & ~is_lost
-            if sticks.any():
-                held = planes[:, np.repeat(sticks, size)]
-                steps = [beside(held, metric, step.T).T for step in steps]
-            fast, slow = steps
-            chain += slow + (fast - slow) @ free.T
-        if mu.size and not self._is_limited(context):
-            is_sure = ~(is_slow | is_lost)
-            part = -np.expm1(-observing.friction_rate * period) * shares(rubbing, metric, chain[-1])
-            change = np.clip(mu + is_sure * part, 0.0, observing.largest_friction) - mu
-            mu += change
-            chain -= rubbing @ change
-        lags[:], r[:] = chain[:-1].ravel(), chain[-1]
-        moves = chain @ free.T
-        told = self._lags.derivatives(moves) + self._force_lags.derivatives(chain - moves)
-        rates[:] = told.ravel()
-        discrete = state.get_mutable_discrete_state()
-        discrete.set_value(self._estimate, estimate)
-        discrete.set_value(self._before, np.concatenate([p, rate, u]))
+        x, u, force = self._given(context, "estimated_state", "control", "measured_force")
+        held = context.get_discrete_state(self._held).value()
+        given = held, u, force, self._holds(context)
+        found = self._checked(self._functions.sample, context, x, *given)[0]
+        state.get_mutable_discrete_state().set_value(self._held, found)
         return EventStatus.Succeeded()
 
-    def _parameters(self, context: Context, friction: FloatArray) -> FloatArray:
-        """The model's parameters with other coefficients of friction."""
-        parameters = context.get_numeric_parameter(0).CopyToVector()
-        for place, value in zip(self._mu, friction, strict=True):
-            parameters[place] = value
-        return parameters
+    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
+        x, force = self._given(context, "estimated_state", "measured_force")
+        held, port = context.get_discrete_state(self._held).value(), self._ports["reference"]
+        if port.HasValue(context):
+            reference = port.Eval(context)
+        else:
+            (reference,) = self._checked(self.observation.moving, context, x)
+        function = self._functions.exogenous
+        output.SetFromVector(self._checked(function, context, x, held, force, reference)[0])
 
-    def _friction(
-        self, context: Context, state: FloatArray, force: FloatArray, parameters: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The friction of coefficients of 1 in a state, and the speeds of sliding."""
-        forces, speeds = self._run(self.observation.friction, context, state, force, parameters)
-        return forces.reshape(len(self.observation.rows), -1).copy(), speeds.copy()
+    def _calc_disturbance(self, context: Context, output: BasicVector) -> None:
+        held = context.get_discrete_state(self._held).value()
+        output.SetFromVector(held[: self._mu.start])
 
-    def _faster(self, state: FloatArray) -> FloatArray:
-        """The state in a motion that is so fast that friction is full."""
-        found, rows = state.copy(), list(self.observation.rows)
-        found[rows] *= _SHARP
-        return found
-
-    def _wanted(self, context: Context, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The state with the velocities that the reference wants, as far as it is told."""
-        function = self.observation.wanted
-        if function is None or not self._reference.HasValue(context):
-            return state
-        wanted, delay = self._reference.Eval(context), np.array([self._delay])
-        return self._run(function, context, state, wanted, delay, parameters)[0]
-
-    def _run(
-        self, function: TracedFunction, context: Context, state: FloatArray, *inputs: FloatArray
-    ) -> tuple[FloatArray, ...]:
-        """The values of a function.
-
-        Raises:
-            SingularityError, NonFiniteError: There are none, at this time and state.
-        """
-        values = function.evaluate(state, *inputs)
-        if function.is_valid:
-            return values
-        time, found = context.get_time(), function.failure()
-        raise simulation_error(found, time, state.copy(), self._signals)
-
-    def _is_limited(self, context: Context) -> bool:
-        return bool(self._hold.HasValue(context) and self._hold.Eval(context).any())
-
-    def _is_lost(self, force: FloatArray) -> Booleans:
-        return np.asarray(force[self._contacts] < self.observing.least_force)
+    def _calc_friction(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._held).value()[self._mu])
 
     def _calc_hold(self, context: Context, output: BasicVector) -> None:
-        is_lost = bool(self._is_lost(self._ports[2].Eval(context)).any())
-        output.SetFromVector([float(is_lost or self._is_limited(context))])
-
-    def _calc_exogenous(self, context: Context, output: BasicVector) -> None:
-        values = context.get_discrete_state(self._estimate).CopyToVector()
-        size = len(self.observation.rows)
-        r, mu, _ = np.split(values, [size, size + len(self._mu)])
-        if mu.any():
-            x, force = self._ports[0].Eval(context), self._ports[2].Eval(context)
-            parameters = self._parameters(context, mu)
-            own, _ = self._friction(context, x, force, parameters)
-            goal = self._faster(self._wanted(context, x, parameters))
-            wanted, _ = self._friction(context, goal, force, parameters)
-            r += (wanted - own) @ mu
-        output.SetFromVector(values[self._order])
-
-    def _copy(self, places: list[int], context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._estimate).value()[places])
+        (force,) = self._given(context, "measured_force")
+        output.SetFromVector(self._functions.hold.evaluate(force, self._holds(context))[0])
 
     def _formulas(self) -> dict[str, Formula]:
         raise ModelError(
@@ -341,4 +230,31 @@ class DisturbanceObserver(ParameterizedSystem):
         )
 
     def traced(self) -> Block:
-        raise not_traced("an observer of disturbances")
+        functions, memory = self._functions, self._functions.memory
+        read = ("estimated_state", HELD)
+        told = (*read, "measured_force", "reference", PARAMETERS)
+        sampled = (*read, "control", "measured_force", "hold", PARAMETERS)
+        parts = [memory.disturbance, memory.friction]
+        shown = ca.Function("shown", [memory.column], parts)
+        moving = ("estimated_state", PARAMETERS)
+        return Block(
+            self,
+            (
+                Computation.of(functions.exogenous, told, ("exogenous",)),
+                Computation.of(functions.hold, ("measured_force", "hold"), ("hold",)),
+                Computation(shown, (HELD,), ("disturbance", "friction")),
+            ),
+            (
+                Update(
+                    Computation.of(functions.sample, sampled, (HELD,)),
+                    self.sample_period,
+                    is_unrestricted=True,
+                ),
+            ),
+            unwired={
+                "hold": Computation(ca.Function("none", [], [ca.SX.zeros(1)]), (), ("hold",)),
+                "reference": Computation.of(self.observation.moving, moving, ("reference",)),
+            },
+            signals=self._signals,
+            ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
+        )

@@ -2,6 +2,7 @@
 
 from math import factorial
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -14,10 +15,10 @@ TIMES = PERIOD * np.arange(1, 200)
 
 def run(lags, signal):
     """r, r', ... at the samples after a signal began that is held between them."""
-    state, rows = np.zeros((lags.degree + 1, 1)), []
+    state, rows = ca.DM.zeros(1, lags.degree + 1), []
     for value in signal:
-        state = lags.after(state, np.array([value]))
-        rows.append(np.concatenate([state[-1], lags.derivatives(state)[:, 0]]))
+        state = lags.after(state, ca.DM(value))
+        rows.append(ca.horzcat(state[-1], lags.derivatives(state)).full()[0])
     return np.array(rows).T
 
 
@@ -49,6 +50,6 @@ def test_ramp_is_followed_late_with_its_slope():
 
 def test_derivatives_stay_where_all_lags_change_alike():
     lags = Lags.of(RATE, PERIOD, 2)
-    state = np.array([[1.0], [2.0], [4.0]])
+    state = ca.DM([[1.0, 2.0, 4.0]])
     assert_allclose(lags.derivatives(state), lags.derivatives(state - 0.7), atol=1e-12)
     assert_allclose(lags.derivatives(state)[0], RATE * (state[1] - state[2]))

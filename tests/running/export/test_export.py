@@ -236,6 +236,19 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert "file: File exists" in capsys.readouterr().err
 
 
+@needs_compiler
+def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
+    """Law, limits and observer are in the update of the loop, so that nothing is left out."""
+    words = ["observer={rate: 20.0}", "sampling={period: 0.002}", "saturation=true"]
+    words.append("force=!MeasuredForce {sample_period: 0.002}")
+    settings = [word for each in words for word in ("--set", each)]
+    assert main(["export", "two_link_wall", *settings, "--out", str(tmp_path)]) == 0
+    assert "not among them" not in capsys.readouterr().out
+    assert "int two_link_wall_loop_update_0(" in (tmp_path / "two_link_wall.h").read_text()
+    done = outcome(tmp_path, "two_link_wall", "-O0")
+    assert done.returncode == 0, done.stdout
+
+
 def test_the_command_tells_what_a_loop_of_ones_own_lacks(tmp_path, capsys):
     words = ["export", "wall_bounce", "--set", "saturation=true", "--out", str(tmp_path)]
     assert main(words) == 0

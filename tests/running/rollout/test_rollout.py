@@ -475,3 +475,38 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     )
     assert found.failure is None
     assert_equal_records(found.record, wanted, 1e-11)
+
+
+OBSERVED = ["sampling={period: 0.002}", "force=!MeasuredForce {sample_period: 0.002}"]
+
+
+@pytest.mark.slow
+@both
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("two_link_wall", ["constraints.0.friction=0.0", "observer.friction=[wall]"]),
+        ("two_link_wall", ["saturation=true", "integral=[tool.z]", "observer.force_rate=5.0"]),
+        ("two_link_wall", ["encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"]),
+        ("two_link_flexible", ["sampling.delay=0.001"]),
+    ],
+)
+def test_observed_loops_are_those_of_drake(name, settings, compiled):
+    """To 1e-11 of the largest value, as of sampled laws; what is observed moves."""
+    observer = "observer={rate: 20.0}"
+    chosen = scenario(name, "duration=0.2", *OBSERVED, observer, *settings, *fixed())
+    loop, context = build_scenario(chosen)
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_parameter(own, "link1.mass", 13.0)
+    if "friction" in loop.signals:
+        loop.plant.set_parameter(own, "wall.friction", 0.3)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, 0.2, chosen.integrator)
+    assert np.ptp(wanted["disturbance"], axis=0).max() > 1.0
+    seeds = {"force_noise": chosen.force.seed}
+    if chosen.encoders is not None:
+        seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
+    settings = {"config": chosen.integrator, "compiled": compiled, "seeds": [seeds]}
+    (found,) = rollout(loop, start, parameters, grid(0.2, 1e-3), **settings)
+    assert found.failure is None
+    assert_equal_records(found.record, wanted, 1e-11)

@@ -1,5 +1,7 @@
 """The rules of `Traced`, on every block of ours: against Drake, in the same context."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from actuated import actuated
@@ -10,13 +12,17 @@ from pydrake.systems.analysis import Simulator
 
 from drake_dae import (
     DaePlant,
+    DisturbanceObserver,
     ForceSensor,
+    Observing,
     ReferenceGenerator,
+    RobotModel,
     RobotPlant,
     SinusoidReference,
     TrackingController,
     TrackingLaw,
     poles,
+    with_disturbance,
 )
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
@@ -49,6 +55,24 @@ def robot(kind):
     return RobotPlant(found.model, structure=found.structure)
 
 
+def observer(**more):
+    """Of the arm on a wall whose friction is found: contact that sticks, is lost, or neither."""
+    found = arm("two_link")
+    smooth = found.model.constraints[0]
+    wall = replace(smooth, friction=0.2, stiction_tolerance=0.1)
+    model = RobotModel(found.model.links, [wall], found.model.positions, [1.2, -1.6])
+    names = [signal.name for signal in model.links.velocity_signals]
+    dae = with_disturbance(model.dae, names, ["wall.friction"])
+    rates = Observing(20.0, force_rate=30.0, **more)
+    return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), rates, 0.01, 0.5, 0.02)
+
+
+def observer_behind_springs():
+    system = actuated("two_link", "flexible").model.dae
+    dae = with_disturbance(system, [signal.name for signal in system.state_signals[2:4]])
+    return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
+
+
 BLOCKS = {
     "RobotPlant": lambda: robot(None),
     "RobotPlant with springs": lambda: robot("flexible"),
@@ -74,6 +98,12 @@ BLOCKS = {
     "ForceSensor with samples": lambda: ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
+    "DisturbanceObserver": lambda: observer(least_force=1e-3),
+    "DisturbanceObserver of a contact that sticks": lambda: observer(
+        least_speed=1e3, least_force=1e-3
+    ),
+    "DisturbanceObserver of a contact that is lost": lambda: observer(least_force=1e3),
+    "DisturbanceObserver behind springs": observer_behind_springs,
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),
     "StateSensor with differences": lambda: StateSensor(
         4, 2, Encoders(resolution=1e-3, velocity_bandwidth=200.0, position_bias=0.1), 0.01

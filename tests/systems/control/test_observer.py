@@ -307,6 +307,11 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
     assert_allclose(controls[2], controls[1], atol=1e-3)
 
 
+def evaluated(function, *arguments):
+    """The value of an expression of numbers, shape (k,)."""
+    return ca.evalf(function(*map(ca.SX, map(ca.DM, arguments)))).full()[:, 0]
+
+
 def test_sharing_is_by_the_accelerations_that_forces_make():
     """By a square root of W: the least squares of d on the columns, of which two are one."""
     random = np.random.default_rng(0)
@@ -314,14 +319,14 @@ def test_sharing_is_by_the_accelerations_that_forces_make():
     metric, d = root.T @ root, random.standard_normal(4)
     column = random.standard_normal((4, 1))
     wanted = np.linalg.lstsq(root @ column, root @ d, rcond=None)[0]
-    assert_allclose(shares(column, metric, d), wanted, rtol=1e-10)
+    assert_allclose(evaluated(shares, column, metric, d), wanted, rtol=1e-10)
     other = random.standard_normal((4, 1))
     planes = np.hstack([column, other, 2.0 * column])
-    left = beside(planes, metric, d)
+    left = evaluated(beside, planes, metric, d)
     assert_allclose(planes.T @ metric @ left, 0.0, atol=1e-10)
     assert_allclose(np.cross((d - left)[:3], column[:3, 0]) @ other[:3, 0], 0.0, atol=1e-8)
-    assert_allclose(beside(0.0 * planes, metric, d), d)
-    assert_allclose(shares(0.0 * column, metric, d), 0.0)
+    assert_allclose(evaluated(beside, 0.0 * planes, metric, d), d)
+    assert_allclose(evaluated(shares, 0.0 * column, metric, d), 0.0)
 
 
 def test_law_without_a_disturbance_is_that_of_the_system():
