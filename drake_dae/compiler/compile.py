@@ -14,9 +14,12 @@ from drake_dae.compiler.wires import Wires
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
+    GAPS,
     HELD,
+    MARGINS,
     NOISE,
     PARAMETERS,
+    RATES,
     STATE,
     Block,
     Computation,
@@ -97,7 +100,7 @@ def _compiled(
             fixed.append((system, name, slice(first, first + symbol.numel())))
             columns["parameters"] = ca.vertcat(columns["parameters"], symbol)
     given = [columns[name] for name in (*ARGUMENTS, "noise")]
-    asked: dict[str, tuple[ca.SX, ca.SX]] = {
+    asked: dict[str, Sequence[ca.SX]] = {
         "rate": expressions.checked(
             lambda: [expressions.output(system, DERIVATIVE) for system, _ in places["state"]]
         ),
@@ -105,6 +108,10 @@ def _compiled(
     }
     rates = _rates(expressions, blocks, places["held"])
     asked |= {f"update_{i}": values for i, (_, values, _) in enumerate(rates)}
+    guarded = [block for block in blocks.values() if block.guard is not None]
+    guards = list[Place]()
+    if guarded:
+        asked["guard"], guards = _guards(expressions, guarded)
     return CompiledDiagram(
         wires,
         context,
@@ -119,6 +126,7 @@ def _compiled(
             for key, values, held in rates
         ),
         blocks,
+        tuple(guards),
         expressions,
         columns,
         asked,
@@ -176,6 +184,26 @@ def _rates(
         places = [i for block, _ in members for i in _entries(parts[block.system])]
         found.append((key, expressions.checked(partial(asked, members)), tuple(places)))
     return found
+
+
+def _guards(expressions: Expressions, blocks: Sequence[Block]) -> tuple[list[ca.SX], list[Place]]:
+    """What the guards of blocks compute, validity last, and where the margins of each stand."""
+    columns, places = [ca.SX(0, 1)] * 3, list[Place]()
+
+    def asked() -> list[ca.SX]:
+        for block in blocks:
+            assert block.guard is not None
+            call = expressions.call(block, block.guard.computation)
+            for i, name in enumerate((MARGINS, GAPS, RATES)):
+                value = call.results[call.computation.outputs.index(name)]
+                first = columns[i].numel()
+                columns[i] = ca.vertcat(columns[i], value)
+                if name == MARGINS:
+                    places.append(Place(block.system, slice(first, columns[i].numel())))
+        return []
+
+    _, valid = expressions.checked(asked)
+    return [*columns, valid], places
 
 
 def _entries(part: slice) -> range:

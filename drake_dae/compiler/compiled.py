@@ -61,6 +61,7 @@ class CompiledDiagram:
         fixed: The input ports without a wire whose values are parameters: (system, name, part).
         rates: The updates, one function for each period and offset.
         blocks: The blocks by their systems, in the order of Drake's states.
+        guards: Where the margins of each block stand that changes at moments which a run finds.
     """
 
     wires: Wires
@@ -73,6 +74,7 @@ class CompiledDiagram:
     noise: tuple[Place, ...]
     rates: tuple[Rate, ...]
     blocks: Mapping[System, Block]
+    guards: tuple[Place, ...]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
     _asked: Mapping[str, Sequence[ca.SX]] = field(repr=False)
@@ -101,11 +103,19 @@ class CompiledDiagram:
         return self._function("row", self._asked["row"])
 
     @cached_property
+    def guard(self) -> ca.Function:
+        """(time, state, held, parameters) -> margins, gaps, their rates, and validity.
+
+        See `Guard`; those of all blocks stand below each other. Only where there are guards.
+        """
+        return self._function("guard", self._asked["guard"])
+
+    @cached_property
     def staged(self) -> Mapping[str, ca.Function]:
         """Name -> function, for who computes what the time alone determines once for each time.
 
-        "given" is (time, parameters) -> a column; "rate", "row", "newton" and "update_0", ... are
-        as the functions of the same names, and take this column after the parameters.
+        "given" is (time, parameters) -> a column; "rate", "row", "newton", "update_0", ... and
+        "guard" are as the functions of the same names, and take this column after the parameters.
         """
         functions = {**self._asked, "newton": self._newton(1)}
         column, values, meant = self._expressions.given_column()
@@ -139,6 +149,34 @@ class CompiledDiagram:
             groups = range(own.num_discrete_state_groups())
             held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
         return state, held
+
+    def put(
+        self,
+        context: Context,
+        time: float,
+        state: FloatArray,
+        held: FloatArray,
+        parameters: FloatArray,
+    ) -> None:
+        """Puts into a context of the diagram what its functions take."""
+        context.SetTime(time)
+        for system, part in self.states:
+            system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
+        for system, part in self.held:
+            own, first = system.GetMyMutableContextFromRoot(context), part.start
+            for i in range(own.num_discrete_state_groups()):
+                last = first + own.get_discrete_state(i).size()
+                own.SetDiscreteState(i, held[first:last])
+                first = last
+        for system, part in self.parameters:
+            own, first = system.GetMyMutableContextFromRoot(context), part.start
+            for i in range(own.num_numeric_parameter_groups()):
+                last = first + own.get_numeric_parameter(i).size()
+                own.get_mutable_numeric_parameter(i).SetFromVector(parameters[first:last])
+                first = last
+        for system, name, part in self.fixed:
+            own = system.GetMyMutableContextFromRoot(context)
+            system.GetInputPort(name).FixValue(own, parameters[part])
 
     def begun(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
@@ -230,11 +268,11 @@ class CompiledDiagram:
             projection = self.blocks[system].projection
             if projection is None:
                 continue
-            parameters = self._expressions.parameters(self.blocks[system])
-            start = self._columns["state"][part]
-            x = start
+            block = self.blocks[system]
+            given = self._expressions.parameters(block), self._expressions.source(block, HELD)
+            x = start = self._columns["state"][part]
             for _ in range(count):
-                change = projection.newton(x, start, parameters)[0]
+                change = projection.newton(x, start, *given)
                 x, left_here = x + ca.DM(projection.scale) * change, ca.norm_2(change)
             state[part], left = x, ca.fmax(left, left_here) if left.nnz() else left_here
         return [state, left]

@@ -338,6 +338,8 @@ def needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[Sy
                 expressions.output(system, DERIVATIVE)
             for update in block.updates:
                 expressions.call(block, update.computation)
+            if block.guard is not None:
+                expressions.call(block, block.guard.computation)
             if block.initial is not None:
                 expressions.call(block, block.initial)
     return done

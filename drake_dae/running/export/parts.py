@@ -22,15 +22,14 @@ class Parts:
     Attributes:
         plant, controller: The blocks.
         diagram: The diagram.
-        compiled: Its functions; None where something in it cannot be traced.
-        reason: Why not, in one sentence; "" if it can.
+        compiled: Its functions; None where something in it cannot be traced, or changes at moments
+            that a run has to find.
     """
 
     plant: Any
     controller: Any
     diagram: Diagram
     compiled: CompiledDiagram | None
-    reason: str = ""
 
     def reference(self, context: Context) -> Callable[[float], FloatArray]:
         """R(t) as the controller takes it, in a context of the diagram."""
@@ -58,10 +57,19 @@ def parts_of(loop: ClosedLoop | Diagram) -> Parts:
     """
     if not isinstance(loop, Diagram):
         try:
-            return Parts(loop.plant, loop.controller, loop.diagram, program_of(loop).compiled)
-        except ModelError as error:
-            return Parts(loop.plant, loop.controller, loop.diagram, None, str(error))
+            compiled = program_of(loop).compiled
+        except ModelError:
+            compiled = None
+        if compiled is not None and compiled.guards:
+            compiled = None
+        return Parts(loop.plant, loop.controller, loop.diagram, compiled)
     compiled = compile_diagram(loop)
+    if compiled.guards:
+        names = ", ".join(system.get_name() for system, _ in compiled.guards)
+        raise ModelError(
+            f"'{names}' changes at moments that a run has to find, as where a contact opens: no "
+            "export knows it, and a rollout does"
+        )
     plants = [each for each, block in compiled.blocks.items() if block.check_start is not None]
     laws = [each for each, block in compiled.blocks.items() if block.under is not None]
     if len(plants) != 1 or len(laws) != 1:

@@ -1,5 +1,6 @@
 """A run under way without machine code: where it is, and what is kept of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Self
 
@@ -8,9 +9,8 @@ from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
-from drake_dae.running.rollout.dense import Span, fill
-from drake_dae.running.rollout.fused import Fused
-from drake_dae.running.rollout.many import BLOCK
+from drake_dae.running.rollout.fused import Fused, Seen
+from drake_dae.running.rollout.many import BLOCK, Many
 from drake_dae.running.rollout.run import Ending, Problem, Run
 from drake_dae.systems.blocks.trials import SLOWEST, STEPS
 
@@ -68,6 +68,65 @@ class Rows(NamedTuple):
         return self._replace(times=self.times[:-1], states=self.states[:-1])
 
 
+class Span(NamedTuple):
+    """A step, and the times within it at which the state is wanted.
+
+    Attributes:
+        time, size: When it begins, and how long it is, in s.
+        state, reached: The states at its ends, shape (n,).
+        rates: The derivatives at its stages and at its end, shape (13, n).
+        held: What is held.
+        times: The times in s, shape (k,).
+        found: Where the states are written, shape (k, n).
+    """
+
+    time: float
+    size: float
+    state: FloatArray
+    reached: FloatArray
+    rates: FloatArray
+    held: FloatArray
+    times: FloatArray
+    found: FloatArray
+
+
+def fill(spans: Sequence[Span], rate: Many, parameters: FloatArray) -> None:
+    """Writes the states within steps, by the interpolant of seventh order as SciPy has it.
+
+    Args:
+        spans: The steps.
+        rate: The derivative of the state, as a function of what all functions take.
+        parameters: The parameters.
+    """
+    if not spans:
+        return
+    time, size = (np.array(each)[:, None] for each in list(zip(*spans, strict=True))[:2])
+    state = np.array([span.state for span in spans])
+    held = np.array([span.held for span in spans])
+    rates = np.zeros((16, *state.shape))
+    rates[:13] = np.stack([span.rates for span in spans], axis=1)
+    tables = zip(DOP853.A_EXTRA, DOP853.C_EXTRA, strict=True)
+    for number, (row, part) in enumerate(tables, start=13):
+        stage = state + size * np.tensordot(row[:number], rates[:number], 1)
+        rates[number] = rate(time + part * size, stage, held, parameters)[0]
+    change = np.array([span.reached for span in spans]) - state
+    parts = [
+        change,
+        size * rates[0] - change,
+        2.0 * change - size * (rates[12] + rates[0]),
+        *(size * np.tensordot(DOP853.D, rates, 1)),
+    ]
+    counts = [span.times.size for span in spans]
+    own = np.repeat(np.arange(len(spans)), counts)
+    share = (np.concatenate([span.times for span in spans])[:, None] - time[own]) / size[own]
+    values = np.zeros((own.size, state.shape[1]))
+    for j in reversed(range(len(parts))):
+        values = (values + parts[j][own]) * (1.0 - share if j % 2 else share)
+    found = np.split(values + state[own], np.cumsum(counts)[:-1])
+    for span, states in zip(spans, found, strict=True):
+        span.found[...] = states
+
+
 @dataclass(eq=False)
 class Course:
     """A run under way; see `Run` and `Problem`."""
@@ -84,6 +143,7 @@ class Course:
     before: float = 0.0
     mark: float = 0.0
     next: float = 0.0
+    seen: Seen | None = None
     trial_time: float = np.inf
     trial: FloatArray = field(default_factory=lambda: np.full(1, np.nan))
 
@@ -110,7 +170,7 @@ class Course:
         if left[0] <= REACHED:
             return states[0]
         try:
-            return self.problem.project(time, state)
+            return self.problem.project(time, state, self.held)
         except InconsistentStateError:
             raise Ended(Ending.OFF_MANIFOLD) from None
 
@@ -177,6 +237,23 @@ class Course:
         fill(self.spans, self.fused.rates, self.problem.parameters)
         self.spans.clear()
 
+    def look(self) -> None:
+        """Looks at the guards where a step begins; ends where a block has to react first."""
+        if self.fused.program.compiled.guards:
+            self.seen = self.fused.seen(self.time, self.state, self.held, self.problem.parameters)
+            is_begin = self.problem.has_reacted and self.time == self.problem.times[0]
+            if self.seen.is_due and not is_begin:
+                self.next = self.time
+                raise Ended(Ending.CHANGE)
+
+    def check(self, time: float, state: FloatArray) -> None:
+        """Ends where a step that leads to a state passes a change."""
+        if self.seen is not None:
+            found = self.fused.seen(time, state, self.held, self.problem.parameters)
+            if found.follows_change(self.seen):
+                self.next = time
+                raise Ended(Ending.CHANGE)
+
     def boundary(self) -> float:
         """The next time at which a sample changes what is held, or the last one."""
         end, events = float(self.problem.times[-1]), self.problem.events
@@ -208,6 +285,8 @@ class Course:
             ending,
             self.time,
             self.state,
+            self.held,
+            self.event,
             self.steps,
             self.before,
             self.next,

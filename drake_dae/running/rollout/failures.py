@@ -28,12 +28,15 @@ def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
         problem: What was run.
         run: What it came to.
     """
+    if run.error is not None:
+        return run.error
     name, state = program.name, run.state[program.plant]
-    trial = _reason(program, problem, run.trial_time, run.trial) if run.trial_time else None
+    given = run.held, problem.parameters
+    trial = _reason(program, run.trial_time, run.trial, *given) if run.trial_time else None
     match run.ending:
         case Ending.OFF_MANIFOLD:
             try:
-                problem.project(run.time, run.state)
+                problem.project(run.time, run.state, run.held)
             except InconsistentStateError as error:
                 return off_manifold(run.time, state, error)
         case Ending.SLOW:
@@ -51,14 +54,14 @@ def failure_of(program: Program, problem: Problem, run: Run) -> SimulationError:
                 run.time,
                 state,
             )
-    reason = _reason(program, problem, run.time, run.state) or trial
+    reason = _reason(program, run.time, run.state, *given) or trial
     if reason is not None:
         return reason
     return NonFiniteError(f"{name}: a signal has no value at t = {run.time:.6g} s", run.time, state)
 
 
 def _reason(
-    program: Program, problem: Problem, time: float, state: FloatArray
+    program: Program, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
 ) -> SimulationError | None:
     """What is wrong at a time and state; None if nothing is."""
     if not np.isfinite(state).all():
@@ -68,7 +71,7 @@ def _reason(
         function = call.computation.traced
         if function is None:
             continue
-        given = compiled.arguments_of(call)(time, state, problem.held, problem.parameters)
+        given = compiled.arguments_of(call)(time, state, held, parameters)
         arguments = [
             np.array(each)[:, 0] for each in (given if len(call.arguments) > 1 else [given])
         ]

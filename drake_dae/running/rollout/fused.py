@@ -1,6 +1,7 @@
 """A diagram as functions of CasADi's interpreter: its derivative, its steps, its record."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import isfinite
 
 import casadi as ca
@@ -12,6 +13,7 @@ from drake_dae.compiler.compiled import ARGUMENTS
 from drake_dae.running.rollout.many import Many
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Tableau
+from drake_dae.systems.blocks.dips import TOUCHING, lowest
 
 CHUNK = 64
 """So many fixed steps are one call of CasADi."""
@@ -47,6 +49,33 @@ class Called:
         return self.results
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What the guards of a diagram see at a moment, see `Guard`.
+
+    Attributes:
+        time: In s.
+        margins, gaps, rates: What they compute.
+    """
+
+    time: float
+    margins: FloatArray
+    gaps: FloatArray
+    rates: FloatArray
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a block has to react."""
+        return bool((self.margins <= 0.0).any())
+
+    def follows_change(self, before: "Seen") -> bool:
+        """Whether something happened since another moment, at which it had not."""
+        if ((self.margins <= 0.0) & (before.margins > 0.0)).any():
+            return True
+        given = before.gaps, before.rates, self.gaps, self.rates
+        return bool((lowest(self.time - before.time, *given) < -TOUCHING).any())
+
+
 class Fused:
     """The functions of a diagram, and steps of its state as functions.
 
@@ -71,6 +100,7 @@ class Fused:
         self._called = Called(self._rate)
         self.controlled = Called(self._controlled_step())
         self.rates = Many(self._rate)
+        self._guard = Called(compiled.guard) if compiled.guards else None
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
         """The derivative of the state, a fresh array; nan where it has no value."""
@@ -79,6 +109,16 @@ class Fused:
         if not isfinite(valid[0]):
             values[:] = np.nan
         return values
+
+    def seen(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> Seen:
+        """What the guards see; a diagram without any has none to call."""
+        assert self._guard is not None
+        margins, gaps, rates, valid = self._guard(time, state, held, parameters)
+        # What has no value is no change: the step tells why.
+        found = margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
+        return Seen(time, found, gaps.copy(), rates.copy())
 
     def update(
         self,

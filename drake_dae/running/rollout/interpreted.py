@@ -59,9 +59,11 @@ def _control(course: Course, settings: Settings) -> None:
             rate = None
         if rate is None:
             rate = course.accepted_rate()
+        course.look()
         limit = course.boundary()
         tried = tried or _first_step(course, rate, settings)
         step = _controlled(course, settings, rate, min(tried, settings.longest), limit)
+        course.check(step.end, step.reached)
         stop = min(bisect_left(moments, step.end, row), times.size - 1)
         if row < stop:
             course.write_between(step, times[row:stop])
@@ -183,9 +185,12 @@ class _Steps:
     def _advance(self, course: Course, block: FloatArray) -> int:
         """Takes some steps, and says how many."""
         problem = course.problem
-        step = self._many
-        if len(block) < CHUNK:
+        step, is_guarded = self._many, bool(course.fused.program.compiled.guards)
+        if len(block) < CHUNK or is_guarded:
             step, block = self._one, block[:1]
+        if is_guarded:
+            course.state = course.projected(course.time, course.state)
+            course.look()
         starts, ends, is_row = block.T
         given = (starts[:, None], (ends - starts)[:, None], course.held, problem.parameters)
         states, checks = (
@@ -195,6 +200,7 @@ class _Steps:
         good = np.isfinite(checks[:, 0]) & (checks[:, 1] <= REACHED)
         count = int(np.argmin(np.append(good, False)))
         for end, state in zip(ends[:count].tolist(), states, strict=False):
+            course.check(end, state)
             course.accept(end, state)
         chosen = np.flatnonzero(is_row[:count])
         course.rows.append(Rows(ends[chosen], states[chosen], course.held, False))
@@ -215,6 +221,7 @@ class _Steps:
         course.next = end
         if not np.isfinite(state).all():
             raise Ended(Ending.SPOILT)
+        course.check(end, state)
         course.accept(end, state)
         if is_row:
             course.write(end, state)

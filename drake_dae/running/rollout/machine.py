@@ -13,6 +13,7 @@ from drake_dae.compiler.compiled import Rate
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
+from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
 
 SOURCE = Path(__file__).parent / "stepper.c"
@@ -34,7 +35,10 @@ class _Run(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("begin", "next", "trial")),
         *(
             (name, ctypes.c_longlong)
-            for name in ("row", "event", "steps", "number", "index", "failures", "pending")
+            for name in (
+                *("row", "event", "steps", "number", "index", "failures", "pending"),
+                "reacted",
+            )
         ),
     )
 
@@ -63,7 +67,8 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
         problem: What to run.
         settings: How to step.
     """
-    own = _Run(time=problem.times[0], start=problem.times[0], mark=problem.times[0], pending=_ALL)
+    start = float(problem.times[0])
+    own = _Run(time=start, start=start, mark=start, pending=_ALL, reacted=int(problem.has_reacted))
     state, held = problem.state.copy(), problem.held.copy()
     trial = np.full_like(problem.state, np.nan)
     rows = np.empty((problem.times.size, program.width))
@@ -79,7 +84,7 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
         ending = Ending(step(ctypes.byref(own), *arguments, _argument(BUDGET)))
         if ending is Ending.OFF_MANIFOLD:
             try:
-                state[:] = problem.project(own.time, state)
+                state[:] = problem.project(own.time, state, held)
             except InconsistentStateError:
                 break
             own.pending &= ~_PROJECTION
@@ -89,6 +94,8 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
         ending,
         own.time,
         state,
+        held,
+        own.event,
         own.steps,
         own.before,
         own.next,
@@ -112,11 +119,13 @@ def _source(program: Program) -> str:
         "WIDTH": program.width,
         "GIVEN": calls["given"].numel_out(0),
         "PROJECTS": int(compiled.projects),
+        "MARGINS": compiled.guard.numel_out(0) if compiled.guards else 0,
+        "GAPS": compiled.guard.numel_out(1) if compiled.guards else 0,
     }
     for name, function in calls.items():
         # At least as many as the initializers in stepper.c.
         sizes[f"{name.upper()}_ARG"] = max(6, function.sz_arg())
-        sizes[f"{name.upper()}_RES"] = max(2, function.sz_res())
+        sizes[f"{name.upper()}_RES"] = max(4, function.sz_res())
     tables = {
         "dop_a": DOP853.A,
         "dop_b": DOP853.B,
@@ -131,6 +140,7 @@ def _source(program: Program) -> str:
     for number, rate in enumerate(compiled.rates):
         listed = ", ".join(map(str, [*rate.places, 0]))
         lines.append(f"static const int places_{number}[] = {{{listed}}};")
+    lines.append(f"static const double TOUCHING = {TOUCHING!r};")
     lines += [_table(name, np.asarray(values)) for name, values in tables.items()]
     words = {
         "generated": without_branches(
@@ -138,6 +148,7 @@ def _source(program: Program) -> str:
         ),
         "constants": "\n".join([*lines, ""]),
         "updates": "\n".join(_updated(*item) for item in enumerate(compiled.rates)),
+        "guards": _GUARDS if compiled.guards else "  (void)x, (void)g;",
     }
     return Template(SOURCE.read_text(encoding="utf-8")).substitute(words)
 
@@ -154,6 +165,16 @@ def _updated(number: int, rate: Rate) -> str:
     good &= isfinite(valid) != 0;
     for (i = 0; i < {count}; i++) fresh[places_{number}[i]] = values[i];
   }}"""
+
+
+_GUARDS = """\
+  double valid;
+  const double *arg[GUARD_ARG] = {&time, x, g->held, g->parameters, g->given};
+  double *res[GUARD_RES] = {seen->margins, seen->gaps, seen->rates, &valid};
+  set_time(time, g);
+  dae_guard(arg, res, 0, 0, 0);
+  for (i = 0; !isfinite(valid) && i < MARGINS; i++) seen->margins[i] = INFINITY;"""
+"""How stepper.c computes what the guards see."""
 
 
 def _table(name: str, values: FloatArray) -> str:

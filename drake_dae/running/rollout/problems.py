@@ -110,7 +110,7 @@ def problems_of(
         for part, now, block in _plants(compiled, times[0], start[:size], held, row):
             if block.check_start is not None:
                 block.check_start(start[part], now)
-        project = partial(_project, compiled, lock, held, row)
+        project = partial(_project, compiled, lock, row)
         problems.append(Problem(times, start[:size], held, row, *events, noise[1:], project))
     return problems
 
@@ -134,15 +134,16 @@ def _plants(
 def _project(
     compiled: CompiledDiagram,
     lock: Lock,
-    held: FloatArray,
     row: FloatArray,
     time: float,
     state: FloatArray,
+    held: FloatArray,
 ) -> FloatArray:
     """The state on N* next to one; by one thread at a time."""
-    found = state.copy()
+    found, parts = state.copy(), dict(compiled.held)
     with lock:
         for part, now, block in _plants(compiled, time, state, held, row):
             if block.projection is not None:
-                found[part] = block.projection.project(state[part], now)
+                own = held[parts.get(block.system, slice(0, 0))]
+                found[part] = block.projection.project(state[part], now, own)
     return found

@@ -3,12 +3,12 @@
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.compiler.compile import compile_diagram, with_twins
 from drake_dae.compiler.compiled import CompiledDiagram
@@ -28,7 +28,8 @@ class Program:
     Attributes:
         compiled: Its functions.
         signals: The columns of a row: name -> names and units.
-        complete: A record with what follows from it.
+        complete: A record with what follows from it; and from a context after the run, where
+            blocks reacted to what happened.
         name: What messages call it.
         choice: Whether it becomes machine code, where nobody says otherwise.
         library: Its machine code, if there is any by now.
@@ -36,7 +37,7 @@ class Program:
 
     compiled: CompiledDiagram
     signals: Mapping[str, Sequence[Signal]]
-    complete: Callable[[Record], Record]
+    complete: Callable[[Record, Context | None], Record]
     name: str
     choice: Compiled = "auto"
     library: ctypes.CDLL | None = None
@@ -111,10 +112,20 @@ def program_of(loop: ClosedLoop | Diagram) -> Program:
                 "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
             )
         name = loop.get_name() or "the diagram"
-        return Program(compiled, compiled.signals, lambda record: record, name)
+        return Program(compiled, compiled.signals, lambda record, context: record, name)
     if "program" not in loop.memory:
         compiled = compile_diagram(loop.diagram, list(loop.signals))
         name, choice = loop.plant.get_name(), loop.plant.dae.compiled
-        loop.memory["program"] = Program(compiled, loop.signals, loop.with_errors, name, choice)
+        complete = partial(_completed, loop)
+        loop.memory["program"] = Program(compiled, loop.signals, complete, name, choice)
     found: Program = loop.memory["program"]
     return found
+
+
+def _completed(loop: ClosedLoop, record: Record, context: Context | None) -> Record:
+    """A record of a loop with errors, and with what happened to contacts."""
+    found = loop.with_errors(record, context)
+    if context is None:
+        return found
+    events = loop.plant.events(loop.plant.GetMyContextFromRoot(context))
+    return replace(found, events=tuple(one for one in events if one.time <= found.time[-1]))

@@ -3,18 +3,19 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout import interpreted, machine
+from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.fused import Fused
@@ -43,6 +44,7 @@ class Rollout:
     _program: Program = field(repr=False)
     _times: FloatArray = field(repr=False)
     _rows: FloatArray = field(repr=False)
+    _context: Context | None = field(repr=False)
 
     @cached_property
     def record(self) -> Record:
@@ -54,7 +56,8 @@ class Rollout:
             name: Recorded(part, tuple(columns[name]))
             for name, part in zip(columns, parts, strict=True)
         }
-        return self._program.complete(Record(self._times[: len(self._rows)], signals))
+        record = Record(self._times[: len(self._rows)], signals)
+        return self._program.complete(record, self._context)
 
 
 @checked(ModelError)
@@ -154,17 +157,18 @@ def _runs(
     code: machine.Library | None,
 ) -> list[Run]:
     """What runs come to, by machine code if there is any."""
-    if code is None:
+    if code is None or program.compiled.guards:
         fused = program.kept("fused", lambda: Fused(program))
         run = interpreted.runner(fused, settings)
+    if code is not None:
+        run = partial(machine.run, code, program, settings=settings)
+    if program.compiled.guards:
+        run = partial(run_with_changes, fused, run, settings.tableau)
+    if code is None or len(problems) == 1:
         return [run(problem) for problem in problems]
-    if len(problems) == 1:
-        return [machine.run(code, program, problems[0], settings)]
     # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:
-        return list(
-            pool.map(lambda problem: machine.run(code, program, problem, settings), problems)
-        )
+        return list(pool.map(run, problems))
 
 
 def _machine_code(
@@ -197,6 +201,6 @@ def _machine_code(
 
 def _result(program: Program, problem: Problem, run: Run) -> Rollout:
     failure = None
-    if run.ending not in (Ending.DONE, Ending.PAUSED):
+    if run.ending not in (Ending.DONE, Ending.PAUSED, Ending.STOPPED):
         failure = failure_of(program, problem, run)
-    return Rollout(run.steps, failure, program, problem.times, run.rows)
+    return Rollout(run.steps, failure, program, problem.times, run.rows, run.context)

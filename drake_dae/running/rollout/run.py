@@ -8,10 +8,11 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context
 from scipy.integrate import RK23, RK45
 
 from drake_dae.arrays import FloatArray
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 
 SHARE = 1e-3
 """Of the accuracy that a step may use up: then what is read between long steps is as good."""
@@ -52,7 +53,10 @@ FIXED = {
 
 
 class Ending(IntEnum):
-    """How the stepping ended; stepper.c has the same list."""
+    """How the stepping ended; stepper.c has the same list.
+
+    At a CHANGE a block has to react before it goes on; a run is STOPPED by a block.
+    """
 
     DONE = 0
     PAUSED = 1
@@ -61,6 +65,8 @@ class Ending(IntEnum):
     STUCK = 4
     SPOILT = 5
     SLOW = 6
+    CHANGE = 7
+    STOPPED = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +125,8 @@ class Problem:
         events: When there are updates, in s.
         due: Which rates are due at each of these, as bits.
         noise: The random numbers of each of these, shape (len(events), number of entries).
-        project: (time, state) -> the state on N*; raises InconsistentStateError.
+        project: (time, state, held) -> the state on N*; raises InconsistentStateError.
+        has_reacted: Whether blocks have reacted to how the run begins.
     """
 
     times: FloatArray
@@ -129,7 +136,8 @@ class Problem:
     events: FloatArray
     due: np.ndarray
     noise: FloatArray
-    project: Callable[[float, FloatArray], FloatArray]
+    project: Callable[[float, FloatArray, FloatArray], FloatArray]
+    has_reacted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,19 +148,27 @@ class Run:
         rows: The rows of the record, up to where it came.
         ending: How it ended.
         time: The time of the last accepted state, in s.
-        state: That state.
+        state, held: That state, and what is held.
+        event: How many of the problem's events were made.
         steps: How many steps were accepted.
         mark: The time a thousand steps ago, in s.
-        next: The time that a step led to that was no step, in s.
+        next: The time that a step led to that was no step, in s; at a change that is found before
+            a step, the time of the state.
         trial_time, trial: The earliest trial that failed after it, not finite if none did.
+        context: A context of the diagram after the run, where blocks reacted to what happened.
+        error: What a block raised there.
     """
 
     rows: FloatArray
     ending: Ending
     time: float
     state: FloatArray
+    held: FloatArray
+    event: int
     steps: int
     mark: float
     next: float
     trial_time: float
     trial: FloatArray
+    context: Context | None = None
+    error: SimulationError | None = None

@@ -15,7 +15,7 @@ $constants
 static const double REACHED = 1e-8, NEAR = 1e-5;
 
 /* How a call ended; Python has the same list. */
-enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW };
+enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW, CHANGE };
 
 /* A run, which can be stopped at any step and go on. */
 typedef struct {
@@ -30,6 +30,7 @@ typedef struct {
   long long number, index; /* of fixed steps in this row, and which comes next */
   long long failures;      /* of trials since the accepted state */
   long long pending;       /* what is to come before the next step, as below */
+  long long reacted;       /* whether blocks have reacted to how the run begins */
 } Run;
 
 /* Unrestricted updates, the projection, discrete updates: in this order. */
@@ -101,6 +102,37 @@ static int project(double time, double *x, Given *g) {
     memcpy(at, found, SIZE * sizeof(double));
   }
   return 0;
+}
+
+/* What the guards see at a moment. */
+typedef struct {
+  double time, margins[MARGINS + 1], gaps[GAPS + 1], rates[GAPS + 1];
+} Seen;
+
+/* Whether a block has to react; what has no value is no change. */
+static int look(double time, const double *x, Given *g, Seen *seen) {
+  int i, due = 0;
+  seen->time = time;
+$guards
+  for (i = 0; i < MARGINS; i++) due |= seen->margins[i] <= 0.0;
+  return due;
+}
+
+/* Whether something happened between two moments, by Python's dips.py within. */
+static int changed(const Seen *before, const Seen *now) {
+  double step = now->time - before->time;
+  int i, found = 0;
+  for (i = 0; i < MARGINS; i++) found |= now->margins[i] <= 0.0 && before->margins[i] > 0.0;
+  for (i = 0; i < GAPS; i++) {
+    double b = step * before->rates[i], rise = now->gaps[i] - before->gaps[i], c, d, root, s;
+    if (!(b < 0.0 && now->rates[i] > 0.0 && now->gaps[i] > 0.0)) continue;
+    c = 3.0 * rise - step * (2.0 * before->rates[i] + now->rates[i]);
+    d = step * (before->rates[i] + now->rates[i]) - 2.0 * rise;
+    root = c + sqrt(fmax(c * c - 3.0 * b * d, 0.0));
+    s = root > -b ? -b / root : 0.0;
+    found |= before->gaps[i] + s * (b + s * (c + s * d)) < -TOUCHING;
+  }
+  return found;
 }
 
 /* The updates of one kind that are due, all at once. */
@@ -185,6 +217,7 @@ __attribute__((visibility("default"))) int run_fixed(
     const long long *due, const double *noise, double longest, int stages, const double *a,
     const double *b, const double *c, long long budget) {
   Given g;
+  Seen before, now;
   double k[16][SIZE], reached[SIZE];
   int s, status;
   g.held = held;
@@ -216,11 +249,20 @@ __attribute__((visibility("default"))) int run_fixed(
       end = run->from + (end - run->from) * ((double)run->index / (double)run->number);
     }
     step = end - run->time;
+    if (look(run->time, x, &g, &before) && !run->reacted) {
+      run->next = run->time;
+      return CHANGE;
+    }
+    run->reacted = 0;
     if (!rates(run->time, x, &g, k[0])) return INVALID;
     for (s = 1; s < stages; s++) stage(run, run->time, step, s, a + s * stages, c[s], x, &g, k, trial);
     weigh(step, stages, b, x, k, reached);
     run->next = end;
     if (!is_finite(reached, SIZE)) return SPOILT;
+    if (MARGINS) {
+      look(end, reached, &g, &now);
+      if (changed(&before, &now)) return CHANGE;
+    }
     status = accept(run, end, x, reached);
     if (status != DONE) return status;
   }
@@ -275,6 +317,7 @@ __attribute__((visibility("default"))) int run_controlled(
     const long long *due, const double *noise, double longest, const double *absolute,
     double relative, long long budget) {
   Given g;
+  Seen before, now;
   double k[16][SIZE], reached[SIZE], f[7][SIZE], between[SIZE];
   int i, j, s, status, valid, known = 0, is_on = 0;
   g.held = held;
@@ -301,6 +344,11 @@ __attribute__((visibility("default"))) int run_controlled(
     } else if (!rates(run->time, x, &g, k[0])) {
       return INVALID;
     }
+    if (look(run->time, x, &g, &before) && !run->reacted) {
+      run->next = run->time;
+      return CHANGE;
+    }
+    run->reacted = 0;
     limit = times[num_rows - 1];
     if (run->event < num_events && events[run->event] < limit) limit = events[run->event];
     if (run->step == 0.0) {
@@ -330,6 +378,11 @@ __attribute__((visibility("default"))) int run_controlled(
       }
       rejected = 1;
       size *= valid ? factor : 0.2;
+    }
+    if (MARGINS) {
+      look(limit, reached, &g, &now);
+      run->next = limit;
+      if (changed(&before, &now)) return CHANGE;
     }
     if (times[run->row] <= limit) {
       for (s = 13; s < 16; s++) {

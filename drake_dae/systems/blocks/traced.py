@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import casadi as ca
-from pydrake.systems.framework import System
+from pydrake.systems.framework import Context, EventStatus, State, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
@@ -20,6 +20,9 @@ numbers of deviation 1."""
 DERIVATIVE = "$derivative"
 """The time derivative of a block's continuous state, among its outputs; its next discrete state is
 HELD there."""
+
+MARGINS, GAPS, RATES = "$margins", "$gaps", "$rates"
+"""What a guard computes; see `Guard`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +74,33 @@ class Projection:
     """How a block's state is brought onto a manifold at the start of each step.
 
     Attributes:
-        newton: (state, start, parameters) -> a Newton step in units of `scale`; gradients are
-            those at the start.
+        newton: (state, start, parameters, held) -> a Newton step in units of `scale`; gradients
+            are those at the start.
         scale: The sizes of the states, shape (n,).
-        project: (state, parameters) -> the state on the manifold, where Newton's steps do not
-            reach it; raises InconsistentStateError.
+        project: (state, parameters, held) -> the state on the manifold, where Newton's steps do
+            not reach it; raises InconsistentStateError.
     """
 
     newton: ca.Function
     scale: FloatArray
-    project: Callable[[FloatArray, FloatArray], FloatArray]
+    project: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Guard:
+    """When a block changes its states at a moment that a run has to find, and how.
+
+    Attributes:
+        computation: Its outputs are MARGINS, numbers of which each is positive until the block
+            changes; GAPS, distances that must not fall through zero within a step either, also
+            where they come out again, any number of them; and RATES, their derivatives.
+        react: (context, state) -> the status: what Drake does then. It reads the block's context,
+            and changes a state of the block, which is a copy of the context's. It keeps in the
+            context what a record has of it.
+    """
+
+    computation: Computation
+    react: Callable[[Context, State], EventStatus]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +119,7 @@ class Block:
         scale: The sizes of its continuous states, shape (n,); ones if None.
         unwired: Name of an input port -> what stands there without a wire and without a value.
         moving: The entries of its parameters that come through an input port "exogenous".
+        guard: When and how it changes at moments that a run has to find; None if at none.
         draws: Whether its update takes new random numbers.
         model: What its first parameters are those of, such as a DaeSystem; None for nothing that
             another block has.
@@ -118,6 +139,7 @@ class Block:
     scale: FloatArray | None = None
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
+    guard: Guard | None = None
     draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None
@@ -148,11 +170,13 @@ class Traced(Protocol):
        context, by the time, states, parameters and inputs of that context.
     3. DERIVATIVE is what `CalcTimeDerivatives` gives, and is there if there is continuous state.
     4. Each HELD is what the event of that period does to the discrete state, and there is one for
-       each event that changes it.
+       each periodic event that changes it.
     5. An output depends on an input port in the same instant exactly if its sources lead there:
        Drake's `HasDirectFeedthrough` says the same.
     6. An output that cannot be traced is left out; what nobody can trace raises a ModelError that
        says why, in one sentence.
+    7. What changes its states at other moments than these has a guard, whose margins fall through
+       zero at the moments that Drake's Simulator finds.
     """
 
     def traced(self) -> Block:

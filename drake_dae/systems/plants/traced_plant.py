@@ -1,11 +1,13 @@
 """What the plant of a DaeSystem computes, as traced functions.                  (1)-(3), (25)"""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import casadi as ca
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.systems.blocks.traced import (
@@ -71,7 +73,7 @@ def traced_plant(
     found.append(Computation(same, (STATE,), ("state",)))
     projection = None
     if projects:
-        projection = Projection(manifold.newton_step.function, dae.scale, manifold.project)
+        projection = Projection(newton_of(manifold), dae.scale, partial(_project, manifold))
     return Block(
         plant,
         tuple(found),
@@ -88,3 +90,16 @@ def traced_plant(
         },
         signals=signals,
     )
+
+
+def newton_of(manifold: Manifold) -> ca.Function:
+    """A Newton step to a manifold, as a `Projection` has it, whatever a block holds."""
+    own = manifold.newton_step
+    inputs = [ca.SX.sym(*each) for each in zip(own.input_names, own.sizes, strict=True)]
+    return ca.Function("newton", [*inputs, ca.SX(0, 1)], own.function.call(inputs)[:1])
+
+
+def _project(
+    manifold: Manifold, state: FloatArray, parameters: FloatArray, held: FloatArray
+) -> FloatArray:
+    return manifold.project(state, parameters)

@@ -21,6 +21,7 @@ from drake_dae import (
     SinusoidReference,
     TrackingController,
     TrackingLaw,
+    UnilateralRobotPlant,
     poles,
     with_disturbance,
 )
@@ -53,6 +54,11 @@ def references():
 def robot(kind):
     found = arm("two_link") if kind is None else actuated("two_link", kind)
     return RobotPlant(found.model, structure=found.structure)
+
+
+def opening(kind):
+    found = arm("two_link") if kind is None else actuated("two_link", kind)
+    return UnilateralRobotPlant(found.model, {"wall": 0.5})
 
 
 def observer(**more):
@@ -104,6 +110,8 @@ BLOCKS = {
     ),
     "DisturbanceObserver of a contact that is lost": lambda: observer(least_force=1e3),
     "DisturbanceObserver behind springs": observer_behind_springs,
+    "UnilateralRobotPlant": lambda: opening(None),
+    "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),
     "StateSensor with differences": lambda: StateSensor(
         4, 2, Encoders(resolution=1e-3, velocity_bandwidth=200.0, position_bias=0.1), 0.01
@@ -120,7 +128,11 @@ def in_context(name):
     system = BLOCKS[name]()
     diagram, context = alone(system)
     own = system.GetMyMutableContextFromRoot(context)
-    if isinstance(system, DaePlant):
+    if isinstance(system, UnilateralRobotPlant):
+        mode = context.get_discrete_state(0).CopyToVector()
+        system.set_consistent_state(own, system.structure.states[1])
+        context.SetDiscreteState(np.abs(np.round(mode)))
+    elif isinstance(system, DaePlant):
         state = system.structure.states[1]
         system.set_consistent_state(own, state)
     elif isinstance(system, TrackingController):
@@ -178,7 +190,32 @@ def test_a_block_tells_the_same_each_time_and_all_of_it(name):
     assert (DERIVATIVE in told) == bool(context.num_continuous_states())
     updated = [HELD in update.computation.outputs for update in one.updates]
     assert all(updated)
-    assert bool(updated) == bool(context.num_discrete_state_groups())
+    assert bool(updated or one.guard) == bool(context.num_discrete_state_groups())
+
+
+@pytest.mark.parametrize("kind", [None, "flexible"])
+def test_margins_of_contacts_are_their_forces_and_gaps(kind):
+    """Rule 7: the force of a contact that is closed, the gap of one that is open and approaches."""
+    system = opening(kind)
+    diagram, context = alone(system)
+    own = system.GetMyMutableContextFromRoot(context)
+    state = system.set_consistent_state(own, system.structure.states[1])
+    # The wall is at x = 1.2, and the arm reaches to 2: both joints turn towards it.
+    for mode, given in ((1.0, state), (0.0, [1.2, -1.6, -0.5, 0.5, *state[4:]])):
+        system.set_state(own, given)
+        context.SetDiscreteState(np.array([mode]))
+        compiled = compile_diagram(diagram, context=context)
+        values = compiled.values(context)
+        found = compiled.guard(0.0, *compiled.start(context), values)
+        margin, gap, rate, valid = map(float, found)
+        assert np.isfinite(valid)
+        if mode:
+            force = system.GetOutputPort("constraint_force").Eval(own)
+            np.testing.assert_allclose(max(margin, 0.0), force[0], rtol=1e-12)
+            assert rate == 0.0
+        else:
+            assert rate < 0.0
+            np.testing.assert_allclose([margin, gap], system.gaps(own)[0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("name", BLOCKS)

@@ -92,7 +92,8 @@ class UnilateralContacts:
         gaps: A function of state and parameters: phi of each contact, and phi'.
         rates: The rates of all constraints, shape (m, 1), and `drift`, that part of their
             derivatives which exogenous signals make.
-        residual: phi_i, phi_i' of each, or what restricts velocities alone.
+        residual: phi_i, phi_i' of each, or what restricts velocities alone; `sizes` are the
+            numbers of its entries.
 
     Raises:
         ModelError: There is no such constraint, or it is none that can only push.
@@ -152,7 +153,7 @@ class UnilateralContacts:
             for i in range(dae.num_constraints)
         ]
         self.residual = ca.vertcat(ca.SX(0, 1), *holds)
-        self._sizes = [held.numel() for held in holds]
+        self.sizes = [held.numel() for held in holds]
         found = {"gap": dae.k[self.normals], "rate": self.rates[self.normals]}
         self.gaps = dae.trace("gaps", found)
         positions, velocities = links.q.numel(), links.v.numel()
@@ -208,7 +209,7 @@ class UnilateralContacts:
         rows = np.ones(self.dae.num_constraints)
         for touch, shut in zip(self.touches, closed, strict=True):
             rows[touch.rows] = shut
-        return np.repeat(rows, self._sizes)
+        return np.repeat(rows, self.sizes)
 
     def terms(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> Terms:
         """The numbers at a state; nan where a function has no value."""

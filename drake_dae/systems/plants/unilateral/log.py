@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.systems.blocks.dips import TOUCHING, lowest
 from drake_dae.systems.plants.contact_events import ContactEvent
-from drake_dae.systems.plants.unilateral.resets import TOUCHING
 
 MARGIN = 1e-13
 """How far below zero, in m/s, the rate of a contact that begins to leave is still round-off."""
@@ -53,14 +53,6 @@ def clearance(log: Log, time: float, gaps: FloatArray, rates: FloatArray) -> Flo
         return found
     pierced = gaps < np.minimum(log.gaps, 0.0) - TOUCHING
     found[pierced] = gaps[pierced]
-    for i in np.flatnonzero((log.rates < 0.0) & (rates > 0.0) & (gaps > 0.0)):
-        step, rise = time - log.time, gaps[i] - log.gaps[i]
-        b = step * log.rates[i]
-        c = 3.0 * rise - step * (2.0 * log.rates[i] + rates[i])
-        d = step * (log.rates[i] + rates[i]) - 2.0 * rise
-        root = c + np.sqrt(max(c * c - 3.0 * b * d, 0.0))
-        if root > -b:  # Not where all that is but round-off.
-            s = -b / root  # There b + 2 c s + 3 d s^2 = 0, and it rises.
-            lowest = log.gaps[i] + s * (b + s * (c + s * d))
-            found[i] = lowest if lowest < -TOUCHING else found[i]
+    dips = lowest(time - log.time, log.gaps, log.rates, gaps, rates)
+    found[dips < -TOUCHING] = dips[dips < -TOUCHING]
     return found

@@ -23,15 +23,17 @@ from drake_dae.errors import (
     SimulationError,
 )
 from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.blocks.failures import off_manifold
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, not_traced
+from drake_dae.systems.blocks.traced import Block, Guard
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.graph import ContactGraph
 from drake_dae.systems.plants.unilateral.log import Log, clearance
 from drake_dae.systems.plants.unilateral.modes import Closed, closed_of, numbers_of
 from drake_dae.systems.plants.unilateral.ports import ModalPorts
-from drake_dae.systems.plants.unilateral.resets import TOUCHING, Resets
+from drake_dae.systems.plants.unilateral.resets import Resets
+from drake_dae.systems.plants.unilateral.traced import TracedContacts
 
 
 @checked(ModelError)
@@ -198,24 +200,7 @@ class UnilateralRobotPlant(ModalPorts):
                 self.state(context),
             )
         x, values = self.state(context), self._values(context)
-        kept = self.modes((False,) * len(self.contacts), x).structure.manifold
-        if not kept.is_consistent(x, values):
-            residual = kept.residual(x, values)
-            worst = int(np.argmax(np.abs(residual)))
-            signal = kept.residual_signals[worst]
-            raise InconsistentStateError(
-                f"{self.dae.name}: the start state is not on the constraints that stay: "
-                f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
-                residual,
-            )
-        gaps = self.gaps(context)
-        deepest = int(np.argmin(gaps))
-        if gaps[deepest] < -TOUCHING:
-            raise InconsistentStateError(
-                f"{self.dae.name}: the start state is {-gaps[deepest]:.3g} m inside the surface of "
-                f"'{self.contacts[deepest]}'; start outside",
-                gaps,
-            )
+        self._check(x, values)
         log = self._log(context)
         if np.isnan(self._control(context)).any():
             # What is held between samples comes with this event: the first step begins with it.
@@ -232,6 +217,28 @@ class UnilateralRobotPlant(ModalPorts):
             if event.time < now or event.kind is not ContactChange.CLOSING
         ]
         return status
+
+    def _check(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a state where no run may start, by the parameters that its system has."""
+        values = parameters[: self.dae.parameter_symbol.numel()]
+        kept = self.modes((False,) * len(self.contacts), state).structure.manifold
+        if not kept.is_consistent(state, values):
+            residual = kept.residual(state, values)
+            worst = int(np.argmax(np.abs(residual)))
+            signal = kept.residual_signals[worst]
+            raise InconsistentStateError(
+                f"{self.dae.name}: the start state is not on the constraints that stay: "
+                f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
+                residual,
+            )
+        gaps = self._contacts.gaps.evaluate(state, values)[0].copy()
+        deepest = int(np.argmin(gaps))
+        if gaps[deepest] < -TOUCHING:
+            raise InconsistentStateError(
+                f"{self.dae.name}: the start state is {-gaps[deepest]:.3g} m inside the surface of "
+                f"'{self.contacts[deepest]}'; start outside",
+                gaps,
+            )
 
     def _advance(self, context: Context, state: State) -> EventStatus:
         log = self._log(context)
@@ -272,8 +279,32 @@ class UnilateralRobotPlant(ModalPorts):
         self._begin_step(context, after.state, values)
         return EventStatus.Succeeded()
 
+    def _react(self, context: Context, state: State) -> EventStatus:
+        self._log(context).time = context.get_time()
+        return self._reset(context, state)
+
     def traced(self) -> Block:
-        raise not_traced("a plant whose contacts open and close")
+        traced, dae = TracedContacts(self._contacts, self.modes, self._residual), self.dae
+        return Block(
+            self,
+            traced.computations(self._ports),
+            check_start=self._check,
+            projection=traced.projection(),
+            scale=dae.scale,
+            moving=tuple(self.exogenous_places),
+            guard=Guard(traced.guard(), self._react),
+            signals=self._signals,
+            ports={
+                "state": tuple(dae.state_signals),
+                "mode": self.mode_signals,
+                "gap": self.gap_signals,
+                "constraint_force": tuple(dae.force_signals),
+                "constraint_residual": tuple(self.structure.manifold.residual_signals),
+                "controlled_output": tuple(dae.output_signals),
+                "constraint_wrenches": tuple(self.wrench_signals),
+                **{name: tuple(own) for name, own in self._ports.loop_signals.items()},
+            },
+        )
 
 
 def _no_events() -> AbstractValue:

@@ -8,6 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.contacts import Jam
 from drake_dae.errors import SimulationError
+from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.contacts import Terms, UnilateralContacts
 from drake_dae.systems.plants.unilateral.frictional import impact
@@ -20,9 +21,6 @@ from drake_dae.systems.plants.unilateral.impacts import (
     stopping,
 )
 from drake_dae.systems.plants.unilateral.modes import Closed, Modes
-
-TOUCHING = 1e-11
-"""A gap below this, in m, is none: such contacts touch at once."""
 
 SLOW = 1e-11
 """A rate below this, in m/s, is none."""

@@ -1,0 +1,201 @@
+"""Runs in which blocks change at moments that are found: contacts that open, phases of a task."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from threading import Lock
+
+import numpy as np
+from pydrake.systems.framework import Context, EventStatus
+from scipy.integrate import DOP853
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import SimulationError
+from drake_dae.running.rollout.fused import Fused
+from drake_dae.running.rollout.run import Ending, Problem, Run, Tableau
+from drake_dae.systems.blocks.trials import SLOWEST
+
+WINDOW = 1e-13
+"""A moment is found to within this time, in s."""
+
+MOST = 1000
+"""So many changes that hardly lead on end a run."""
+
+_LOCK = Lock()
+"""Runs find and make changes one at a time: functions have one place for what they compute."""
+
+_CONTROLLED = Tableau(DOP853.A[:12, :12], DOP853.B, DOP853.C[:12])
+
+
+@dataclass(eq=False)
+class _Changes:
+    """A run in pieces, from change to change; see `run_with_changes`."""
+
+    fused: Fused
+    problem: Problem
+    tableau: Tableau
+    is_controlled: bool
+    context: Context = field(init=False)
+
+    def begin(self) -> tuple[Run, Problem | None]:
+        """A run without steps, and how it goes on after what blocks do when it begins, if it does.
+
+        Raises:
+            InconsistentStateError: No run may start there.
+        """
+        compiled, problem = self.fused.program.compiled, self.problem
+        self.context = compiled.diagram.CreateDefaultContext()
+        # Plants that need the moments of changes ask whether they are sought.
+        self.context.SetAccuracy(WINDOW)
+        given = problem.state, problem.held, problem.parameters
+        compiled.put(self.context, problem.times[0], *given)
+        start, nowhere = float(problem.times[0]), np.full_like(problem.state, np.nan)
+        counts, none = (
+            (0, 0, start, start, np.inf, nowhere),
+            np.zeros((0, self.fused.program.width)),
+        )
+        begun = Run(none, Ending.DONE, start, problem.state, problem.held, *counts)
+        try:
+            compiled.diagram.ExecuteInitializationEvents(self.context)
+        except SimulationError as error:
+            return replace(begun, ending=Ending.STUCK, error=error), None
+        state, held = compiled.start(self.context)
+        return begun, replace(problem, state=state, held=held)
+
+    def make(self, run: Run, piece: Problem) -> tuple[Run, Problem | None]:
+        """What a run comes to with the change that ended it, and how it goes on, if it does.
+
+        The rows are those between the last step and the change.
+        """
+        moment, state = run.time, run.state
+        if run.next > run.time:
+            moment, state = self.located(run)
+        # At the moment of the change a record has what was before.
+        times = self.problem.times
+        rows = self.rows(run, times[(times > run.time) & (times <= moment)])
+        left = times[times > moment]
+        try:
+            state, held, goes_on = self.react(moment, state, run.held)
+        except SimulationError as error:
+            failed = replace(run, rows=rows, ending=Ending.STUCK, time=moment, state=state)
+            return replace(failed, error=error), None
+        ending = Ending.DONE if goes_on else Ending.STOPPED
+        after = replace(run, rows=rows, ending=ending, time=moment, state=state, held=held)
+        if not (goes_on and left.size):
+            return after, None
+        return after, replace(
+            piece,
+            times=np.concatenate([[moment], left]),
+            state=state,
+            held=held,
+            events=piece.events[run.event :],
+            due=piece.due[run.event :],
+            noise=piece.noise[run.event :],
+            has_reacted=run.next == run.time,
+        )
+
+    def ended(self, run: Run) -> Context:
+        """A context of the diagram at the end of a run."""
+        given = run.time, run.state, run.held, self.problem.parameters
+        self.fused.program.compiled.put(self.context, *given)
+        return self.context
+
+    def react(
+        self, time: float, state: FloatArray, held: FloatArray
+    ) -> tuple[FloatArray, FloatArray, bool]:
+        """State and what is held after blocks reacted, and whether the run goes on."""
+        compiled, parameters = self.fused.program.compiled, self.problem.parameters
+        margins = self.fused.seen(time, state, held, parameters).margins
+        due = [system for system, part in compiled.guards if (margins[part] <= 0.0).any()]
+        goes_on = True
+        compiled.put(self.context, time, state, held, parameters)
+        after = self.context.Clone()
+        for system in due or [system for system, _ in compiled.guards]:
+            guard = compiled.blocks[system].guard
+            assert guard is not None
+            own = system.GetMyContextFromRoot(self.context)
+            changed = system.GetMyMutableContextFromRoot(after).get_mutable_state()
+            status = guard.react(own, changed)
+            goes_on &= status.severity() != EventStatus.Severity.kReachedTermination
+        self.context.SetTimeStateAndParametersFrom(after)
+        return *compiled.start(self.context), goes_on
+
+    def reached(self, run: Run, end: float) -> FloatArray:
+        """The state at a time within the step that a run did not take."""
+        a, b, c = self.tableau
+        step, rates = end - run.time, list[FloatArray]()
+        given = run.held, self.problem.parameters
+        for row, part in zip(a, c, strict=True):
+            change = sum((w * rate for w, rate in zip(row, rates, strict=False) if w), 0.0)
+            rates.append(self.fused.rate(run.time + part * step, run.state + step * change, *given))
+        found: FloatArray = run.state + step * (b @ np.array(rates))
+        return found
+
+    def rows(self, run: Run, times: FloatArray) -> FloatArray:
+        """Rows of the record at times within the step that a run did not take."""
+        if not times.size:
+            return np.zeros((0, self.fused.program.width))
+        states = np.array([self.reached(run, time) for time in times.tolist()])
+        if self.is_controlled:
+            for time, state in zip(times.tolist(), states, strict=True):
+                state[:] = self.problem.project(time, state, run.held)
+        held = np.tile(run.held, (times.size, 1))
+        return self.fused.rows(times, states, held, self.problem.parameters)[0]
+
+    def located(self, run: Run) -> tuple[float, FloatArray]:
+        """When the change is that lies within a step, and the state just after it."""
+        given = run.held, self.problem.parameters
+        before = self.fused.seen(run.time, run.state, *given)
+        first, last = run.time, run.next
+        state = self.reached(run, last)
+        while last - first > WINDOW:
+            middle = 0.5 * (first + last)
+            if middle in (first, last):
+                break
+            tried = self.reached(run, middle)
+            if self.fused.seen(middle, tried, *given).follows_change(before):
+                last, state = middle, tried
+            else:
+                first = middle
+        return last, state
+
+
+def run_with_changes(
+    fused: Fused, take: Callable[[Problem], Run], tableau: Tableau | None, problem: Problem
+) -> Run:
+    """A run in which blocks react, as Drake's Simulator lets them.
+
+    Between changes it is one of those without. Where a step passes a change, the moment is found by
+    steps that end earlier, and the blocks do in a context of Drake's what they do there.
+
+    Args:
+        fused: The diagram.
+        take: What runs up to a change.
+        tableau: The method of fixed steps; None for error control.
+        problem: The run.
+
+    Raises:
+        InconsistentStateError: No run may start there.
+    """
+    changes = _Changes(fused, problem, tableau or _CONTROLLED, tableau is None)
+    with _LOCK:
+        run, piece = changes.begin()
+    rows, steps, count, mark = [run.rows], 0, 0, run.time
+    while piece is not None:
+        run = take(piece)
+        steps += run.steps
+        # A piece begins with a row; after a change that is none of the record's.
+        rows.append(run.rows[min(count, 1) :])
+        if run.ending is not Ending.CHANGE:
+            break
+        with _LOCK:
+            run, piece = changes.make(run, piece)
+        rows.append(run.rows)
+        count += 1
+        if count % MOST == 0 and piece is not None:
+            if run.time - mark < SLOWEST * (run.time - problem.times[0]):
+                run = replace(run, ending=Ending.SLOW, mark=mark)
+                break
+            mark = run.time
+    with _LOCK:
+        context = changes.ended(run)
+    return replace(run, rows=np.concatenate(rows), steps=steps, context=context)

@@ -1,0 +1,220 @@
+"""Rollouts of blocks that change at moments which a run finds, against Drake's Simulator."""
+
+import shutil
+
+import numpy as np
+import pytest
+from falling import ball, box, planar_box, rocking_block, standing_on_right
+from painleve import rod, sliding
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+from runs import run, scenario
+
+from drake_dae import (
+    Plane,
+    PointOnSurface,
+    UnilateralRobotPlant,
+    build_scenario,
+    rollout,
+    simulate,
+    start_values,
+)
+from drake_dae.errors import InconsistentStateError, JammedContactError, ModelError, SimulationError
+
+with_compiler = pytest.param(
+    True, marks=pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+)
+both = pytest.mark.parametrize("compiled", [False, with_compiler])
+
+FIXED = (
+    "use_error_control=false",
+    "integration_scheme=runge_kutta3",
+    "max_step_size=1e-3",
+    "accuracy=1e-10",
+)
+ACCURATE = ("accuracy=1e-11", "integration_scheme=runge_kutta5")
+
+
+def settings_of(words):
+    return ["compiled=false", *(f"integrator.{word}" for word in words)]
+
+
+def fixed(step=0.01):
+    """Steps whose events Drake finds to within 1e-13 s, a hundredth of the accuracy in steps."""
+    return SimulatorConfig(
+        integration_scheme="runge_kutta5",
+        max_step_size=step,
+        use_error_control=False,
+        accuracy=1e-9,
+    )
+
+
+def assert_same_events(found, wanted, tolerance):
+    assert [one.kind for one in found] == [one.kind for one in wanted]
+    assert [one.closed for one in found] == [one.closed for one in wanted]
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one.time, other.time, rtol=0.0, atol=tolerance)
+        np.testing.assert_allclose(one.impulses, other.impulses, rtol=1e-9, atol=1e-9)
+
+
+def assert_same_records(found, wanted, tolerance, before):
+    """To the tolerance; before the first change that is found, with fixed steps, to `before`.
+
+    At the moment of a change itself two runs may be on either side of it.
+    """
+    assert list(found.signals) == list(wanted.signals)
+    assert found.time.size == wanted.time.size
+    times = np.array([event.time for event in wanted.events])
+    away = np.abs(wanted.time[:, None] - times).min(axis=1) > 1e-9
+    first = wanted.time < times[0] - 1e-9
+    for name, recorded in wanted.signals.items():
+        scale = max(1.0, np.max(np.abs(recorded.values), initial=0.0))
+        off = np.abs(found[name] - recorded.values).max(axis=1) / scale
+        assert off[away].max() < tolerance, name
+        assert off[first].max(initial=0.0) < before, name
+
+
+@pytest.mark.slow
+@both
+@pytest.mark.parametrize(
+    ("words", "settings", "duration"),
+    [
+        (FIXED, [], 3.6),
+        (ACCURATE, [], 3.6),
+        (FIXED, ["sampling={period: 0.004, delay: 0.001}"], 3.302),
+        (FIXED, ["constraints.0.friction=0.4", "sampling={period: 0.003}"], 3.301),
+        (FIXED, ["actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 0.5}]"], 3.3),
+    ],
+)
+def test_a_contact_opens_strikes_and_rests_as_in_drake(words, settings, duration, compiled):
+    """To 1e-9; before the first change that is found to 1e-11 with equal steps, as sampled laws."""
+    chosen = scenario("wall_bounce", f"duration={duration}", *settings, *settings_of(words))
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    wanted = run(loop, context, duration, chosen.integrator)
+    (found,) = rollout(
+        loop, start, parameters, wanted.time, config=chosen.integrator, compiled=compiled
+    )
+    assert found.failure is None
+    assert len(wanted.events) > 1
+    assert_same_events(found.record.events, wanted.events, 1e-9)
+    before = 1e-11 if words is FIXED else 1e-9
+    assert_same_records(found.record, wanted, 1e-9, before)
+
+
+def alone(plant):
+    """A plant without controls in a diagram, and its context."""
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    for name in ("state", "mode", "gap", "constraint_force"):
+        builder.ExportOutput(plant.GetOutputPort(name), name)
+    diagram = builder.Build()
+    return diagram, diagram.CreateDefaultContext()
+
+
+FALLING = {
+    "a ball that bounces": (lambda: ball(0.6), [0.5, -1.0], 1.5),
+    "a box that lands on two feet": (
+        lambda: box({"left": 0.3, "right": 0.3}, driven=False),
+        [0.0, 0.7, 0.1, 0.2, 0.0, 0.0],
+        0.7,
+    ),
+    "a block that rocks": (rocking_block, standing_on_right(0.2), 3.0),
+}
+
+
+@both
+@pytest.mark.parametrize("name", FALLING)
+def test_bodies_fall_as_in_drake(name, compiled):
+    """To 1e-9 at the end, of a plant without a law and without a loop."""
+    make, state, duration = FALLING[name]
+    plant = make()
+    diagram, context = alone(plant)
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), np.array(state))
+    start, parameters = start_values(diagram, context)
+    times = np.linspace(0.0, duration, 101)
+    (found,) = rollout(
+        diagram, start, parameters, times, config=fixed(duration / 100), compiled=compiled
+    )
+    assert found.failure is None
+    simulate(diagram, context, duration, fixed(duration / 100))
+    own = plant.GetMyContextFromRoot(context)
+    assert len(plant.events(own)) > 1
+    for port in ("state", "mode", "gap"):
+        wanted = plant.GetOutputPort(port).Eval(own)
+        np.testing.assert_allclose(found.record[port][-1], wanted, rtol=0.0, atol=1e-9)
+
+
+def test_what_dips_below_the_floor_within_a_step_is_found():
+    """A ball that is thrown at the floor from 1 mm, with steps of 0.3 s."""
+    plant = ball(1.0)
+    diagram, context = alone(plant)
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), np.array([0.001, -1.0]))
+    start, parameters = start_values(diagram, context)
+    times = np.linspace(0.0, 0.3, 2)
+    for compiled in (False, True) if shutil.which("cc") else (False,):
+        (found,) = rollout(diagram, start, parameters, times, config=fixed(0.3), compiled=compiled)
+        # It returns to the floor with the speed that it left it with.
+        energy = 9.81 * 0.001 + 0.5
+        z, v = found.record["state"][-1]
+        assert z > 0.0
+        np.testing.assert_allclose(9.81 * z + v * v / 2.0, energy, rtol=1e-9)
+
+
+@both
+def test_runs_of_many_starts_are_those_of_one_each(compiled):
+    plant = ball(0.5)
+    diagram, context = alone(plant)
+    start, parameters = start_values(diagram, context)
+    starts = np.tile(start, (5, 1))
+    starts[:, 0] = np.linspace(0.1, 0.5, 5)
+    times = np.linspace(0.0, 0.5, 51)
+    settings = {"config": fixed(), "compiled": compiled}
+    many = rollout(diagram, starts, parameters, times, **settings)
+    for begun, run_of_it in zip(starts, many, strict=True):
+        (one,) = rollout(diagram, begun, parameters, times, **settings)
+        np.testing.assert_array_equal(one.record["state"], run_of_it.record["state"])
+
+
+def test_a_start_inside_and_too_many_contacts_are_refused():
+    plant = ball(0.5)
+    diagram, context = alone(plant)
+    start, parameters = start_values(diagram, context)
+    start[0] = -0.1
+    with pytest.raises(InconsistentStateError, match="inside the surface"):
+        rollout(diagram, start, parameters, [0.0, 0.1])
+    floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    feet = [
+        PointOnSurface("box", floor, (x, 0.0, -0.5), name=f"foot {i}")
+        for i, x in enumerate((-0.2, -0.1, 0.1, 0.2))
+    ]
+    model = planar_box(feet, driven=False)
+    many = UnilateralRobotPlant(model, {foot.name: 0.0 for foot in feet})
+    with pytest.raises(ModelError, match="more than 3 contacts that open and close cannot be"):
+        rollout(alone(many)[0], start, parameters, [0.0, 0.1])
+
+
+def test_what_a_block_raises_ends_the_run_with_its_record():
+    """A rod that jams cannot start; one that lands so fails there, as in Drake."""
+    plant = UnilateralRobotPlant(rod(1.5, 1.1), {"floor": 0.0})
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
+    still = builder.AddSystem(ConstantVectorSource(np.zeros(3)))
+    builder.Connect(still.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), sliding(1.1))
+    (found,) = rollout(diagram, *start_values(diagram, context), [0.0, 0.1])
+    assert isinstance(found.failure, JammedContactError)
+    assert found.record.time.size == 0
+    above = sliding(1.1) + np.eye(6)[1] * 0.05
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), above)
+    given = *start_values(diagram, context), np.linspace(0.0, 0.5, 51)
+    (found,) = rollout(diagram, *given, config=fixed())
+    with pytest.raises(SimulationError) as raised:
+        simulate(diagram, context, 0.5, fixed())
+    assert type(found.failure) is type(raised.value)
+    assert found.failure.time == pytest.approx(raised.value.time, abs=1e-6)
+    assert found.failure.time - 0.01 < found.record.time[-1] <= found.failure.time
