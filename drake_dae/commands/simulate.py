@@ -168,14 +168,12 @@ def _roll(run: _Run) -> RunStatistics:
     """
     from drake_dae.scenario.rolled import roll_scenario
 
-    if run.loop.generator is None:
-        raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
     with ending_signals(ending := Ending()):
         found = roll_scenario(
             run.scenario, run.loop, run.context, stop=lambda: ending.signal is not None
         )
-    run.record = found.record
+    run.record, run.context = found.record, found.context or run.context
     if found.failure is not None:
         raise found.failure
     times, wall = run.record.time, time.perf_counter() - began

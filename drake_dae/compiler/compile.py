@@ -9,8 +9,8 @@ from pydrake.systems.framework import Context, Diagram, System
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram, Place, Rate, dense_function
-from drake_dae.compiler.trace import Expressions, needed_systems
-from drake_dae.compiler.wires import Wires
+from drake_dae.compiler.trace import Expressions
+from drake_dae.compiler.wires import Port, Wires
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
@@ -87,7 +87,7 @@ def _compiled(
     context = context or diagram.CreateDefaultContext()
     expressions = Expressions(wires, context, twins, is_short)
     chosen = [wires.outputs[name] for name in outputs]
-    needed_systems(expressions, chosen)
+    _needed_systems(expressions, chosen)
     blocks = {each: expressions.used[each] for each in wires.systems if each in expressions.used}
     columns, places = {"time": expressions.time}, {}
     own = {"state": STATE, "held": HELD, "parameters": PARAMETERS, "noise": NOISE}
@@ -131,6 +131,35 @@ def _compiled(
         columns,
         asked,
     )
+
+
+def _needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[System]:
+    """The systems that some output ports depend on, by way of states too, all of them traced.
+
+    Raises:
+        ModelError: One cannot be traced.
+    """
+    for port in outputs:
+        expressions.port(port)
+    done: list[System] = []
+    while len(done) < len(expressions.used):
+        for system, block in list(expressions.used.items()):
+            if system in done:
+                continue
+            done.append(system)
+            if _has_state(block):
+                expressions.output(system, DERIVATIVE)
+            for update in block.updates:
+                expressions.call(block, update.computation)
+            if block.guard is not None:
+                expressions.call(block, block.guard.computation)
+            if block.initial is not None:
+                expressions.call(block, block.initial)
+    return done
+
+
+def _has_state(block: Block) -> bool:
+    return any(DERIVATIVE in one.outputs for one in block.computations)
 
 
 def _refuse(wires: Wires) -> None:

@@ -34,6 +34,7 @@ class Call:
         needed: The calls that the arguments need.
         is_given: Whether it needs the time and parameters alone. Its results are then symbols of
             their own, so that they can be computed once for all that happens at a time.
+        gate: What is finite if that is of use which its computation chooses, see `Computation`.
     """
 
     block: Block
@@ -42,6 +43,7 @@ class Call:
     results: tuple[ca.SX, ...]
     needed: tuple["Call", ...]
     is_given: bool
+    gate: ca.SX
 
     @property
     def valid(self) -> ca.SX:
@@ -49,7 +51,7 @@ class Call:
         if self.computation.traced is not None:
             return self.results[-1]
         made = [result for result in self.results if not result.is_valid_input()]
-        return ca.sum1(ca.vertcat(ca.SX(0), *made))
+        return ca.sum1(ca.vertcat(self.gate, *made))
 
 
 class Expressions:
@@ -146,15 +148,29 @@ class Expressions:
             )
         self._open.append(key)
         self._needed.append({})
-        arguments = [self.source(block, name) for name in computation.sources]
+        chosen: dict[str, ca.SX] = {}
+        arguments = []
+        for name in computation.sources:
+            if computation.choice is not None and name in computation.choice[1:]:
+                self._needed.append({})
+                arguments.append(self.source(block, name))
+                inner = self._needed.pop().values()
+                chosen[name] = sum((one.valid for one in inner), ca.SX(0))
+            else:
+                arguments.append(self.source(block, name))
         self._open.pop()
         needed = tuple(self._needed.pop().values())
+        gate = ca.SX(0)
+        if computation.choice is not None:
+            flag, one, other = computation.choice
+            is_one = arguments[computation.sources.index(flag)] > 0.5
+            gate = ca.if_else(is_one, chosen[one], chosen[other])
         results = computation.function.call(arguments)
         is_given = not {STATE, HELD, NOISE} & set(computation.sources)
-        is_given = is_given and all(one.is_given for one in needed)
+        is_given = is_given and not chosen and all(one.is_given for one in needed)
         if is_given:
             results = [self._named(result) for result in results]
-        found = Call(block, computation, tuple(arguments), tuple(results), needed, is_given)
+        found = Call(block, computation, tuple(arguments), tuple(results), needed, is_given, gate)
         self._found[key] = found
         self.calls.append(found)
         self._note(found)
@@ -318,32 +334,3 @@ class Expressions:
             return sum(context.get_numeric_parameter(i).size() for i in range(count))
         count = context.num_discrete_state_groups()
         return sum(context.get_discrete_state(i).size() for i in range(count))
-
-
-def needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[System]:
-    """The systems that some output ports depend on, by way of states too, all of them traced.
-
-    Raises:
-        ModelError: One cannot be traced.
-    """
-    for port in outputs:
-        expressions.port(port)
-    done: list[System] = []
-    while len(done) < len(expressions.used):
-        for system, block in list(expressions.used.items()):
-            if system in done:
-                continue
-            done.append(system)
-            if _has_state(block):
-                expressions.output(system, DERIVATIVE)
-            for update in block.updates:
-                expressions.call(block, update.computation)
-            if block.guard is not None:
-                expressions.call(block, block.guard.computation)
-            if block.initial is not None:
-                expressions.call(block, block.initial)
-    return done
-
-
-def _has_state(block: Block) -> bool:
-    return any(DERIVATIVE in one.outputs for one in block.computations)

@@ -126,9 +126,17 @@ def test_what_knows_no_tasks_says_so(file, tmp_path, capsys):
     assert "task: exports know `references` alone" in capsys.readouterr().err
 
 
-def test_a_rollout_of_a_task_is_refused_in_its_words(file, tmp_path, capsys):
-    assert main(["simulate", str(file), "--rollout", "--out", str(tmp_path / "run")]) == 1
-    assert "a rollout does not know tasks" in capsys.readouterr().err
+@pytest.mark.slow
+def test_a_rollout_of_a_task_tells_its_phases(file, tmp_path, capsys):
+    told = []
+    for number, more in enumerate(([], ["--rollout"])):
+        words = ["--set", "integrator.accuracy=1e-9", "--out", str(tmp_path / f"run {number}")]
+        assert main(["simulate", str(file), *words, *more]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        (first,) = [i for i, line in enumerate(lines) if line.startswith("0 s: Approach")]
+        told.append([line.split(";")[0] for line in lines[first : first + 4]])
+    assert told[0] == told[1]
+    assert ": done, after" in told[1][-1]
 
 
 def test_a_task_that_begins_in_contact_starts_on_it(file):

@@ -37,6 +37,8 @@ class Rollout:
     Attributes:
         steps: How many steps it took.
         failure: Why it could not go on, with time and state; None if it came to its end.
+        context: The diagram's context after the run, where blocks changed at moments that were
+            found: contacts, and the phases of a task. None where there are no such blocks.
     """
 
     steps: int
@@ -44,7 +46,7 @@ class Rollout:
     _program: Program = field(repr=False)
     _times: FloatArray = field(repr=False)
     _rows: FloatArray = field(repr=False)
-    _context: Context | None = field(repr=False)
+    context: Context | None = field(default=None, repr=False)
 
     @cached_property
     def record(self) -> Record:
@@ -57,7 +59,7 @@ class Rollout:
             for name, part in zip(columns, parts, strict=True)
         }
         record = Record(self._times[: len(self._rows)], signals)
-        return self._program.complete(record, self._context)
+        return self._program.complete(record, self.context)
 
 
 @checked(ModelError)

@@ -37,12 +37,15 @@ class Computation:
             other computations of the block have among their sources. "" is of no interest.
         traced: The same function, whose last result is finite where its values are of use, and
             which can say why they are not; None if it has values wherever its arguments have.
+        choice: (flag, one, other), three of the sources: only one has to be of use where the flag
+            is above 1 / 2, else only the other. None where all have to.
     """
 
     function: ca.Function
     sources: tuple[str, ...]
     outputs: tuple[str, ...]
     traced: TracedFunction | None = None
+    choice: tuple[str, str, str] | None = None
 
     @classmethod
     def of(

@@ -228,22 +228,34 @@ class ReferenceGenerator(DifferentiableSystem):
 
     def traced(self) -> Block:
         time = ca.SX.sym("t")
-        rows, left = [ca.SX(0, 1)], list(self.degrees)
-        for reference in self.references:
-            own, left = left[: reference.size], left[reference.size :]
-            row = reference.expression(own, time)
-            if row is None:
-                raise ModelError(
-                    f"a {type(reference).__name__} is no expression of time, and a rollout needs "
-                    "one: take an ExpressionReference, PointToPointReference or "
-                    "SinusoidReference, or run the loop by simulate"
-                )
-            rows.append(row)
-        function = TracedFunction("reference", {"time": time}, {"R": ca.vertcat(*rows)})
+        rows = traced_references(self.references, self.degrees, time)
+        function = TracedFunction("reference", {"time": time}, {"R": rows})
         return Block(self, (Computation.of(function, (TIME,), ("reference",)),))
 
     def _formulas(self) -> dict[str, Formula]:
         return {"reference": _ReferenceFormula(self.references, self.degrees)}
+
+
+def traced_references(
+    references: Sequence[Reference], degrees: Sequence[int], time: ca.SX
+) -> ca.SX:
+    """R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1).
+
+    Raises:
+        ModelError: One is no expression of time.
+    """
+    rows, left = [ca.SX(0, 1)], list(degrees)
+    for reference in references:
+        own, left = left[: reference.size], left[reference.size :]
+        row = reference.expression(own, time)
+        if row is None:
+            raise ModelError(
+                f"a {type(reference).__name__} is no expression of time, and a rollout needs one: "
+                "take an ExpressionReference, PointToPointReference or SinusoidReference, or run "
+                "the loop by simulate"
+            )
+        rows.append(row)
+    return ca.vertcat(*rows)
 
 
 class _ReferenceFormula:

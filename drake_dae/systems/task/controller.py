@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, PortSwitch
+from pydrake.systems.primitives import MatrixGain
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
@@ -17,7 +17,6 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.systems.control.contract import Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
@@ -27,6 +26,7 @@ from drake_dae.systems.task.planner import CONTACT, FREE
 from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import Segment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
+from drake_dae.systems.task.switch import LawSwitch
 from drake_dae.systems.task.task import Task
 from drake_dae.trace.functions import TracedFunction
 
@@ -127,10 +127,9 @@ class TaskController(Diagram, Controller):
         )
         builder.ExportInput(self.supervisor.GetInputPort("estimated_state"), "estimated_state")
         builder.ExportInput(self.supervisor.GetInputPort("measured_force"), "measured_force")
-        switch = builder.AddSystem(PortSwitch(law.system.num_controls))
-        builder.Connect(
-            self.supervisor.GetOutputPort("chosen_law"), switch.get_port_selector_input_port()
-        )
+        switch = builder.AddSystem(LawSwitch(law.system.num_controls))
+        in_contact = self.supervisor.GetOutputPort("free_hold")
+        builder.Connect(in_contact, switch.GetInputPort("in_contact"))
         added = []
         for which, name, own in ((FREE, "free", free_law), (CONTACT, "contact", law)):
             controller = builder.AddSystem(TrackingController(own, sample_period=sample_period))
@@ -149,12 +148,10 @@ class TaskController(Diagram, Controller):
                 builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
                 shown = "integral" if which == CONTACT else "free_integral"
                 builder.ExportOutput(controller.GetOutputPort("integral"), shown)
-            passed = switch.DeclareInputPort(name)
-            assert int(passed.get_index()) == which + 1  # The first port chooses.
-            builder.Connect(controller.GetOutputPort("control"), passed)
+            builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(name))
             added.append(controller)
         self.free_controller, self.controller = added
-        builder.ExportOutput(switch.get_output_port(), "control")
+        builder.ExportOutput(switch.GetOutputPort("control"), "control")
         for name in ("phase", "desired_output"):
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)
@@ -317,6 +314,3 @@ class TaskController(Diagram, Controller):
         known = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
         at_supervisor = self.GetMutableSubsystemContext(self.supervisor, context)
         at_supervisor.get_mutable_numeric_parameter(0).SetFromVector(known)
-
-    def traced(self) -> Block:
-        raise not_traced("a task")

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import ClassVar, Literal
 
+import casadi as ca
+
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.references import Reference
@@ -23,7 +25,7 @@ _NOTHING: Reaction | None = None
 
 @dataclass(frozen=True)
 class Moment:
-    """What the guards of a phase see.
+    """What the guards of a phase see: numbers, or expressions of CasADi.
 
     Attributes:
         time: Since the phase began, in s.
@@ -92,7 +94,7 @@ class Phase(ABC):
 
     @abstractmethod
     def margin(self, now: Moment, contact_force: float) -> float:
-        """A number that is positive until the phase is over.
+        """A number that is positive until the phase is over, or an expression, as `now` has.
 
         Args:
             now: What is measured.
@@ -172,7 +174,9 @@ class Press(Phase):
         return {contact_output: self.force}
 
     def margin(self, now: Moment, contact_force: float) -> float:
-        return max(self.over - now.time, abs(now.force - now.wanted) - self.tolerance)
+        off = abs(now.force - now.wanted)
+        found: float = ca.fmax(self.over - now.time, off - self.tolerance)
+        return found
 
     def awaited(self, contact_force: float) -> str:
         return f"a force within {self.tolerance:g} N of its reference"
@@ -283,7 +287,9 @@ class Retreat(Phase):
         return {contact_output: self.distance}
 
     def margin(self, now: Moment, contact_force: float) -> float:
-        return max(self.over - now.time, abs(now.distance - self.distance) - self.tolerance)
+        off = abs(now.distance - self.distance)
+        found: float = ca.fmax(self.over - now.time, off - self.tolerance)
+        return found
 
     def awaited(self, contact_force: float) -> str:
         return f"a distance within {self.tolerance:g} m of {self.distance:g} m"

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ConstantReference, stack_references
+from drake_dae.dae.references import ConstantReference, Reference, stack_references
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
@@ -27,10 +27,12 @@ class Goals:
     Attributes:
         function: R in s after its begin, zero for outputs that it does not name.
         named: Which outputs it names.
+        references: The same as references of all outputs, in their order.
     """
 
     function: Callable[[float], FloatArray]
     named: tuple[int, ...]
+    references: tuple[Reference, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,10 @@ class Planner:
         laws: The law of the free robot and that in contact.
         place: Which output is the distance of the first, and the force of the second.
 
+    Attributes:
+        goals: What each phase wants.
+        distance_function: (x, parameters) -> the distance and its derivative, by the model.
+
     Raises:
         ModelError: A phase has a reference that does not fit its law.
     """
@@ -63,15 +69,15 @@ class Planner:
     def __init__(self, task: Task, laws: tuple[TrackingLaw, TrackingLaw], place: int) -> None:
         self._task, self._laws, self._place = task, laws, place
         pairs = enumerate(task.contacts[:-1])
-        self._goals = [_goals(task, index, laws[contact], place) for index, contact in pairs]
+        self.goals = [_goals(task, index, laws[contact], place) for index, contact in pairs]
         self._nothing = [_no_goals(law) for law in laws]
         free = laws[FREE]
         distance = ca.vertcat(*free.structure.output_chains[place][:2])
-        self._distance = free.system.trace("distance", {"value": distance})
+        self.distance_function = free.system.trace("distance", {"value": distance})
 
     def distance(self, now: Now) -> tuple[float, float]:
         """The distance and its derivative, by the model."""
-        distance, rate = self._distance.evaluate(now.state, now.parameters)[0]
+        distance, rate = self.distance_function.evaluate(now.state, now.parameters)[0]
         return float(distance), float(rate)
 
     def first(self, now: Now) -> Segment:
@@ -122,7 +128,7 @@ class Planner:
         rate, over, goals = np.zeros(len(law.degrees)), phases[-1].over, self._nothing[contact]
         if place < len(phases):
             rate[self._place] = -phases[place].speed_of_approach
-            over, goals = phases[place].over, self._goals[place]
+            over, goals = phases[place].over, self.goals[place]
         change = PhaseChange(
             time=float(now.time),
             phase=name,
@@ -180,7 +186,8 @@ def _goals(task: Task, index: int, law: TrackingLaw, place: int) -> Goals:
     rest = [name for i, name in enumerate(names) if i not in named]
     found += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
-        return Goals(stack_references(in_order(found, names), degrees), named)
+        references = tuple(in_order(found, names))
+        return Goals(stack_references(references, degrees), named, references)
     except ReferenceSignalError as error:
         raise ModelError(f"phase {index + 1} of the task, {phase.name}: {error}") from error
 

@@ -98,11 +98,13 @@ class Progress(Immutable):
         segments: All that began; none before a run.
         step: When the step began that is being made, in s.
         felt: When the contact was felt last, in s.
+        is_felt: Whether it has been felt since then.
     """
 
     segments: tuple[Segment, ...] = ()
     step: float = -inf
     felt: float = -inf
+    is_felt: bool = False
 
     @property
     def changes(self) -> tuple[PhaseChange, ...]:

@@ -1,6 +1,7 @@
 """What leads through the phases of a task: guards, changes and references."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -8,7 +9,6 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     EventStatus,
-    InputPortIndex,
     LeafSystem,
     State,
     UnrestrictedUpdateEvent,
@@ -17,13 +17,16 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.systems.blocks.traced import Block, Guard, not_traced
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.task import Task
+from drake_dae.systems.task.traced import TracedTask
 
 
 class TaskSupervisor(LeafSystem):
@@ -35,7 +38,6 @@ class TaskSupervisor(LeafSystem):
 
     Output ports:
         contact_reference, free_reference: R of the law that acts, zero for the other one.
-        chosen_law: Which input of a `PortSwitch` passes.
         phase: The place of the phase, shape (1,); the number of phases when done or held.
         desired_output: The positions, the force and the distance that are wanted, shape (p + 1,);
             zero for the one of the last two that is none now.
@@ -63,14 +65,17 @@ class TaskSupervisor(LeafSystem):
     ) -> None:
         super().__init__()
         self.set_name("task")
+        self._sample_period = sample_period
         self.task, self._laws, self._place, self._force = task, laws, place, force
-        self._plan = Planner(task, laws, place)
+        self._plan = plan = Planner(task, laws, place)
+        self._traced = TracedTask(task, laws, place, force, plan, num_forces)
         self._state_port = self.DeclareVectorInputPort(
             "estimated_state", laws[FREE].system.num_states
         )
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
         self.DeclareNumericParameter(BasicVector(laws[FREE].system.parameter_values))
         self._index = self.DeclareAbstractState(AbstractValue.Make(Progress()))
+        self.DeclareDiscreteState(self._traced.size)
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
         self._witnesses: list[WitnessFunction] = []
         if sample_period > 0.0:
@@ -106,12 +111,6 @@ class TaskSupervisor(LeafSystem):
         self.DeclareVectorOutputPort("free_hold", 1, weakly(self._calc_free_hold), by_state)
         felt.add(self.time_ticket())
         self.DeclareVectorOutputPort("contact_hold", 1, weakly(self._calc_contact_hold), felt)
-        self.DeclareAbstractOutputPort(
-            "chosen_law",
-            lambda: AbstractValue.Make(InputPortIndex(1 + FREE)),
-            weakly(self._calc_chosen),
-            by_state,
-        )
 
     def progress(self, context: Context) -> Progress:
         """How far the task is, in a context of this system."""
@@ -150,15 +149,19 @@ class TaskSupervisor(LeafSystem):
     def _margins(
         self, context: Context, progress: Progress, segment: Segment
     ) -> tuple[Moment, FloatArray]:
-        """What is seen, and how far the phase is from its end, from a lost contact, from late."""
+        """What is seen, and how far the phase is from its end, from a lost contact, from late.
+
+        Last comes how far the contact is from being felt, or from being felt no more.
+        """
         task, place = self.task, segment.change.place
         moment = self._moment(context, segment)
         phase = task.phases[place]
-        lost = np.inf
-        if phase.if_lost and segment.change.in_contact and moment.force < task.contact_force:
+        excess, lost = moment.force - task.contact_force, np.inf
+        if phase.if_lost and segment.change.in_contact and not progress.is_felt:
             lost = task.patience - (context.get_time() - progress.felt)
         end = phase.margin(moment, task.contact_force)
-        return moment, np.array([end, lost, phase.within - moment.time])
+        felt = excess if progress.is_felt else -excess
+        return moment, np.array([end, lost, phase.within - moment.time, felt])
 
     def _guard(self, context: Context) -> float:
         """Positive while the phase goes on: Drake seeks where that ends."""
@@ -178,6 +181,13 @@ class TaskSupervisor(LeafSystem):
         if self.progress(context).segments:
             return EventStatus.DidNothing()  # A run that goes on.
         time = context.get_time()
+        if context.get_discrete_state_vector().value().any():
+            raise SimulationError(
+                f"{self.get_name()}: a task begins when its run does: what it did before is not "
+                "among the numbers of a start",
+                time,
+                self._state_port.Eval(context).copy(),
+            )
         self._put(state, Progress((self._segment(context),), time, time))
         return EventStatus.Succeeded()
 
@@ -192,17 +202,18 @@ class TaskSupervisor(LeafSystem):
         if self._is_over(segment):
             return EventStatus.DidNothing()
         moment, margins = self._margins(context, progress, segment)
-        is_felt = moment.force >= self.task.contact_force
         status, found = EventStatus.Succeeded(), progress.segments
-        if np.any(margins <= 0.0):
+        if np.any(margins[:-1] <= 0.0):
             following, status = self._changed(context, segment, moment, margins)
             found = (*found, following)
-        felt = time if is_felt else progress.felt
-        self._put(state, replace(progress, segments=found, step=time, felt=felt))
+        known: dict[str, Any] = {"felt": time} if progress.is_felt else {}
+        is_felt = moment.force > self.task.contact_force
+        self._put(state, replace(progress, segments=found, step=time, is_felt=is_felt, **known))
         return status
 
     def _put(self, state: State, progress: Progress) -> None:
         state.get_mutable_abstract_state().get_mutable_value(int(self._index)).set_value(progress)
+        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress))
 
     def _changed(
         self, context: Context, segment: Segment, moment: Moment, margins: FloatArray
@@ -261,10 +272,17 @@ class TaskSupervisor(LeafSystem):
         force = self._force_port.Eval(context)[self._force]
         is_open = not begin.in_contact or force < self.task.contact_force
         # The force of an impact is no error to be integrated.
-        touched = len(segments) > 1 and not segments[-2].change.in_contact
-        settles = touched and context.get_time() < begin.time + segments[-1].over
+        settles = (
+            self._traced.touched(segments) and context.get_time() < begin.time + segments[-1].over
+        )
         output.SetFromVector([float(is_open or settles)])
 
-    def _calc_chosen(self, context: Context, value: AbstractValue) -> None:
-        contact = self._segment(context).change.in_contact
-        value.set_value(InputPortIndex(1 + (CONTACT if contact else FREE)))
+    def traced(self) -> Block:
+        if self._sample_period:
+            raise not_traced("a task whose guards are looked at in samples")
+        return Block(
+            self,
+            self._traced.computations(),
+            guard=Guard(self._traced.guard(), self._advance),
+            ports={"phase": (Signal("phase"),)},
+        )

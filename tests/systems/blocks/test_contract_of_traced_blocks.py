@@ -31,6 +31,7 @@ from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
+from drake_dae.systems.task.switch import LawSwitch
 
 
 def measured_law(integral, gain=0.5):
@@ -102,6 +103,7 @@ BLOCKS = {
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
     "ForceSensor with a lag": lambda: ForceSensor(2, 0.01, bias=0.1),
     "ForceSensor with samples": lambda: ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
+    "LawSwitch": lambda: LawSwitch(2),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
     "DisturbanceObserver": lambda: observer(least_force=1e-3),

@@ -1,0 +1,183 @@
+"""What a task computes, as traced functions of the numbers of its present segment."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.errors import ModelError
+from drake_dae.systems.blocks.traced import (
+    GAPS,
+    HELD,
+    MARGINS,
+    PARAMETERS,
+    RATES,
+    TIME,
+    Computation,
+)
+from drake_dae.systems.control.references import traced_references
+from drake_dae.systems.task.phases import Moment
+from drake_dae.systems.task.planner import CONTACT, FREE, Planner
+from drake_dae.systems.task.progress import Progress, Segment
+from drake_dae.systems.task.task import Task
+from drake_dae.trace.functions import TracedFunction
+
+NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt")
+"""Which numbers a context holds of a task, before base, rate and fade of its present segment."""
+
+
+class TracedTask:
+    """The functions of a `TaskSupervisor`, by the numbers of its present segment.
+
+    Args:
+        task, laws, place, force: As of the supervisor.
+        plan: What makes its references.
+        num_forces: How many constraint forces are measured.
+
+    Attributes:
+        size: How many numbers there are.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        laws: tuple[TrackingLaw, TrackingLaw],
+        place: int,
+        force: int,
+        plan: Planner,
+        num_forces: int,
+    ) -> None:
+        self._task, self._laws, self._place, self._plan = task, laws, place, plan
+        count = len(laws[FREE].degrees)
+        rows = max(law.layout.reference_size for law in laws)
+        self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
+        ends = np.cumsum([len(NAMES), count, count, rows * self._shape[1]]).tolist()
+        self.size = ends[-1]
+        self._time, self._held = ca.SX.sym("time"), ca.SX.sym("held", self.size)
+        self._base, self._rate, fade = (self._held[a:b] for a, b in pairwise(ends))
+        self._faded = ca.reshape(fade, *self._shape)
+        self._named = {name: self._held[i] for i, name in enumerate(NAMES)}
+        self._forces = ca.SX.sym("force", num_forces)
+        self._force = self._forces[force]
+
+    def numbers(self, progress: Progress) -> FloatArray:
+        """The numbers of a task that is so far; zeros before a run."""
+        found = np.zeros(self.size)
+        if not progress.segments:
+            return found
+        segment = progress.segments[-1]
+        change, touched = segment.change, self.touched(progress.segments)
+        felt = progress.felt if np.isfinite(progress.felt) else change.time
+        flags = [change.place, change.in_contact, change.time, segment.over, touched, felt]
+        faded = np.zeros(self._shape)
+        faded[: segment.faded.shape[0], : segment.faded.shape[1]] = segment.faded
+        parts = [*flags, progress.is_felt, *segment.base, *segment.rate, *faded.ravel(order="F")]
+        found[:] = parts
+        return found
+
+    @staticmethod
+    def touched(segments: Sequence[Segment]) -> bool:
+        """Whether the present segment began where the robot had been free."""
+        return len(segments) > 1 and not segments[-2].change.in_contact
+
+    def _in_phase(self, values: Callable[[int], ca.SX], otherwise: ca.SX) -> ca.SX:
+        """What a function of the phase gives in that which goes on; else after the last."""
+        place, count = self._named["place"], len(self._task.phases)
+        found = ca.if_else(place > count - 0.5, otherwise, 0)
+        for i in range(count):
+            found += ca.if_else(ca.fabs(place - i) < 0.5, values(i), 0)
+        return found
+
+    def _reference(self, which: int) -> ca.SX:
+        """R of a law, zero where the other one acts; see `Segment`."""
+        law, passed = self._laws[which], self._time - self._named["start"]
+        size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
+
+        def goals(index: int) -> ca.SX:
+            references = self._plan.goals[index].references
+            if self._task.contacts[index] != bool(which):
+                return ca.SX.zeros(size)
+            time = ca.SX.sym("time")
+            rows = traced_references(references, law.degrees, time)
+            return ca.substitute(rows, time, passed)
+
+        found = self._in_phase(goals, ca.SX.zeros(size))
+        found[lowest] += self._base + self._rate * passed
+        for i, degree in enumerate(law.degrees):
+            if degree:
+                found[lowest[i] + 1] += self._rate[i]
+        share, powers = passed / self._named["over"], [ca.SX(1)]
+        for _ in range(self._shape[1] - 1):
+            powers.append(powers[-1] * share)
+        fading = ca.mtimes(self._faded[:size, :], ca.vertcat(*powers))
+        found += ca.if_else(passed < self._named["over"], fading, 0)
+        acts = self._named["contact"] > 0.5
+        return ca.if_else(acts if which else ca.logic_not(acts), found, 0)
+
+    def computations(self) -> tuple[Computation, ...]:
+        """All output ports with vectors."""
+        found = []
+        wanted = ca.SX.zeros(len(self._laws[FREE].degrees) + 1)
+        for which, name in ((FREE, "free_reference"), (CONTACT, "contact_reference")):
+            row = self._reference(which)
+            inputs = {"time": self._time, "held": self._held}
+            function = TracedFunction(name, inputs, {"R": row})
+            found.append(Computation.of(function, (TIME, HELD), (name,)))
+            values = ca.vertcat(row[self._laws[which].layout.lowest.tolist()], 0)
+            if which == FREE:
+                values[-1], values[self._place] = values[self._place], 0
+            wanted += values
+        contact = self._named["contact"]
+        settles = self._named["touched"] * (self._time < self._named["start"] + self._named["over"])
+        is_open = ca.logic_or(contact < 0.5, self._force < self._task.contact_force)
+        given = [self._time, self._held]
+        shown = ca.Function("shown", given, [wanted, self._named["place"], contact])
+        outputs = ("desired_output", "phase", "free_hold")
+        found.append(Computation(shown, (TIME, HELD), outputs))
+        holds = ca.Function("hold", [*given, self._forces], [ca.logic_or(is_open, settles)])
+        found.append(Computation(holds, (TIME, HELD, "measured_force"), ("contact_hold",)))
+        return tuple(found)
+
+    def guard(self) -> Computation:
+        """The margins of a phase, as those of the supervisor.
+
+        Raises:
+            ModelError: A phase computes its margin from numbers alone.
+        """
+        named, task, law = self._named, self._task, self._laws[FREE]
+        x, parameters = law.system.state, law.system.parameter_symbol
+        distances = self._plan.distance_function.function.call([x, parameters])[0]
+        lowest = [
+            self._reference(which)[int(law.layout.lowest[self._place])]
+            for which, law in ((FREE, self._laws[FREE]), (CONTACT, self._laws[CONTACT]))
+        ]
+        passed = self._time - named["start"]
+        excess = self._force - task.contact_force
+        moment = Moment(passed, self._force, distances[0], distances[1], lowest[0] + lowest[1])
+
+        def margins(index: int) -> ca.SX:
+            phase, lost = task.phases[index], ca.SX(1)
+            try:
+                end = ca.SX(phase.margin(moment, task.contact_force))
+            except (TypeError, ValueError, RuntimeError, NotImplementedError) as error:
+                raise ModelError(
+                    f"the margin of {phase.name} takes numbers alone, so that a rollout does not "
+                    "know it: take ca.fmax, ca.fmin and abs in its place; or run it by simulate"
+                ) from error
+            if phase.if_lost:
+                patience = task.patience - (self._time - named["felt"])
+                waits = ca.logic_and(named["contact"] > 0.5, named["is_felt"] < 0.5)
+                lost = ca.if_else(waits, patience, 1)
+            late = phase.within - passed if np.isfinite(phase.within) else ca.SX(1)
+            felt = ca.if_else(named["is_felt"] > 0.5, excess, -excess)
+            return ca.vertcat(end, lost, late, felt)
+
+        found = self._in_phase(margins, ca.SX.ones(4))
+        inputs = [self._time, self._held, x, self._forces, parameters]
+        none = ca.SX(0, 1)
+        function = ca.Function("guard", inputs, [ca.densify(found), none, none])
+        sources = (TIME, HELD, "estimated_state", "measured_force", PARAMETERS)
+        return Computation(function, sources, (MARGINS, GAPS, RATES))
