@@ -108,10 +108,16 @@ def _compiled(
     }
     rates = _rates(expressions, blocks, places["held"])
     asked |= {f"update_{i}": values for i, (_, values, _) in enumerate(rates)}
-    guarded = [block for block in blocks.values() if block.guard is not None]
-    guards = list[Place]()
-    if guarded:
-        asked["guard"], guards = _guards(expressions, guarded)
+    guards = dict[str, list[Place]]()
+    for name, in_samples in (("guard", False), ("watch", True)):
+        own_blocks = [
+            block
+            for block in blocks.values()
+            if block.guard is not None and block.guard.in_samples is in_samples
+        ]
+        guards[name] = []
+        if own_blocks:
+            asked[name], guards[name] = _guards(expressions, own_blocks)
     return CompiledDiagram(
         wires,
         context,
@@ -126,7 +132,8 @@ def _compiled(
             for key, values, held in rates
         ),
         blocks,
-        tuple(guards),
+        tuple(guards["guard"]),
+        tuple(guards["watch"]),
         expressions,
         columns,
         asked,

@@ -62,6 +62,7 @@ class CompiledDiagram:
         rates: The updates, one function for each period and offset.
         blocks: The blocks by their systems, in the order of Drake's states.
         guards: Where the margins of each block stand that changes at moments which a run finds.
+        watched: The same of blocks that look at their guards in samples.
     """
 
     wires: Wires
@@ -75,6 +76,7 @@ class CompiledDiagram:
     rates: tuple[Rate, ...]
     blocks: Mapping[System, Block]
     guards: tuple[Place, ...]
+    watched: tuple[Place, ...]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
     _asked: Mapping[str, Sequence[ca.SX]] = field(repr=False)
@@ -111,11 +113,33 @@ class CompiledDiagram:
         return self._function("guard", self._asked["guard"])
 
     @cached_property
+    def watch(self) -> ca.Function:
+        """The same of the guards that are looked at in samples. Only where there are such."""
+        return self._function("watch", self._asked["watch"])
+
+    @property
+    def watched_rates(self) -> int:
+        """The rates at whose samples blocks look at their guards, as bits."""
+        found = 0
+        for system, _ in self.watched:
+            for update in self.blocks[system].updates:
+                key = update.period, update.offset, update.is_unrestricted
+                keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in self.rates]
+                found |= 1 << keys.index(key)
+        return found
+
+    @property
+    def changes(self) -> bool:
+        """Whether blocks change at moments that a run has to find, by guards."""
+        return bool(self.guards or self.watched)
+
+    @cached_property
     def staged(self) -> Mapping[str, ca.Function]:
         """Name -> function, for who computes what the time alone determines once for each time.
 
-        "given" is (time, parameters) -> a column; "rate", "row", "newton", "update_0", ... and
-        "guard" are as the functions of the same names, and take this column after the parameters.
+        "given" is (time, parameters) -> a column; "rate", "row", "newton", "update_0", ...,
+        "guard" and "watch" are as the functions of the same names, and take this column after the
+        parameters.
         """
         functions = {**self._asked, "newton": self._newton(1)}
         column, values, meant = self._expressions.given_column()

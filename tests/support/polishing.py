@@ -14,12 +14,14 @@ from drake_dae import (
     Approach,
     ClosedLoop,
     KnownForce,
+    LoopSettings,
     Move,
     PointToPointReference,
     Press,
     Release,
     Retreat,
     RobotModel,
+    Sampling,
     Task,
     TaskController,
     TrackingLaw,
@@ -66,10 +68,14 @@ def laws() -> tuple[TrackingLaw, TrackingLaw]:
     return TrackingLaw(system, poles(POLE)), TrackingLaw(free, poles(POLE))
 
 
-def task_loop(phases: Sequence[Phase], **settings: float) -> ClosedLoop:
+def task_loop(
+    phases: Sequence[Phase], sampling: Sampling | None = None, **settings: float
+) -> ClosedLoop:
     """The ideal plant under a task."""
-    controller = TaskController(Task(phases, **settings), *laws())
-    return wire_loop(UnilateralRobotPlant(polisher(), {"wall": 0.0}), controller)
+    period = 0.0 if sampling is None else sampling.period
+    controller = TaskController(Task(phases, **settings), *laws(), sample_period=period)
+    plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
+    return wire_loop(plant, controller, settings=LoopSettings(sampling=sampling))
 
 
 def started(loop: ClosedLoop, distance: float = FAR, height: float = 0.3) -> Context:

@@ -60,12 +60,12 @@ def parts_of(loop: ClosedLoop | Diagram) -> Parts:
             compiled = program_of(loop).compiled
         except ModelError:
             compiled = None
-        if compiled is not None and compiled.guards:
+        if compiled is not None and compiled.changes:
             compiled = None
         return Parts(loop.plant, loop.controller, loop.diagram, compiled)
     compiled = compile_diagram(loop)
-    if compiled.guards:
-        names = ", ".join(system.get_name() for system, _ in compiled.guards)
+    if compiled.changes:
+        names = ", ".join(system.get_name() for system, _ in (*compiled.guards, *compiled.watched))
         raise ModelError(
             f"'{names}' changes at moments that a run has to find, as where a contact opens: no "
             "export knows it, and a rollout does"

@@ -1,11 +1,11 @@
 """Runs in which blocks change at moments that are found: contacts that open, phases of a task."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
 import numpy as np
-from pydrake.systems.framework import Context, EventStatus
+from pydrake.systems.framework import Context, EventStatus, System
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
@@ -66,20 +66,28 @@ class _Changes:
 
         The rows are those between the last step and the change.
         """
-        moment, state = run.time, run.state
+        moment, state, held, count = run.time, run.state, run.held, run.event
         if run.next > run.time:
             moment, state = self.located(run)
         # At the moment of the change a record has what was before.
         times = self.problem.times
         rows = self.rows(run, times[(times > run.time) & (times <= moment)])
         left = times[times > moment]
+        is_sample = run.next == run.time and bool((piece.events[count:] <= moment).any())
         try:
-            state, held, goes_on = self.react(moment, state, run.held)
+            if is_sample:
+                state, held, goes_on = self.sample(run, piece)
+                count += 1
+            else:
+                state, held, goes_on = self.react(moment, state, held)
         except SimulationError as error:
             failed = replace(run, rows=rows, ending=Ending.STUCK, time=moment, state=state)
             return replace(failed, error=error), None
         ending = Ending.DONE if goes_on else Ending.STOPPED
         after = replace(run, rows=rows, ending=ending, time=moment, state=state, held=held)
+        if is_sample and not left.size:  # The last row comes after what happens then.
+            given = np.array([moment]), state[None], held[None], self.problem.parameters
+            after = replace(after, rows=self.fused.rows(*given)[0])
         if not (goes_on and left.size):
             return after, None
         return after, replace(
@@ -87,11 +95,29 @@ class _Changes:
             times=np.concatenate([[moment], left]),
             state=state,
             held=held,
-            events=piece.events[run.event :],
-            due=piece.due[run.event :],
-            noise=piece.noise[run.event :],
-            has_reacted=run.next == run.time,
+            events=piece.events[count:],
+            due=piece.due[count:],
+            noise=piece.noise[count:],
+            has_reacted=run.next == run.time and not is_sample,
         )
+
+    def sample(self, run: Run, piece: Problem) -> tuple[FloatArray, FloatArray, bool]:
+        """What `react` returns, where blocks react that look at their guards in samples.
+
+        All unrestricted updates of the instant see what was before it.
+        """
+        fused, parameters = self.fused, self.problem.parameters
+        noise, due = piece.noise[run.event], int(piece.due[run.event])
+        given = run.time, run.state, run.held, parameters, noise, due
+        held, compiled = fused.update(*given, True), fused.program.compiled
+        margins = fused.watched(run.time, run.state, run.held, parameters).margins
+        systems = [system for system, part in compiled.watched if (margins[part] <= 0.0).any()]
+        _, reacted, goes_on = self._reacted(run.time, run.state, run.held, systems)
+        for system, part in compiled.held:
+            if system in systems:
+                held[part] = reacted[part]
+        state = self.problem.project(run.time, run.state, run.held)
+        return state, fused.update(run.time, state, held, parameters, noise, due, False), goes_on
 
     def ended(self, run: Run) -> Context:
         """A context of the diagram at the end of a run."""
@@ -106,10 +132,15 @@ class _Changes:
         compiled, parameters = self.fused.program.compiled, self.problem.parameters
         margins = self.fused.seen(time, state, held, parameters).margins
         due = [system for system, part in compiled.guards if (margins[part] <= 0.0).any()]
-        goes_on = True
-        compiled.put(self.context, time, state, held, parameters)
+        return self._reacted(time, state, held, due or [system for system, _ in compiled.guards])
+
+    def _reacted(
+        self, time: float, state: FloatArray, held: FloatArray, systems: Sequence[System]
+    ) -> tuple[FloatArray, FloatArray, bool]:
+        compiled, goes_on = self.fused.program.compiled, True
+        compiled.put(self.context, time, state, held, self.problem.parameters)
         after = self.context.Clone()
-        for system in due or [system for system, _ in compiled.guards]:
+        for system in systems:
             guard = compiled.blocks[system].guard
             assert guard is not None
             own = system.GetMyContextFromRoot(self.context)

@@ -192,6 +192,11 @@ class Course:
             self.state = self.projected(self.time, self.state)
         problem = self.problem
         while self.event < problem.events.size and problem.events[self.event] <= self.time:
+            if problem.due[self.event] & self.fused.watched_rates:
+                found = self.fused.watched(self.time, state, self.held, problem.parameters)
+                if found.is_due:
+                    self.state, self.next = state, self.time
+                    raise Ended(Ending.CHANGE)
             # Unrestricted updates see what was before the projection, which is one of them.
             for seen, is_unrestricted in ((state, True), (self.state, False)):
                 self.held = self.fused.update(

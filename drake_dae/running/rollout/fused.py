@@ -84,6 +84,7 @@ class Fused:
     Attributes:
         program: The diagram.
         controlled: A step of DOP853, as `controlled_step` has it.
+        watched_rates: As of the compiled diagram.
         rates: The derivative of the state at many moments, and what is finite where it is of use.
     """
 
@@ -101,6 +102,8 @@ class Fused:
         self.controlled = Called(self._controlled_step())
         self.rates = Many(self._rate)
         self._guard = Called(compiled.guard) if compiled.guards else None
+        self._watch = Called(compiled.watch) if compiled.watched else None
+        self.watched_rates = compiled.watched_rates
 
     def rate(self, *arguments: FloatArray | float) -> FloatArray:
         """The derivative of the state, a fresh array; nan where it has no value."""
@@ -119,6 +122,15 @@ class Fused:
         # What has no value is no change: the step tells why.
         found = margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
         return Seen(time, found, gaps.copy(), rates.copy())
+
+    def watched(
+        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
+    ) -> Seen:
+        """What the guards see that are looked at in samples; as `seen`."""
+        assert self._watch is not None
+        margins, *_, valid = self._watch(time, state, held, parameters)
+        found = margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
+        return Seen(time, found, np.zeros(0), np.zeros(0))
 
     def update(
         self,

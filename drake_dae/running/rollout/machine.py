@@ -120,6 +120,8 @@ def _source(program: Program) -> str:
         "GIVEN": calls["given"].numel_out(0),
         "PROJECTS": int(compiled.projects),
         "MARGINS": compiled.guard.numel_out(0) if compiled.guards else 0,
+        "WATCHED": compiled.watch.numel_out(0) if compiled.watched else 0,
+        "WATCHED_RATES": compiled.watched_rates,
         "GAPS": compiled.guard.numel_out(1) if compiled.guards else 0,
     }
     for name, function in calls.items():
@@ -148,6 +150,7 @@ def _source(program: Program) -> str:
         ),
         "constants": "\n".join([*lines, ""]),
         "updates": "\n".join(_updated(*item) for item in enumerate(compiled.rates)),
+        "watch": _WATCH if compiled.watched else "  (void)time, (void)x, (void)g;",
         "guards": _GUARDS if compiled.guards else "  (void)x, (void)g;",
     }
     return Template(SOURCE.read_text(encoding="utf-8")).substitute(words)
@@ -175,6 +178,15 @@ _GUARDS = """\
   dae_guard(arg, res, 0, 0, 0);
   for (i = 0; !isfinite(valid) && i < MARGINS; i++) seen->margins[i] = INFINITY;"""
 """How stepper.c computes what the guards see."""
+
+_WATCH = """\
+  double margins[WATCHED], valid;
+  const double *arg[WATCH_ARG] = {&time, x, g->held, g->parameters, g->given};
+  double *res[WATCH_RES] = {margins, 0, 0, &valid};
+  set_time(time, g);
+  dae_watch(arg, res, 0, 0, 0);
+  for (i = 0; isfinite(valid) && i < WATCHED; i++) due |= margins[i] <= 0.0;"""
+"""The same for those that are looked at in samples."""
 
 
 def _table(name: str, values: FloatArray) -> str:

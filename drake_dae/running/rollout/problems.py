@@ -38,6 +38,12 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     program = program_of(loop)
     state, held = program.compiled.start(context)
     values = program.compiled.values(context)
+    if program.compiled.changes and np.isnan(held).any():
+        # What a block shows before it has begun is no expression.
+        own = context.Clone()
+        own.SetAccuracy(1e-9)
+        program.compiled.diagram.ExecuteInitializationEvents(own)
+        held = np.where(np.isnan(held), program.compiled.start(own)[1], held)
     held = program.compiled.begun(context.get_time(), state, held, values)
     return np.concatenate([state, held[program.kept_places]]), values
 

@@ -159,12 +159,12 @@ def _runs(
     code: machine.Library | None,
 ) -> list[Run]:
     """What runs come to, by machine code if there is any."""
-    if code is None or program.compiled.guards:
+    if code is None or program.compiled.changes:
         fused = program.kept("fused", lambda: Fused(program))
         run = interpreted.runner(fused, settings)
     if code is not None:
         run = partial(machine.run, code, program, settings=settings)
-    if program.compiled.guards:
+    if program.compiled.changes:
         run = partial(run_with_changes, fused, run, settings.tableau)
     if code is None or len(problems) == 1:
         return [run(problem) for problem in problems]

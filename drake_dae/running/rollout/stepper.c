@@ -118,6 +118,14 @@ $guards
   return due;
 }
 
+/* Whether a block has to react that looks at its guards in samples. */
+static int watch(double time, const double *x, Given *g) {
+  int i, due = 0;
+  (void)i;
+$watch
+  return due;
+}
+
 /* Whether something happened between two moments, by Python's dips.py within. */
 static int changed(const Seen *before, const Seen *now) {
   double step = now->time - before->time;
@@ -155,6 +163,10 @@ static int update(Run *run, double *x, double *held, Given *g, long long num_eve
     int now = run->event < num_events && events[run->event] <= run->time;
     const double *drawn = noise + run->event * NOISE;
     if (run->pending & UNRESTRICTED) {
+      if (now && due[run->event] & WATCHED_RATES && watch(run->time, x, g)) {
+        run->next = run->time;
+        return CHANGE;
+      }
       if (now && !apply(run->time, x, held, g, drawn, due[run->event], 1)) return INVALID;
       run->pending &= ~UNRESTRICTED;
     }

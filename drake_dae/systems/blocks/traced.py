@@ -100,10 +100,13 @@ class Guard:
         react: (context, state) -> the status: what Drake does then. It reads the block's context,
             and changes a state of the block, which is a copy of the context's. It keeps in the
             context what a record has of it.
+        in_samples: Whether it is looked at when the block is updated, and only then, in place of
+            that update.
     """
 
     computation: Computation
     react: Callable[[Context, State], EventStatus]
+    in_samples: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, Guard, not_traced
+from drake_dae.systems.blocks.traced import Block, Guard, Update
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment
@@ -278,11 +278,13 @@ class TaskSupervisor(LeafSystem):
         output.SetFromVector([float(is_open or settles)])
 
     def traced(self) -> Block:
-        if self._sample_period:
-            raise not_traced("a task whose guards are looked at in samples")
+        period, updates = self._sample_period, tuple[Update, ...]()
+        if period:
+            updates = (Update(self._traced.unchanged(), period, 0.0, True),)
         return Block(
             self,
             self._traced.computations(),
-            guard=Guard(self._traced.guard(), self._advance),
+            updates,
+            guard=Guard(self._traced.guard(), self._advance, bool(period)),
             ports={"phase": (Signal("phase"),)},
         )

@@ -141,6 +141,10 @@ class TracedTask:
         found.append(Computation(holds, (TIME, HELD, "measured_force"), ("contact_hold",)))
         return tuple(found)
 
+    def unchanged(self) -> Computation:
+        """What is held after a sample at which nothing changes."""
+        return Computation(ca.Function("held", [self._held], [self._held]), (HELD,), (HELD,))
+
     def guard(self) -> Computation:
         """The margins of a phase, as those of the supervisor.
 

@@ -21,6 +21,7 @@ from drake_dae import (
     Press,
     Release,
     Retreat,
+    Sampling,
     UnilateralRobotPlant,
     build_scenario,
     rollout,
@@ -125,18 +126,25 @@ def alone(plant):
     return diagram, diagram.CreateDefaultContext()
 
 
-def pulled(*phases, pull=0.0):
+def pulled(*phases, pull=0.0, sampling=None):
     """The two-link arm under a task, pulled by a hand."""
-    loop = task_loop(phases, patience=0.02)
+    loop = task_loop(phases, sampling, patience=0.02)
     context = started(loop, distance=0.005)
     push(loop, context, pull)
     return loop, context
 
 
 HOLDING = Approach(0.1, over=0.1), Press(10.0, over=0.1)
+LEAVING = Move({"tool.z": CLIMB}, 0.2, over=0.1), Release(over=0.1), Retreat(0.01, over=0.1)
 TASKS = {
-    "whole": lambda: pulled(
-        *HOLDING, Move({"tool.z": CLIMB}, 0.2, over=0.1), Release(over=0.1), Retreat(0.01, over=0.1)
+    "whole": lambda: pulled(*HOLDING, *LEAVING),
+    "sampled": lambda: pulled(*HOLDING, *LEAVING, sampling=Sampling(0.002)),
+    "sampled and late": lambda: pulled(*HOLDING, *LEAVING, sampling=Sampling(0.004, 0.001)),
+    "sampled and pulled off": lambda: pulled(
+        Approach(0.1, over=0.1),
+        Press(10.0, over=0.2, if_lost="hold"),
+        pull=-8.0,
+        sampling=Sampling(0.002, 0.002),
     ),
     "begins in contact": lambda: pulled(Press(5.0, over=0.05), Dwell(0.1), Release(over=0.05)),
     "waits in vain": lambda: pulled(Approach(0.01, within=0.1, if_late="hold")),
