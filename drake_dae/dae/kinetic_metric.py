@@ -8,7 +8,6 @@ what is heavy stays, in any units, and what no constraint force reaches stays as
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import Indices, Layout
@@ -72,9 +71,9 @@ class KineticMetric:
         lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
         if not all(np.all(np.isfinite(one)) and np.all(one > 0.0) for one in lengths):
             return False
-        basis = scipy.linalg.orth(across / lengths[0])
-        unit = forces / lengths[1]
-        return bool(np.max(np.abs(unit - basis @ (basis.T @ unit))) <= ALONG)
+        basis, unit = across / lengths[0], forces / lengths[1]
+        left = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
+        return bool(np.max(np.abs(left)) <= ALONG)
 
     def directions(
         self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int

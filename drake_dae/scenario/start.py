@@ -164,10 +164,12 @@ def _unwound(
     asks for it.
     """
     q, turn = found, 2 * np.pi
-    for index, signal in enumerate(model.links.position_signals):
-        if signal.unit != "rad":
+    limits = model.links.position_limits
+    is_inside = (limits[0] - _SLACK <= q) & (q <= limits[1] + _SLACK)
+    for index in np.flatnonzero(~is_inside | (np.abs(q - guess) >= np.pi)):
+        if model.links.position_signals[index].unit != "rad":
             continue
-        low, high = (limits[index] for limits in model.links.position_limits)
+        low, high = limits[0][index], limits[1][index]
         turns = q[index] - turn * np.round((q[index] - guess[index]) / turn) + turn * _NEAREST
         inside = [value for value in turns if low - _SLACK <= value <= high + _SLACK]
         nearest = min(inside, key=lambda value: abs(value - guess[index]), default=q[index])
