@@ -4,7 +4,7 @@ from problems import PROBLEMS, Problem
 
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative, lie_derivative_along, lie_derivatives
+from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 
 
 def states(problem: Problem) -> list[np.ndarray]:
@@ -65,6 +65,14 @@ def test_the_rest_follows_from_the_definitions(problem):
         expected = (f + g @ alpha, h + g @ beta, el + em @ alpha, em @ beta)
         for one, two, shape in zip(starred(state, parameters), expected, shapes, strict=True):
             np.testing.assert_allclose(one.reshape(shape), two, rtol=1e-11, atol=1e-12)
+
+
+def lie_derivatives(expression, field, state, order):
+    """[k, L_f k, ..., L_f^order k]."""
+    chain = [expression]
+    for _ in range(order):
+        chain.append(lie_derivative(chain[-1], field, state))
+    return chain
 
 
 def test_equations_17_to_19(problem):

@@ -1,6 +1,7 @@
 """What the constraints alone decide of a system: Assumptions (1)-(3), N*, and (9)-(14)."""
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -24,6 +25,8 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
+
+Kind = TypeVar("Kind", bound="ConstraintStructure")
 
 
 @checked(ModelError)
@@ -143,28 +146,37 @@ def constraint_structure_of(
         AssumptionError, InconsistentStateError: There is none; see `find_constraint_structure`.
         ModelError: The structure is none, or that of another system.
     """
-    if structure is None:
-        return find_constraint_structure(system)
-    if not isinstance(structure, ConstraintStructure):
-        raise ModelError(
-            f"{owner}: structure must be what find_structure or find_constraint_structure returns, "
-            f"got {type(structure).__name__}"
+    return (
+        find_constraint_structure(system)
+        if structure is None
+        else checked_structure(
+            owner,
+            system,
+            structure,
+            ConstraintStructure,
+            "find_structure or find_constraint_structure",
         )
-    check_same_system(owner, system, structure)
-    return structure
+    )
 
 
-def check_same_system(owner: str, system: DaeSystem, structure: ConstraintStructure) -> None:
-    """Refuses the structure of another system.
+def checked_structure(
+    owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
+) -> Kind:
+    """The given structure of a system.
 
     Raises:
-        ModelError: It is.
+        ModelError: It is no structure of this kind, or that of another system.
     """
+    if not isinstance(structure, kind):
+        raise ModelError(
+            f"{owner}: structure must be what {made_by} returns, got {type(structure).__name__}"
+        )
     if structure.system is not system:
         raise ModelError(
             f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
             f"'{system.name}'; leave it out, or find that of this one"
         )
+    return structure
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, fields, replace
 
 import casadi as ca
-import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
@@ -13,13 +12,14 @@ from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.structure.constrained import (
     ConstraintStructure,
-    check_same_system,
+    checked_structure,
     constraint_violation,
     examine_constraints,
     guesses,
     with_numbers,
 )
 from drake_dae.dae.structure.dependence import combinations_of
+from drake_dae.dae.structure.mass_matrix import is_positive_definite
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.system import DaeSystem
@@ -68,11 +68,6 @@ class Structure(ConstraintStructure):
     def output_order(self) -> tuple[int, ...]:
         """The outputs in the paper's order (15): those with mu_i >= 1 first."""
         return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))
-
-    @property
-    def num_dynamic_outputs(self) -> int:
-        """s of (15), the number of outputs with mu_i >= 1."""
-        return len(self.layout.dynamic)
 
     @property
     def zero_dynamics_dimension(self) -> int:
@@ -188,15 +183,11 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
         AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
         ModelError: This is no system, or the structure is that of another one.
     """
-    if structure is None:
-        return find_structure(system)
-    if not isinstance(structure, Structure):
-        raise ModelError(
-            f"{owner}: structure must be what find_structure returns, got "
-            f"{type(structure).__name__}"
-        )
-    check_same_system(owner, system, structure)
-    return structure
+    return (
+        find_structure(system)
+        if structure is None
+        else checked_structure(owner, system, structure, Structure, "find_structure")
+    )
 
 
 def examine_structure(
@@ -289,16 +280,11 @@ def _check_metric(samples: Samples) -> None:
         return
     values = samples.values(metric=system.control_metric)
     for state, (metric,) in zip(samples.states, values, strict=True):
-        length = np.sqrt(np.abs(np.diag(metric)))
-        if np.all(length > 0.0):
-            scaled = metric / length / length[:, None]
-            symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
-            if symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
-                continue
-        raise ModelError(
-            f"{system.name}: control_metric is not symmetric and positive definite at x = "
-            f"{show(state)}; give each control a positive weight"
-        )
+        if not is_positive_definite(metric):
+            raise ModelError(
+                f"{system.name}: control_metric is not symmetric and positive definite at x = "
+                f"{show(state)}; give each control a positive weight"
+            )
 
 
 def control_violation(structure: Structure) -> Violation | None:

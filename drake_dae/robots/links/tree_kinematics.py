@@ -23,8 +23,6 @@ from drake_dae.robots.links.kinematics import (
 )
 from drake_dae.robots.links.recursions import LinkKinematics
 
-Wrench = tuple[ca.SX, ca.SX]
-
 
 @dataclass(frozen=True, eq=False)
 class _FrameSymbols:

@@ -139,7 +139,9 @@ class Plant(System):
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state x in a context, shape (n,).
+        """Sets the state x in a context as it is given, shape (n,).
+
+        A run is refused from a state that is not on N*.
 
         Raises:
             ModelError: The shape is wrong.

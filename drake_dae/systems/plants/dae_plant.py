@@ -208,16 +208,16 @@ class DaePlant(ParameterizedSystem, Plant):
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         self.check_context(context)
-        return context.get_continuous_state_vector().CopyToVector()
+        return super().state(context)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,); a run from there is refused if it is off N*.
+        """Sets x as given, shape (n,); a run is refused from a state that is not on N*.
 
         Raises:
             ModelError: The shape is wrong.
         """
         self.check_context(context)
-        context.SetContinuousState(self.dae.state_vector(state))
+        super().set_state(context, state)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.

@@ -107,20 +107,6 @@ class Encoders:
         a = self._forgetting(period)
         return self.position_deviation * (1.0 - a) / period * np.sqrt(2.0 / (1.0 + a))
 
-    def velocity_lag(self, period: float) -> float:
-        """By how much vm is late where the acceleration is constant, T / 2 + T a / (1 - a), in s.
-
-        It is 0 for velocities that are measured themselves, and about 1 / w for a filter that is
-        slow beside the samples.
-
-        Args:
-            period: T in s.
-        """
-        if self.velocity_bandwidth is None:
-            return 0.0
-        a = self._forgetting(period)
-        return period * (0.5 + a / (1.0 - a))
-
     def _forgetting(self, period: float) -> float:
         """a, the share of the last velocity that stays in the next one."""
         assert self.velocity_bandwidth is not None

@@ -145,7 +145,7 @@ class ModalPorts(ParameterizedSystem, Plant):
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         self.check_context(context)
-        return context.get_continuous_state_vector().CopyToVector()
+        return super().state(context)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets x as given, shape (n,), all contacts open: a run finds its mode when it begins.
@@ -154,7 +154,7 @@ class ModalPorts(ParameterizedSystem, Plant):
             ModelError: The shape is wrong.
         """
         self.check_context(context)
-        context.SetContinuousState(self.dae.state_vector(state))
+        super().set_state(context, state)
         context.SetDiscreteState(np.zeros(len(self.contacts)))
 
     def gaps(self, context: Context) -> FloatArray:
@@ -170,16 +170,6 @@ class ModalPorts(ParameterizedSystem, Plant):
             ModelError: They cannot be closed together, likewise as an AssumptionError.
         """
         return self.modes((True,) * len(self.contacts), self.dae.nominal_state).structure
-
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state next to a guess, shape (n,), with all contacts closed, and returns it.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
-        state = self.structure.manifold.settle(guess, self._values(context))
-        self.set_state(context, state)
-        return state
 
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""
