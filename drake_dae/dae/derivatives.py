@@ -74,7 +74,7 @@ class Derivatives:
         #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
         self.constraint_input = first[len(self._rows) :, :]  # A slice [1:] of a scalar is a row.
         balance, self._constraint_rate = self._first_order(constraint)
-        self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)
+        self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)  # (1)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
         if _agree(system, gradient, g_rows):
             gradient = g_rows

@@ -45,8 +45,8 @@ class Elimination:
 def eliminate(derivatives: Derivatives) -> Elimination:
     """Reads (9)-(14) off the derivatives on N*, which are affine in the control."""
     system = derivatives.system
-    alpha, beta = derivatives.by_control(derivatives.constraint_input)
-    f_star, h_star = derivatives.by_control(derivatives.rate)
+    alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14)
+    f_star, h_star = derivatives.by_control(derivatives.rate)  # (9), (10)
     return Elimination(
         constraint_gradient=derivatives.constraint_gradient,
         constraint_matrix=derivatives.constraint_matrix,
@@ -54,8 +54,8 @@ def eliminate(derivatives: Derivatives) -> Elimination:
         beta=beta,
         f_star=f_star,
         h_star=h_star,
-        l_star=system.outputs(alpha),
-        n_star=ca.sparsify(ca.mtimes(system.m, beta)),
+        l_star=system.outputs(alpha),  # (11)
+        n_star=ca.sparsify(ca.mtimes(system.m, beta)),  # (12)
         pivot=derivatives.pivot,
     )
 

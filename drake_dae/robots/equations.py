@@ -69,7 +69,7 @@ def robot_equations(
             kinematics = links.kinematics()
             motion = kinematics.value(bound.rate(kinematics))
             constraint_rate += ca.jtimes(motion, links.q, slip)
-        balance = inertial - ca.mtimes(rotors, acceleration) - torque
+        balance = inertial - ca.mtimes(rotors, acceleration) - torque  # (37)
         stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
         return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 

@@ -120,9 +120,9 @@ class RobotModel:
         if forces is None and not (links.actuator_signals or bound.motors):
             forces = ()  # Nothing steers them: the robot is only simulated.
         self.forces = force_outputs(forces, bound)
-        S = force_rows(self.forces, bound, links)
+        S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
-        h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
+        h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])  # (39)
         signals = [signal for output in self.positions for signal in output.signals(links)]
         weighted = control_weights is not None
         check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)

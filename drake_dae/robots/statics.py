@@ -40,7 +40,7 @@ class Placing:
 
         def residual(q: FloatArray) -> FloatArray:
             phi, h_1, _, _ = self._function(q, parameters)
-            return np.concatenate([phi, h_1[:count] - outputs])
+            return np.concatenate([phi, h_1[:count] - outputs])  # (58)
 
         def linearize(q: FloatArray) -> Linearization | None:
             _, _, J, P = self._function(q, parameters)

@@ -35,7 +35,7 @@ class Residual:
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
         self.system = system
-        self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])
+        self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])  # (4)
         self.layout = Layout(tuple(len(chain) for chain in chains))
         self.signals = self.layout.chain_signals(system.constraint_output_signals)
         self.gradient = ca.jacobian(self.expression, system.state)

@@ -69,19 +69,19 @@ class NormalForm:
                 f"{show(structure.control_margin.state)}, so the output chains are not independent "
                 "there and are no coordinates; choose other outputs"
             )
-        chains = ca.vertcat(residual, structure.chain)
+        chains = ca.vertcat(residual, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
         if completion is None:
             found = choose_completion(structure, chains, samples)
         else:
             found = check_completion(structure, chains, samples, completion)
-        self.completion, self.completion_signals, self.margin = found
+        self.completion, self.completion_signals, self.margin = found  # (22)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
             *structure.layout.chain_signals(system.output_signals),
             *self.completion_signals,
         )
-        coordinates = ca.vertcat(chains, self.completion)
+        coordinates = ca.vertcat(chains, self.completion)  # (20)
         self._coordinates = system.trace("normal form", {"coordinates": coordinates})
         self._map = system.trace(
             "normal form and Jacobian",
@@ -144,7 +144,7 @@ class NormalForm:
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
         p = self.system.parameter_vector(parameters)
-        found = self._newton(x, target, p)
+        found = self._newton(x, target, p)  # (24)
         if found is not None:
             return found
         start, first = self._at(x, p)

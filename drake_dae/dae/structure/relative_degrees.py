@@ -55,7 +55,7 @@ def constraint_chains(
     """
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
-    chains = [[system.k[i]] for i in range(system.num_constraints)]
+    chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
     undecided, elsewhere = list(range(system.num_constraints)), Elsewhere()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
@@ -150,7 +150,7 @@ def output_chains(
             if acts[row].all():
                 elsewhere.refuse(i)
                 drift[i] = following[row]
-                control_matrix[i, :] = rows[row, :]
+                control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
                 highest_derivatives[i] = moving[row]
             elif acts[row].any():

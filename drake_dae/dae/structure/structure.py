@@ -67,7 +67,7 @@ class Structure(ConstraintStructure):
     @property
     def output_order(self) -> tuple[int, ...]:
         """The outputs in the paper's order (15): those with mu_i >= 1 first."""
-        return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))
+        return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))  # (15)
 
     @property
     def zero_dynamics_dimension(self) -> int:
@@ -115,7 +115,7 @@ class Structure(ConstraintStructure):
         """
         found: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
-            found = self.derivatives.inverse(self.highest_derivatives, wanted)
+            found = self.derivatives.inverse(self.highest_derivatives, wanted)  # (28)
         if found is None:  # L_h* of an output vanishes, but not by structure.
             found = self.control_by_matrix(wanted)
         control, pivot, *_ = found
@@ -132,7 +132,7 @@ class Structure(ConstraintStructure):
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
         """
-        needed, metric = wanted - self.drift, self.system.control_metric
+        needed, metric = wanted - self.drift, self.system.control_metric  # (28)
         if metric is not None:
             return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
         factors = Factorization(self.control_matrix)

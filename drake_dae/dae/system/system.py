@@ -234,7 +234,7 @@ class DaeSystem:
 
     def outputs(self, constraint_input: ca.SX) -> ca.SX:
         """z = l(x) + m(x) v (3) of v, shape (m, 1): the controlled outputs, shape (p, 1)."""
-        return self.l + ca.mtimes(self.m, constraint_input)
+        return self.l + ca.mtimes(self.m, constraint_input)  # (3)
 
     @cached_property
     def parameter_symbol(self) -> ca.SX:

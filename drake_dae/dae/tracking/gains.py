@@ -75,7 +75,7 @@ class FeedbackGains:
         """E of e' = E e, shape (N, N)."""
         layout = self.layout
         result = np.eye(layout.chain_size, k=1)
-        result[layout.ends] = -self.matrix[layout.dynamic]
+        result[layout.ends] = -self.matrix[layout.dynamic]  # (30)
         return result
 
     @property
@@ -111,7 +111,7 @@ class FeedbackGains:
         order = np.argsort(moments)
         steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
         lengths, which = np.unique(steps, return_inverse=True)
-        result = np.zeros((moments.size, len(self.degrees)))
+        result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
         orders, owner = self.layout.orders, self.layout.owners
         for block in _coupled(self.layout, self.matrix):
             rows = np.flatnonzero(np.isin(owner, block))
@@ -215,6 +215,7 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
                         f"{', '.join(names[i] for i in members)} need "
                         f"({len(members)}, {len(members)})"
                     )
+                # (60), (72)-(73), (82)-(83)
                 matrix[np.ix_(np.array(members), starts[members] + order)] = block
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
@@ -261,7 +262,7 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
         raise GainError(
             f"output '{name}' has degree {degree} and takes 1 or {degree} poles, got {roots.size}"
         )
-    monic = np.poly(roots)
+    monic = np.poly(roots)  # (32)
     if np.abs(np.imag(monic)).max() > 1e-12 * np.abs(monic).max():
         raise GainError(f"complex poles of output '{name}' must come in conjugate pairs: {roots}")
     return [float(number) for number in np.real(monic)[:0:-1]]

@@ -70,7 +70,7 @@ class MeasuredForce:
         result = ca.SX(chain)
         for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
             if output in self.inputs:
-                result[int(head)] = self.symbol[self.inputs[int(output)]]
+                result[int(head)] = self.symbol[self.inputs[int(output)]]  # (71), (81)
         return result
 
     def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
@@ -86,7 +86,7 @@ class MeasuredForce:
         result = ca.SX(highest)
         for i in map(int, self.layout.direct):
             if i in self.inputs:
-                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)
+                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)  # (59)
         return result
 
 

@@ -116,13 +116,13 @@ class TrackingLaw:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
         errors = chain - reference[layout.chained.tolist(), :]
-        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
         control, pivot = structure.control_for(ubar)
         # By the model; what the control reaches at once is as wanted.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
-        outputs = {"control": control, "tracking_error": output - values}
+        outputs = {"control": control, "tracking_error": output - values}  # (29)
         if self.integral.outputs:
             inputs["integral"] = self.integral.symbol
             outputs["integral_rate"] = self.integral.rate(chain, values, measured)

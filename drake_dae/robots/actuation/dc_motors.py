@@ -58,10 +58,10 @@ class DcMotors(Stage):
             state=current,
             state_signals=tuple(Signal(f"{name}.current", "A") for name in names),
             mass=ca.diag(l),
-            drift=lambda position, velocity: -r * current - k_m * n * velocity,
+            drift=lambda position, velocity: -r * current - k_m * n * velocity,  # (75)
             drive_matrix=ca.SX.eye(p),
             drive_signals=tuple(Signal(f"{name}.voltage", "V") for name in names),
-            force=lambda position, velocity: n * k_m * current,
+            force=lambda position, velocity: n * k_m * current,  # (74)
             ports={"motor_current": slice(0, p)},
             parameters=(constant, inductance, resistance, gears),
         )

@@ -80,7 +80,7 @@ class FlexibleJoints(Stage):
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
 
         def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
-            return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)
+            return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)  # (64)
 
         kinds = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
         positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, kinds, strict=True)]
@@ -89,7 +89,7 @@ class FlexibleJoints(Stage):
             state=ca.vertcat(q_2, rate),
             state_signals=(*positions, *rates),
             mass=ca.diagcat(ca.SX.eye(p), m_2),
-            drift=lambda position, velocity: ca.vertcat(rate, -force(position, velocity)),
+            drift=lambda position, velocity: ca.vertcat(rate, -force(position, velocity)),  # (65)
             drive_matrix=ca.vertcat(ca.SX(p, p), ca.SX.eye(p)),
             drive_signals=tuple(links.actuator_signals),
             force=force,

@@ -65,7 +65,7 @@ class ConstraintSet:
 
     def residual(self, frames: Frames) -> ca.SX:
         """phi(q) of the rows that restrict positions, shape (k, 1)."""
-        return ca.vertcat(ca.SX(0, 1), *[c.residual(frames) for c in self.constraints])
+        return ca.vertcat(ca.SX(0, 1), *[c.residual(frames) for c in self.constraints])  # (38)
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
         """phi'(q, v), and the rates of rows that restrict velocities alone, shape (m, 1)."""
@@ -168,6 +168,7 @@ class ConstraintSet:
     def force_matrix(self, links: Links) -> ca.SX:
         """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""
         kinematics, force = links.kinematics(), ca.SX.sym("force", self.size)
+        # (41)
         columns = self.reaction(kinematics, force).map(lambda part: ca.jacobian(part, force))
         return links.generalized_force(kinematics, columns)
 

@@ -76,14 +76,14 @@ class StateRealization(ParameterizedSystem):
         self._layout = layout = structure.layout
         self._on_manifold = np.zeros(sum(structure.constraint_degrees))
         elimination, derivatives = structure.elimination, structure.derivatives
-        highest = structure.drift + ca.mtimes(structure.control_matrix, derivatives.control)
+        highest = structure.drift + ca.mtimes(structure.control_matrix, derivatives.control)  # (26)
         rate = ca.SX(0, 1)
         if normal_form.completion.numel():
             moving = derivatives.expand(derivatives.rate)
             rate = ca.jtimes(normal_form.completion, dae.state, moving)
             rate += dae.exogenous.rate(normal_form.completion)
         rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
-        force = dae.forces(derivatives.expand(derivatives.constraint_input))
+        force = dae.forces(derivatives.expand(derivatives.constraint_input))  # (25)
         self._force_needs_control = elimination.beta.nnz() > 0
         self._dynamics = structure.trace("state realization", rates, True)
         self._force = structure.trace("constraint force", force, self._force_needs_control)
@@ -183,7 +183,7 @@ class StateRealization(ParameterizedSystem):
             self._steps.tolerate(context, error)
             value.set_value((np.full_like(last, np.nan), last))
             return
-        wanted = np.concatenate([self._on_manifold, coordinates])
+        wanted = np.concatenate([self._on_manifold, coordinates])  # (27)
         try:
             found = self.normal_form.state(wanted, last, p)
             value.set_value((found, found))

@@ -37,7 +37,7 @@ def traced_plant(
         signals: Names and units of what its functions take, for messages.
     """
     dae, derivatives = structure.system, structure.derivatives
-    rate, force = (
+    rate, force = (  # (25)
         derivatives.expand(value) for value in (derivatives.rate, derivatives.constraint_input)
     )
     control = {"control": derivatives.control}

@@ -31,6 +31,7 @@ def test_degrees_index_and_dimensions(problem):
 
 
 @pytest.mark.slow
+@pytest.mark.equation(15)
 def test_the_order_of_the_outputs_is_that_of_15(problem):
     """In the order found, n* has s rows of zeros first, and every row after has an entry."""
     structure = find_structure(problem.system)

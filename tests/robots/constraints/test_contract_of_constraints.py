@@ -304,6 +304,7 @@ def test_rows_are_as_many_as_names(given):
     assert all(name.startswith(f"{constraint.name}.") for name in names)
 
 
+@pytest.mark.equation(38)
 def test_it_holds_and_its_rate_is_the_derivative(given):
     _, _, evaluate, *_ = given
     found = evaluate()
@@ -317,6 +318,7 @@ def test_rate_is_linear_in_velocities(given):
     np.testing.assert_allclose(evaluate(v=-3.0 * v)["rate"], -3.0 * evaluate()["rate"], **CLOSE)
 
 
+@pytest.mark.equation(41)
 def test_reaction_is_linear_and_does_the_work_of_the_rate(given):
     """Friction takes some: tau . v = lambda . rate without it, and less with it."""
     _, constraint, evaluate, _, v, load, _ = given

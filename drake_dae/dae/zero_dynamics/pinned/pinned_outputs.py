@@ -49,10 +49,10 @@ class PinnedOutputs:
             *layout.chain_signals(system.output_signals),
         )
         errors = structure.chain - goal[layout.chained.tolist(), :]
-        residual = ca.vertcat(structure.manifold.residual_expression, errors)
+        residual = ca.vertcat(structure.manifold.residual_expression, errors)  # (36)
         derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
         control, pivot = structure.control_by_matrix(highest)
-        self._rate, constraint_input = (
+        self._rate, constraint_input = (  # (35)
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
         )
