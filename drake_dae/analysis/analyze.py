@@ -73,8 +73,8 @@ def analyze(
     rule. There is no proof that none was missed.
 
     Where friction acts on contacts that can only push, the margin of A(x) is that without friction,
-    and `contact_margin` tells with its sign how far friction is from jamming a contact (Painleve),
-    and at which coefficient that would be; likewise along a reference.
+    and the sign of `contact_margin` shows how far friction is from the Painleve paradox, with the
+    critical coefficients; the same along a reference.
 
     Args:
         system: The system (1)-(3).
@@ -134,7 +134,7 @@ def analyze(
         ) from error
     samples = around
     if states is not None:
-        # Degrees are decided around them, too; margins are theirs alone.
+        # Degrees are decided also at states around them, margins only at them.
         samples = Samples(around.manifold, given)
         check_consistent(samples.manifold, given, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
@@ -151,13 +151,14 @@ def analyze(
             equilibria=_equilibria(dynamics, stability, samples.states, None),
         )
     layout = analysis.structure.layout
-    with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion tells when.
+    with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion has the time.
         check_reference(system, layout, reference, times)
     guess = samples.states[0] if start is None else start
     motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
     rest, outputs = samples.states[0], None
     if motion.times.size:
-        # The state does not tell outputs with mu_i = 0: they are as the reference begins.
+        # The state does not determine outputs with mu_i = 0: they are taken from the start of the
+        # reference.
         rest = motion.states[0]
         outputs = layout.values(reference(float(motion.times[0])))
     stability = dynamics.stability(rest, outputs=outputs)

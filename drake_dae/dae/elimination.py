@@ -67,10 +67,10 @@ def eliminate_numbers(
     scale: FloatArray,
     negligible: float,
 ) -> tuple[Sized, Sized]:
-    """h* (10) and n* (12) at one state, where what is zero but for round-off is zero.
+    """h* (10) and n* (12) at one state; entries that are only round-off are set to zero.
 
-    The expressions of `eliminate` do not tell how large the terms were that cancelled in them; the
-    factors of beta (14) do.
+    The expressions of `eliminate` do not show how large their cancelled terms were; the factors of
+    beta (14) do.
 
     Args:
         fields: g, h and m of the system with E = 1, by letter.

@@ -1,4 +1,4 @@
-"""From a start that someone gave to N* level by level: positions first, then velocities."""
+"""From a user's start to N* level by level: positions first, then velocities."""
 
 from functools import cached_property
 
@@ -34,7 +34,7 @@ class Settling:
         return KineticMetric(self._system, self._residual.layout)
 
     def settled(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """A state next to one, to round-off on N*; None where that leads nowhere."""
+        """The consistent state next to one, to round-off; None if the method does not converge."""
         kinetic = self._kinetic
         if kinetic.does_no_work(start, parameters, self._residual.gradients(start, parameters)):
             found = start.copy()
@@ -57,7 +57,7 @@ def _settle_level(
     parameters: FloatArray,
     energy: tuple[KineticMetric, int] | None = None,
 ) -> bool:
-    """Moves some states so that some rows of the residual vanish, and says whether they do.
+    """Changes some states so that some rows of the residual vanish; returns whether they do.
 
     Args:
         residual: What is zero on N*.

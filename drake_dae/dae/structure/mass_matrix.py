@@ -1,4 +1,4 @@
-"""What a mass matrix E(x) of E x' = f + g v + h u must be."""
+"""Checks of a mass matrix E(x) of E x' = f + g v + h u."""
 
 import casadi as ca
 import numpy as np
@@ -9,7 +9,7 @@ from drake_dae.errors import ModelError
 
 
 def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Refuses what is no mass matrix: its factorization LDL^T reads one triangle alone.
+    """Refuses an invalid mass matrix, since LDL^T reads only one triangle of it.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.
@@ -29,7 +29,7 @@ def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
 
 
 def is_positive_definite(matrix: FloatArray) -> bool:
-    """Whether a matrix is symmetric and positive definite, in any units of its rows."""
+    """Whether a matrix is symmetric and positive definite, independent of units."""
     length = np.sqrt(np.abs(np.diag(matrix)))
     if not (np.all(np.isfinite(matrix)) and np.all(length > 0.0)):
         return False

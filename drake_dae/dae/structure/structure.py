@@ -1,4 +1,4 @@
-"""What kind of system it is: relative degrees, index, Assumptions (1)-(5) with their margins."""
+"""The structure of a system: relative degrees, index, Assumptions (1)-(5) with margins."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -41,8 +41,8 @@ class Structure(ConstraintStructure):
         control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p); of a
             system with a `control_metric` it has more columns than rows.
         chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
-        round_off: Which entries of B(x) are zero but for round-off at all of many states, of its
-            shape. A column of nothing else would be scaled up to the size of the others.
+        round_off: The entries of B(x) that are only round-off at all sampled states, in its shape.
+            A column of such entries would otherwise be scaled up to the size of the others.
         control_margin: The margin of B(x), Assumption (5).
     """
 
@@ -82,15 +82,15 @@ class Structure(ConstraintStructure):
     def motion_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
         """x' and v under the control of `control_for`, solved for along with it.
 
-        That takes no forward dynamics: with rigid joints it is kinematics, and no M(q) is factored.
+        No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
         Args:
             wanted: ubar of (28), shape (p, 1).
 
         Returns:
             x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
-            not determined; None where the control is not found in that way, and where friction may
-            leave the motion open though the control is determined.
+            not determined; None if the control is not found in this way, or if friction may leave
+            the motion undetermined.
         """
         if self.system.control_metric is not None or self.system.rubbing:
             return None
@@ -105,7 +105,7 @@ class Structure(ConstraintStructure):
     def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
         """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
 
-        Where B(x) leaves some of u open, it is the u that `DaeSystem.control_metric` chooses.
+        If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
 
         Args:
             wanted: ubar of (28), shape (p, 1).
@@ -147,15 +147,15 @@ def find_structure(
 
     Whether an expression is zero is decided by its structure first, then by its numbers at
     consistent states drawn around `system.nominal_state`, with the default parameters and exogenous
-    signals at rest. What is zero there must be zero with all other numbers that parameters, signals
-    and their derivatives may have, see `Parameter.bounds`: otherwise the degree is another one once
-    they move, and the system is refused.
+    signals at rest. An expression that is zero there must be zero for all other values of
+    parameters, signals and their derivatives, see `Parameter.bounds`; otherwise the degree would
+    change with them, and the system is refused.
 
     Args:
         system: The system (1)-(3).
         spread: The standard deviation of the drawn states around the nominal one, a number for all
             or shape (n,); `DaeSystem.nominal_spread` if None.
-        count: How many states are drawn, at least 1.
+        count: The number of random states, at least 1.
         seed: The seed of the random numbers.
 
     Raises:
@@ -172,7 +172,7 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """The structure of a system, as given, or found where it is not known yet.
+    """The given structure of a system, or that found if none is given.
 
     Args:
         owner: Who needs it, for messages.
@@ -181,7 +181,7 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
 
     Raises:
         AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
-        ModelError: This is no system, or the structure is that of another one.
+        ModelError: It is not a system, or the structure is that of another one.
     """
     return (
         find_structure(system)
@@ -201,7 +201,7 @@ def examine_structure(
     Raises:
         AssumptionError: There is no B(x), since one of Assumptions (1)-(3) is violated or an
             output has no degree.
-        InconsistentStateError, ModelError: There is no structure to find; see `find_structure`.
+        InconsistentStateError, ModelError: It has no structure; see `find_structure`.
     """
     _check_counts(system)
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
@@ -213,7 +213,7 @@ def examine_structure(
 
 
 def why_no_law(system: DaeSystem) -> str:
-    """Why there is no law (28) for a system, by counting alone; empty if there may be one."""
+    """Why a system has no law (28), by its numbers of inputs and outputs; empty if it may have."""
     p, q = system.num_controls, system.num_outputs
     if p == 0:
         return "there is no control input, so there is nothing to steer"
@@ -243,7 +243,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
     Raises:
         AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
             B(x) is left to `control_violation`.
-        ModelError: A function is not finite, or `control_metric` is no metric.
+        ModelError: A function is not finite, or `control_metric` is not valid.
     """
     _check_metric(samples)
     elimination = constrained.elimination
@@ -270,7 +270,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
 
 
 def _check_metric(samples: Samples) -> None:
-    """Refuses a `control_metric` that is none.
+    """Refuses an invalid `control_metric`.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.
