@@ -1,4 +1,4 @@
-"""The normal form: constraint chains, output chains, and what completes them.       (20)-(24)"""
+"""The normal form: constraint chains, output chains, and their completion.          (20)-(24)"""
 
 from collections.abc import Callable
 
@@ -27,10 +27,10 @@ class NormalForm:
 
     both chains in the order of the system's constraints and outputs.
 
-    Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials
-    of both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular;
-    so where the Jacobian is singular, one of these is, or xi does not complete the chains there.
-    The paper allows any completion; L_h* xi = 0 is not required.
+    Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials of
+    both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular; if the
+    Jacobian is singular, A or B is, or xi does not complete the chains there. The paper allows any
+    completion; L_h* xi = 0 is not required.
 
     Args:
         system: The system (1)-(3).
@@ -45,7 +45,7 @@ class NormalForm:
         completion_signals: Names and units of xi. A chosen one is its own name: "x3", or
             "x0 - 0.5 x1".
         coordinate_signals: Names and units of (y, zeta, xi), n in all.
-        margin: How far the Jacobian of Phi is from singular over `structure.states`.
+        margin: The margin of the Jacobian of Phi over `structure.states`.
 
     Raises:
         ModelError: The completion does not fit, or its differentials are not independent of each
@@ -87,7 +87,7 @@ class NormalForm:
             "normal form and Jacobian",
             {"coordinates": coordinates, "jacobian": ca.jacobian(coordinates, system.state)},
         )
-        # Not that of `samples`: a state that is zero on N* is round-off there.
+        # Not the scale of `samples`, in which a state that is zero on N* is round-off.
         self._scale = structure.scale
 
     def __repr__(self) -> str:
@@ -123,10 +123,10 @@ class NormalForm:
     ) -> FloatArray:
         """x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
 
-        The inverse is local: other states may have the same coordinates (elbow up, elbow down;
-        an angle and the same angle plus 2 pi, as states are not wrapped). The one that continues
-        the guess is sought by damped Newton's method; where that fails, on the straight way from
-        the coordinates of the guess to the given ones.
+        The inverse is local: other states may have the same coordinates (elbow up, elbow down; an
+        angle and the same angle plus 2 pi, as states are not wrapped). The one that continues the
+        guess is found by damped Newton's method or, if that fails, by continuation along the
+        straight line from the coordinates of the guess to the given ones.
 
         Args:
             coordinates: (y, zeta, xi), shape (n,).
@@ -137,8 +137,8 @@ class NormalForm:
             x, shape (n,).
 
         Raises:
-            InconsistentStateError: There is no such state, or no way to it from the guess. Its
-                residual is what is left in the coordinates, shape (n,).
+            InconsistentStateError: There is no such state, or it is not reached from the guess. Its
+                residual is the remaining error of the coordinates, shape (n,).
             ModelError: Shapes do not fit, or numbers are not finite.
         """
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
@@ -192,7 +192,7 @@ class NormalForm:
         first: FloatArray,
         parameters: FloatArray,
     ) -> InconsistentStateError:
-        """Names the coordinate that the weak directions of the Jacobian keep from its target."""
+        """Names the coordinate that weak directions of the Jacobian keep from its target."""
         values, jacobian = self._at(state, parameters)
         left = target - values
         rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale

@@ -14,25 +14,24 @@ from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 @dataclass(frozen=True, eq=False)
 class StabilityAlong:
-    """Whether the internal states stay near their motion while the outputs follow a reference.
+    """The stability of the internal states while the outputs follow a reference.
 
     Attributes:
-        verdict: With a period: exponentially stable if all multipliers are inside the unit circle,
-            unstable if one is outside, bounded if the motions that leave are seen to come to one
-            that repeats itself, undecided if these draw their neighbours to them and are not seen
-            to return, or if a multiplier is on the circle up to the error. Without: what the
-            exponents of the disturbances say over the second half of the time; undecided where
-            these neither grow nor die out.
-        period: The period of the reference in s, or of the motion where that repeats itself after
-            several of them; None if there is none, 0 if the reference is constant.
+        verdict: With a period: exponentially stable if all multipliers are inside the unit circle;
+            unstable if one is outside; bounded if motions that leave converge to a periodic one;
+            undecided if they converge to a motion that does not return, or if a multiplier is on
+            the circle up to the error. Without a period: by the exponents of the disturbances over
+            the second half of the time; undecided if they neither grow nor decay.
+        period: The period of the reference in s, or of the motion if that is a multiple of it; None
+            without a period, 0 if the reference is constant.
         multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
             (dimension,); empty if there is no such motion.
         exponents: The rates at which disturbances grow, in 1/s, the largest first: log |multiplier|
             per period, or of the singular values of the transition matrix over the second half
             of the time, shape (dimension,); empty if the motion ends. If the reference is constant
             the real parts of the eigenvalues at rest.
-        state: Where the periodic motion begins, shape (n,); None if there is none.
-        reason: What decided, in words.
+        state: The start of the periodic motion, shape (n,); None without one.
+        reason: The reason for the verdict, in words.
     """
 
     verdict: Verdict
@@ -46,7 +45,7 @@ class StabilityAlong:
     def without_numbers(
         cls, verdict: Verdict, reason: str, period: float | None = None
     ) -> "StabilityAlong":
-        """One that nothing is computed for."""
+        """A result without numbers."""
         return cls(verdict, period, np.zeros(0, dtype=complex), np.zeros(0), None, reason)
 
 
@@ -66,13 +65,13 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
         reason = "one time alone is no motion; give more times"
         return StabilityAlong.without_numbers(Verdict.UNDECIDED, reason, period)
     if period is not None:
-        # Late, where what dies out has died out; or early, where what grows is small yet.
+        # Late, when decaying disturbances are gone; or early, when growing ones are still small.
         late = int(np.flatnonzero(motion.times <= motion.times[-1] - period)[-1])
         starts = dict.fromkeys((late, 0))
         found = (_closed(flow, motion, first, period) for first in starts)
         closed = next((one for one in found if one is not None), None)
         if closed is None or closed[0].repels:
-            # The motion itself may be another one, which repeats itself after several periods.
+            # The motion itself may have a period of several periods of the reference.
             begin = float(motion.times[late])
             repeating = flow.repeating(begin, period)
             several = find_multiple(repeating, motion.states[late], begin, period)
@@ -86,7 +85,7 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
 def _closed(
     flow: Flow, motion: PinnedMotion, first: int, period: float
 ) -> tuple[Return, float] | None:
-    """The motion of the period near one of the states of a motion, and when it begins."""
+    """The periodic motion near one of the states of a motion, and its start time."""
     begin = float(motion.times[first])
     found = close(flow, motion.states[first], begin, period, patient=True)
     return None if found is None else (found, begin)
@@ -120,7 +119,7 @@ def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
 
 
 def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
-    """What the second half of the time does with disturbances of the motion there."""
+    """The growth of disturbances over the second half of the time."""
     middle = int(np.searchsorted(motion.times, 0.5 * (motion.times[0] + motion.times[-1])))
     middle = min(middle, motion.times.size - 2)
     begin, end = float(motion.times[middle]), float(motion.times[-1])

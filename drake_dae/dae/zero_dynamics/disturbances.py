@@ -1,4 +1,4 @@
-"""Motions with pinned outputs, and what becomes of small disturbances of them.            (35)
+"""Motions with pinned outputs, and the growth of their small disturbances.            (35)
 
 To first order a disturbance delta of a state on Z(R(t)) moves by delta' = (dx'/dx) delta, with the
 derivative of x' = f* + h* u at fixed R, and stays tangent to Z(R(t)). In bases T of the tangent
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy  # Which loads its heavy parts when they are used.
+import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
@@ -26,10 +26,11 @@ ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""
 
 STEPS = 5000
-"""The most steps of one interval."""
+"""The largest number of steps in one interval."""
 
 SECTIONS = 16
-"""In so many parts of an interval the state is put back on Z(R), and bases are chosen anew."""
+"""The number of parts of an interval; after each, the state is projected onto Z(R) and bases are
+renewed."""
 
 
 class Lost(Exception):
@@ -42,14 +43,14 @@ class Lost(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """What an interval of time makes of a state on Z(R), and of its disturbances.
+    """The flow of a state on Z(R) and of its disturbances over an interval of time.
 
     Attributes:
         state: The state at the end, shape (n,).
         basis: T_1, of the tangent space there, orthonormal relative to the scale, shape (n, d).
-        transition: M divided by exp(growth), shape (d, d); the identity if nobody asked for it.
-        growth: The logarithm of the norm of M, by which disturbances grow at most.
-        volume: The logarithm of |det M|, by which a volume of disturbances grows.
+        transition: M divided by exp(growth), shape (d, d); the identity if it was not computed.
+        growth: The logarithm of the norm of M, the largest growth of a disturbance.
+        volume: The logarithm of |det M|, the growth of volumes.
     """
 
     state: FloatArray
@@ -66,7 +67,7 @@ class Flow:
         pinned: Z(R).
         reference: The function t -> R(t).
         parameters: The function t -> values of all parameters.
-        scale: How large the states are, shape (n,).
+        scale: The sizes of the states, shape (n,).
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Flow:
         )
 
     def repeating(self, begin: float, period: float) -> "Flow":
-        """The same along a reference and parameters that repeat what they are in one period."""
+        """The same flow for a reference and parameters that repeat one period."""
 
         def within(time: float) -> float:
             return begin + (time - begin) % period
@@ -116,7 +117,7 @@ class Flow:
         """The state on Z(R(t)) next to a given one.
 
         Raises:
-            Lost: There is none, or it is far.
+            Lost: There is none, or it is not near.
         """
         found, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
         if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
@@ -126,7 +127,7 @@ class Flow:
     def carry(
         self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
     ) -> Passage:
-        """Where an interval of time takes a state, and its disturbances.
+        """The state and its disturbances at the end of an interval.
 
         Raises:
             Lost: The motion grows without bound, is too fast, or leaves the domain.
@@ -150,7 +151,7 @@ class Flow:
     def way(
         self, state: FloatArray, begin: float, end: float
     ) -> Iterator[tuple[float, FloatArray]]:
-        """Times, and the states there, after each step of the way from a state.
+        """The times and states after each step from a state.
 
         Raises:
             Lost: As `carry`.
@@ -168,7 +169,7 @@ class Flow:
     def _integrate(
         self, state: FloatArray, columns: FloatArray, begin: float, end: float, steps: int
     ) -> tuple[FloatArray, FloatArray, int]:
-        """A state and directions at the end of a section, and how many steps are left."""
+        """The state and directions at the end of a section, and the number of remaining steps."""
         for _, there, along in self._steps(state, columns, begin, end):
             state, columns, steps = there, along, steps - 1
             if steps < 0:
@@ -199,7 +200,7 @@ class Flow:
             return moved
 
         def slopes(time: float, both: FloatArray) -> FloatArray:
-            # Without the second derivatives, which the iteration of the integrator makes up for.
+            # Without second derivatives, for which the iteration of the integrator compensates.
             goal, p = self.goal(time), self.parameters(time)
             matrix = self.pinned.slopes(split(both)[0], goal, p)[0]
             blocks = [matrix * self.scale / unit] * (1 + columns.shape[1])
@@ -207,7 +208,7 @@ class Flow:
 
         def quietly(work: Callable[[], Any]) -> Any:
             with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # That of a step that fails; it is told as Lost.
+                warnings.simplefilter("ignore")  # Of a failed step: see Lost.
                 return work()
 
         y = joined(state, columns)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import scipy  # Which loads its heavy parts when they are used.
+import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause, Ending, PinnedMotion
@@ -13,19 +13,19 @@ from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.given import result_of
 
 TOLERANCE = 1e-6
-"""The error of an integration step by the method's estimate, which is two orders too high."""
+"""The tolerance of an integration step; the method overestimates its error by two orders."""
 
 
 SHORTEST = 1e-6
-"""The part of a time step at which a search for the way on ends."""
+"""The smallest step, as a fraction of a time step, at which the motion ends."""
 
 
 JUMP = 0.1
-"""A correction of this size, relative to the state, may lead to another solution."""
+"""A correction above this, relative to the state, may lead to another solution."""
 
 
 STEPS = 20_000
-"""The most steps of one motion, beside its times."""
+"""The largest number of steps of one motion, besides its given times."""
 
 
 GROWN = 1e8
@@ -33,7 +33,7 @@ GROWN = 1e8
 
 
 LOST = 1e-2
-"""A margin below this part of its largest value on the way tends to zero."""
+"""A margin below this fraction of its largest value along the motion counts as tending to zero."""
 
 
 Reference = Callable[[float], FloatArray]
@@ -59,7 +59,7 @@ def follow(
     points: list[Point] = []
     ending = None
     try:
-        with np.errstate(all="ignore"):  # States out of the domain are tried, and refused.
+        with np.errstate(all="ignore"):  # States outside the domain are tried and rejected.
             pursuit = _Pursuit(pinned, reference, parameters, times.tolist(), guess)
             for point in pursuit.points():
                 points.append(point)
@@ -87,7 +87,7 @@ def follow(
 
 
 class _MotionEnd(Exception):
-    """A motion with pinned outputs does not go on."""
+    """The end of a motion with pinned outputs."""
 
     def __init__(self, ending: Ending) -> None:
         super().__init__(str(ending))
@@ -95,7 +95,7 @@ class _MotionEnd(Exception):
 
 
 class _Pursuit:
-    """Follows a reference from point to point; raises _MotionEnd where that ends."""
+    """Follows a reference from point to point; raises _MotionEnd at the end of the motion."""
 
     def __init__(
         self,
@@ -134,7 +134,7 @@ class _Pursuit:
         yield from self._integrate() if has_dynamics else self._continue()
 
     def _continue(self) -> Iterator[Point]:
-        """Goes on without zero dynamics, by a predictor and Newton's method."""
+        """Continues without zero dynamics, by a predictor and Newton's method."""
         step, change = np.inf, np.zeros(self._last.state.size)
         for end in self._times[1:]:
             interval = end - self._time
@@ -142,7 +142,7 @@ class _Pursuit:
                 step = min(step, end - self._time)
                 time = end if step == end - self._time else self._time + step
                 before = self._last
-                # Adams and Bashforth: x' and its change since the step before.
+                # Adams-Bashforth: x' and its change since the previous step.
                 predicted = before.state + step * (before.rate + 0.5 * step * change)
                 if self._reach(time, predicted):
                     change = (self._last.rate - before.rate) / step
@@ -153,7 +153,7 @@ class _Pursuit:
             yield self._last
 
     def _integrate(self) -> Iterator[Point]:
-        """Goes on with zero dynamics, by an implicit integrator, since they may be stiff."""
+        """Continues with zero dynamics, by an implicit integrator, since they may be stiff."""
         scale = self._pinned.system.scale
         bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
         integrator = None
@@ -225,7 +225,7 @@ class _Pursuit:
         return goal
 
     def _reach(self, time: float, state: FloatArray) -> bool:
-        """Goes on to the point next to a state, unless it is on another branch than the last."""
+        """Continues to the point next to a state, unless it is on another branch than the last."""
         last = self._last
         self._remaining -= 1
         if self._remaining < 0:
@@ -254,7 +254,7 @@ class _Pursuit:
             raise self._end(0.1 * interval)
 
     def _end(self, ahead: float) -> _MotionEnd:
-        """Why there is no way on from the last point, with a look at the goal ahead of it."""
+        """The reason why the motion ends at the last point, also from the reference ahead."""
         last, when = self._last, f"t = {self._time:.6g} s"
         shares = [
             now / largest if largest < np.inf else 1.0
@@ -287,8 +287,8 @@ class _Pursuit:
     def _escape(self) -> _MotionEnd | None:
         """The end where a state grows without bound within a finite time; None where none does.
 
-        At such an end a rate is as large as if the state had grown by `GROWN` in the time so far,
-        though the state itself may still be small, as that of x' = exp(x).
+        At such an end a rate is so large that the state would have grown by `GROWN` in the elapsed
+        time. The state itself may still be small, as for x' = exp(x).
         """
         system, last = self._pinned.system, self._last
         elapsed = max(self._time - self._times[0], SHORTEST * (self._times[-1] - self._times[0]))

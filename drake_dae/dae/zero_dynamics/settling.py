@@ -1,4 +1,4 @@
-"""What becomes of a motion with pinned outputs in the long run."""
+"""The long-term behavior of a motion with pinned outputs."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -18,27 +18,29 @@ from drake_dae.dae.zero_dynamics.stability import (
 from drake_dae.errors import InconsistentStateError
 
 FOLDINGS = 40.0
-"""A motion is watched while the fastest disturbance grows by e to this power."""
+"""A motion is followed until its fastest disturbance could have grown by e to this power."""
 
 BESIDE = 1e-3
-"""How far beside a motion one starts that may leave it, relative to the scale of the states."""
+"""The initial distance from an unstable motion, relative to the scale of the states."""
 
 PATIENCE = 10.0
-"""For a return is waited so many times as long as for what becomes of disturbances."""
+"""The factor by which the search for a return lasts longer than that for the growth of
+disturbances."""
 
 PLAIN = float(np.log(10.0))
-"""Disturbances grow or shrink where the logarithm of their size changes by more than this."""
+"""Disturbances count as growing or decaying if the logarithm of their size changes by more than
+this."""
 
 
 LONGEST = 1500.0
-"""No motion is followed through a larger angle, in rad, some hundred turns."""
+"""The largest angle through which a motion is followed, in rad: some hundred turns."""
 
 SLOWEST = 1e-4
-"""What moves more slowly than this, relative to all that moves, is not waited for."""
+"""Rates below this, relative to the fastest, are ignored."""
 
 
 class Fate(Enum):
-    """What becomes of a motion; the value says it."""
+    """The long-term behavior of a motion; the value describes it."""
 
     GROWS = "grows without bound"
     SETTLES = "settles into another motion, which is stable"
@@ -51,12 +53,12 @@ class Fate(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What becomes of a motion, and what shows it.
+    """The long-term behavior of a motion, with its evidence.
 
     Attributes:
-        fate: What becomes of it.
-        state: Where it was at the end; None if that is not known.
-        closed: The periodic motion that it comes to; None if there is none.
+        fate: The behavior.
+        state: The last state; None if it is not known.
+        closed: The periodic motion to which it converges; None without one.
     """
 
     fate: Fate
@@ -68,12 +70,13 @@ class Course:
 
 
 def fate_of(passage: Passage, *halves: Passage) -> Fate:
-    """What an interval says of a motion that has lasted for some time.
+    """The behavior of a motion, from its disturbances over a late interval.
 
-    Neighbours that a motion draws to it come nearer in all directions. On a limit cycle those
-    ahead stay ahead, while volumes shrink; but so they do where a motion drifts for ever. A growth
-    that is no more than proportional to time, as of neighbours that are a little faster, is not
-    exponential: then that of both halves adds up to much more.
+    If a motion attracts its neighbours, disturbances decay in all directions. On a limit cycle,
+    disturbances along the motion neither grow nor decay while volumes shrink; the same holds for a
+    motion that drifts. Growth proportional to time, from neighbours with a slightly different
+    speed, is not exponential: then the growth of the two halves adds up to much more than the
+    whole.
 
     Args:
         passage: The interval.
@@ -92,12 +95,12 @@ def fate_of(passage: Passage, *halves: Passage) -> Fate:
 def watch(
     flow: Flow, state: FloatArray, begin: float, end: float, period: float | None = None
 ) -> Course:
-    """What becomes of the motion from a state.
+    """The long-term behavior of the motion from a state.
 
     Args:
         flow: Of a reference that can be asked at all times.
         state: The state, shape (n,).
-        begin, end: From when to when it is watched, in s; the second half decides.
+        begin, end: The interval of observation, in s; the second half decides.
         period: The period of the reference; None if it is constant.
     """
     middle = 0.5 * (begin + end)
@@ -123,7 +126,7 @@ def watch(
 def carry_in_halves(
     flow: Flow, state: FloatArray, begin: float, end: float
 ) -> tuple[Passage, tuple[Passage, Passage]]:
-    """What an interval of time and its halves make of a state.
+    """The flow over an interval and over its halves.
 
     Raises:
         Lost: The motion cannot be followed.
@@ -144,9 +147,9 @@ def carry_in_halves(
 
 
 def watch_from(flow: Flow, state: FloatArray) -> Course:
-    """What becomes of the motion from a state that is not at rest, under a constant reference.
+    """The long-term behavior from a state that is not at rest, for a constant reference.
 
-    How long that takes is told by how fast its disturbances move.
+    The duration follows from the rates of its disturbances.
     """
     basis = flow.basis(state, 0.0) / flow.scale[:, None]
     slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters(0.0))
@@ -168,18 +171,18 @@ def leave(
     fastest: float,
     period: float | None = None,
 ) -> Course:
-    """What becomes of the motions that leave an unstable one, on both sides of it.
+    """The long-term behavior of the motions that leave an unstable one, on both sides.
 
     Args:
         flow: Of a reference that can be asked at all times.
         state: A state of the unstable motion, shape (n,).
-        time: When it is there.
+        time: The time of that state.
         rate: The largest exponent of its disturbances, in 1/s, positive.
-        fastest: How fast it moves, in rad/s; what takes too many turns is not followed.
+        fastest: Its fastest frequency in rad/s; motions of too many turns are not followed.
         period: The period of the reference; None if it is constant.
 
     Returns:
-        The fate that is worse, or that is not known; the circling one only if both sides circle.
+        The worse behavior of both sides; a limit cycle only if both sides converge to one.
     """
     duration = FOLDINGS / rate
     if duration * fastest > LONGEST:
@@ -203,7 +206,7 @@ def leave(
 def judge_at_rest(
     equilibria: Equilibria, goal: FloatArray, rest: FloatArray, parameters: FloatArray
 ) -> Stability:
-    """What the eigenvalues say; where they are unstable, also what leaves the equilibrium.
+    """The verdict by eigenvalues; if unstable, also by the motions that leave the equilibrium.
 
     Args:
         equilibria: The states at rest on Z(R).
@@ -223,7 +226,7 @@ def judge_at_rest(
 
 
 def _after(found: Stability, course: Course) -> Stability:
-    """What is said of an unstable equilibrium once it is known what becomes of what leaves it."""
+    """The verdict on an unstable equilibrium, given the behavior of motions that leave it."""
     verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
         course.fate, Verdict.UNSTABLE
     )
@@ -239,7 +242,7 @@ def judge_without_rest(
     parameters: FloatArray,
     reason: str,
 ) -> Stability:
-    """What the motion from a state says where the search finds no equilibrium near it.
+    """The verdict by the motion from a state near which no equilibrium is found.
 
     Args:
         equilibria: The states at rest on Z(R).
