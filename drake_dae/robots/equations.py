@@ -42,12 +42,12 @@ def robot_equations(
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
 ) -> DaeSystem:
-    """(43)-(45), with M on the left; below the rows of the links stand those of the stages.
+    """(43)-(45), with M on the left; the rows of the stages follow those of the links.
 
     Args:
         name: The robot's name in messages.
-        links, bound, driven, loop_joints, loads, outputs: What the robot is made of.
-        choice: The parameters by which the control is chosen, if it is; see `control_choice`.
+        links, bound, driven, loop_joints, loads, outputs: The parts of the robot.
+        choice: The parameters of the choice of the control, if any; see `control_choice`.
         nominal: A configuration of the robot at work, shape (nq,).
     """
     nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
@@ -103,7 +103,7 @@ def robot_equations(
         control_signals=controls,
         output_signals=outputs.signals,
         nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
-        state_scale=np.ones(nq + nv + k),  # Of SI units and angles.
+        state_scale=np.ones(nq + nv + k),  # For SI units and angles.
         name=name,
         implicit=implicit,
         control_metric=ca.diag(choice[0].symbol) if choice else None,
@@ -121,7 +121,7 @@ def _known_force(links: Links, loads: Sequence[KnownForce]) -> ca.SX:
 
 
 def _moved_rotors(links: Links, driven: ActuationChain) -> ca.SX:
-    """What of M turns with a stage, and not with the links, shape (nv, nv)."""
+    """The part of M that moves with a stage instead of the links, shape (nv, nv)."""
     B = links.actuation_matrix
     if not driven.carries_rotors:
         return ca.SX(B.shape[0], B.shape[0])

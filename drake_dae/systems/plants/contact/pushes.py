@@ -1,4 +1,4 @@
-"""Pushes on a robot that its law does not know."""
+"""Disturbance forces on a robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 @checked(ModelError)
 @dataclass(frozen=True)
 class Push:
-    """A force F on a point of a frame for some time, which grows and fades smoothly:
+    """A disturbance force F on a point of a frame, with a smooth rise and fall:
 
         F(t) = F (s((t - start_time) / rise) - s((t - end_time) / rise)),    s(x) = 3 x^2 - 2 x^3
 
@@ -30,9 +30,9 @@ class Push:
     Attributes:
         frame: Name of the frame.
         force: F in the world, N, shape (3,).
-        start_time: When it begins, s.
-        end_time: When it begins to fade, s; None for never.
-        rise: How long it grows, and fades, s.
+        start_XX8
+        end_time: The start of the fall, s; None for never.
+        rise: The duration of the rise and of the fall, s.
         point: The point in the frame, m, shape (3,).
 
     Raises:
@@ -73,10 +73,10 @@ class Push:
 
 
 class AppliedPushes(LeafSystem):
-    """Gives pushes to Drake's MultibodyPlant.
+    """Applies disturbance forces to Drake's MultibodyPlant.
 
     Output port:
-        spatial_forces: For its port `applied_spatial_force`.
+        spatial_forces: The input of its port `applied_spatial_force`.
 
     Args:
         plant: The plant, finalized.
