@@ -85,16 +85,16 @@ robots: $(VENV)/installed-dev
 unknowns: $(VENV)/installed
 	$(BIN)/drake-dae sweep wall_point_contact --random $(RUNS) --seed $(SEED) --out runs/unknowns \
 		--set duration=1.6 --set 'constraints.0.rpy=[0, 0, 0]' \
-		--set 'force=!MeasuredForce {sample_period: 0.001}' \
+		--set 'force_feedback=!MeasuredForce {sample_period: 0.001}' \
 		--set 'tolerances={outputs: {tool.y: 0.005, tool.z: 0.005, wall.force: 10}, after: 0.5}' \
 		--vary plant.friction=0.1..0.6 --vary 'plant.stiffness=[3.0e+4, 1.0e+5, 3.0e+5, 1.0e+6]' \
 		--vary 'plant_parameters.wall.position=[[0.698..0.702, 0, 0]]' \
 		--vary 'plant_parameters.wall.rpy=[[0, -0.02..0.02, -0.02..0.02]]' \
 		--vary plant_parameters.link3.mass=5.6..6.9 \
 		--vary 'plant_payloads=[[{frame: tool, mass: 0.01..0.5}]]' \
-		--vary 'plant_pushes=[[{frame: tool, force: [-10..10, -10..10, -10..10], start_time: 0.6, end_time: 0.7}]]' \
+		--vary 'plant_disturbances=[[{frame: tool, force: [-10..10, -10..10, -10..10], start_time: 0.6, end_time: 0.7}]]' \
 		--vary 'encoders=[{resolution: 1.0e-5, velocity_bandwidth: 500}, {position_noise: 5.0e-6, velocity_noise: 0.001}]' \
-		--vary force.bias=-0.3..0.3 --vary force.noise_deviation=0..0.3 --vary force.seed=1..1000
+		--vary force_feedback.bias=-0.3..0.3 --vary force_feedback.noise_deviation=0..0.3 --vary force_feedback.seed=1..1000
 
 friction: $(VENV)/installed
 	$(BIN)/python examples/unknown_friction

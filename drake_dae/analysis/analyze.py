@@ -166,7 +166,7 @@ def analyze(
     if dynamics.dimension and motion.times.size > 1:
         along = dynamics.stability_along(reference, motion, exogenous=exogenous)
     contact_margin_along = None
-    if system.rubbing and motion.times.size:
+    if system.frictional_contacts and motion.times.size:
         contacts = ContactMargins(system, analysis.structure.elimination.constraint_matrix)
         contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
     return replace(
@@ -213,14 +213,14 @@ def _examine(
         margins[violation.assumption if violation else number] = margin
 
     if constrained.constraint_margin is not None:
-        matrix = system.rubbing.without_friction(elimination.constraint_matrix)
+        matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
         margin = find_margin(samples, matrix, search=search)
         constrained = replace(constrained, constraint_margin=margin)
         judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
         known["constraint_structure"] = constrained
-        if system.rubbing:
+        if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
             known["contact_margin"] = margins_of_contacts.over(samples, search)
     without_law = why_no_law(system)

@@ -186,11 +186,11 @@ class Findings:
             )
         # Along a reference the motion decides: elsewhere there may be no contact.
         contact = self.contact_margin_along or self.contact_margin
-        if contact is not None and contact.jams:
+        if contact is not None and contact.is_paradoxical:
             when = "" if contact.time is None else f"t = {contact.time:.6g} s, "
             critical = ", ".join(f"{k} = {v:.4g}" for k, v in contact.critical_friction.items())
             found.append(
-                "Friction: a contact jams (Painleve's paradox) at "
+                "Friction: the Painleve paradox occurs at "
                 f"{when}{named_values(self.system.state_signals, contact.state)}: a principal "
                 f"minor of A(x) is {contact.reserve:.3g} of what it is without friction, and "
                 f"{critical} is critical there. Lower the friction, slide the other way, or hold "

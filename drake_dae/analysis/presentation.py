@@ -187,7 +187,7 @@ def _places(findings: Findings) -> list[Part]:
     matrices = {}
     if findings.constraint_structure is not None:
         matrix = findings.constraint_structure.elimination.constraint_matrix
-        matrices[2] = findings.system.rubbing.without_friction(matrix)
+        matrices[2] = findings.system.frictional_contacts.without_friction(matrix)
     if findings.structure is not None:
         matrices[5] = findings.structure.control_matrix
     lines = [

@@ -309,10 +309,12 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
             scenario.plant_parameters
         ),
         "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
-        "the plant is pushed, and the law does not know it": bool(scenario.plant_pushes),
+        "disturbance forces act on the plant, unknown to the law": bool(
+            scenario.plant_disturbances
+        ),
         "Drake's own contact gives way": not loop.plant.is_ideal,
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
-        "the force is measured by a sensor": scenario.force.is_measured,
+        "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }

@@ -85,8 +85,10 @@ class Derivatives:
         self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
             mass[self._rows, self._rows], g_rows, gradient
         )
-        if system.rubbing:
-            self.pivot = ca.fmin(self.pivot, system.rubbing.reserve(self.constraint_matrix))
+        if system.frictional_contacts:
+            self.pivot = ca.fmin(
+                self.pivot, system.frictional_contacts.reserve(self.constraint_matrix)
+            )
         self._equations: list[ca.SX] = []
         self._control_slopes: list[ca.SX] = []
         self._solve_order(damping)

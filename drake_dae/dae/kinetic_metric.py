@@ -44,7 +44,7 @@ class KineticMetric:
         if not self.is_known:
             return
         moving = groups[0].tolist()
-        forces = system.rubbing.without_friction(system.g)[moving, :]
+        forces = system.frictional_contacts.without_friction(system.g)[moving, :]
         outputs = {
             "mass": ca.densify(system.mass_matrix[moving, moving]),
             "forces": ca.densify(forces),

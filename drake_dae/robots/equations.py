@@ -11,8 +11,8 @@ from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.actuation.chain import ActuationChain
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.loop_state import LoopState
 
 
@@ -37,7 +37,7 @@ def robot_equations(
     bound: ConstraintSet,
     driven: ActuationChain,
     loop_joints: LoopState,
-    loads: Sequence[KnownForce],
+    known_forces: Sequence[KnownForce],
     outputs: Outputs,
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
@@ -46,7 +46,7 @@ def robot_equations(
 
     Args:
         name: The robot's name in messages.
-        links, bound, driven, loop_joints, loads, outputs: The parts of the robot.
+        links, bound, driven, loop_joints, known_forces, outputs: The parts of the robot.
         choice: The parameters of the choice of the control, if any; see `control_choice`.
         nominal: A configuration of the robot at work, shape (nq,).
     """
@@ -56,7 +56,9 @@ def robot_equations(
     h_1, S = outputs.positions, outputs.forces
     B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
     velocity = ca.mtimes(links.velocity_map, links.v)
-    torque = ca.mtimes(B, driven.joint_force) + _known_force(links, loads) + bound.drag(links)
+    torque = (
+        ca.mtimes(B, driven.joint_force) + _known_force(links, known_forces) + bound.drag(links)
+    )
     torque += loop_joints.force
     motors = loop_joints.motors
     rotors = _moved_rotors(links, driven)
@@ -90,7 +92,7 @@ def robot_equations(
             *links.parameters,
             *driven.parameters,
             *bound.parameters,
-            *(parameter for load in loads for parameter in load.parameters),
+            *(parameter for load in known_forces for parameter in load.parameters),
             *choice,
         ),
         state_signals=(
@@ -112,10 +114,10 @@ def robot_equations(
     )
 
 
-def _known_force(links: Links, loads: Sequence[KnownForce]) -> ca.SX:
-    """The generalized force of the loads, shape (nv, 1)."""
+def _known_force(links: Links, known_forces: Sequence[KnownForce]) -> ca.SX:
+    """The generalized force of the known_forces, shape (nv, 1)."""
     total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
-    for load in loads:
+    for load in known_forces:
         total += links.generalized_force(kinematics, load.reaction(kinematics))
     return total
 

@@ -23,9 +23,9 @@ from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.equations import Outputs, robot_equations
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
@@ -67,7 +67,7 @@ class RobotModel:
             of forces, as a `Squeeze`; all constraint forces if None, none without actuators.
         exogenous: The names of parameters that are exogenous signals w with known derivatives,
             "wall.position" for example; see `DaeSystem`.
-        loads: Known forces on frames; zero by default.
+        known_forces: Known forces on frames; zero by default.
         compliances: For a robot whose constraints are redundant: name of a constraint force -> its
             relative compliance, 1 if not named, {} for equal ones. The forces are then shared by
             least squares, see `share_forces`. An output that depends on the split is refused, since
@@ -79,7 +79,7 @@ class RobotModel:
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, positions, nominal_positions, name, loads: The arguments.
+        links, positions, nominal_positions, name, known_forces: The arguments.
         constraints: The constraints, with those of the plant.
         forces: The force outputs; a name is a `NamedForce`.
         stages: The attached stages.
@@ -103,7 +103,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
-        loads: Sequence[KnownForce] = (),
+        known_forces: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
@@ -113,7 +113,7 @@ class RobotModel:
         self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
         self.positions = tuple(positions)
         self.name = name
-        self.loads = tuple(loads)
+        self.known_forces = tuple(known_forces)
         bound = ConstraintSet(self.constraints)
         if forces is None and not (links.actuator_signals or bound.motors):
             forces = ()  # The robot has no actuators and is only simulated.
@@ -150,7 +150,7 @@ class RobotModel:
             bound,
             driven,
             self.loop_joints,
-            self.loads,
+            self.known_forces,
             Outputs(h_1, S, steered),
             choice,
             nominal,
@@ -179,7 +179,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
-        loads: Sequence[KnownForce] = (),
+        known_forces: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
@@ -199,7 +199,7 @@ class RobotModel:
             actuation,
             forces,
             exogenous,
-            loads,
+            known_forces,
             compliances,
             control_weights,
             compiled,

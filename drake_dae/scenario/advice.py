@@ -69,7 +69,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     integral = scenario.integral
     if integral is None:
         integral = [name for name in positions if name in points] + forces.tolist()
-    force = scenario.force
+    force = scenario.force_feedback
     if not force.is_measured:
         force = parts.MeasuredForce(sample_period=period)
     # A force of degree 0 has a gain where it is integrated, and none otherwise.
@@ -84,12 +84,12 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         damping = parts.Poles(all=[-_rounded(found.constraint_damping)])
     observer = scenario.observer
     if observer is None:
-        rubbing = [c.name for c in model.constraints if c.friction_parameter]
+        frictional = [c.name for c in model.constraints if c.friction_parameter]
         observer = parts.Observer(
             rate=_rounded(found.observer_rate),
             force_rate=_rounded(found.observer_force_rate),
             friction_rate=_rounded(found.friction_rate),
-            friction=rubbing,
+            identify_friction=frictional,
         )
     chosen = replace(
         scenario,
@@ -97,9 +97,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         integral=integral,
         constraint_damping=damping,
         observer=observer,
-        force=force,
+        force_feedback=force,
     )
-    known = ", ".join(observer.friction) or "none"
+    known = ", ".join(observer.identify_friction) or "none"
     note = (
         f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and velocities within {noise:.2g} rad/s: "

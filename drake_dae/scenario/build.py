@@ -26,7 +26,7 @@ from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import observed_structure
-from drake_dae.scenario.own_model import check_pushes, own_model
+from drake_dae.scenario.own_model import check_disturbances, own_model
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -114,8 +114,8 @@ def build_loop(
     plant = plant or make_plant(scenario, model, structure, feedback, opens)
 
     # The parts between them; what does not fit is told with its key.
-    with at("force"):
-        sensor = scenario.force.sensor(model.dae.num_constraints)
+    with at("force_feedback"):
+        sensor = scenario.force_feedback.sensor(model.dae.num_constraints)
     settings = LoopSettings(
         sensor=sensor,
         encoders=scenario.encoders,
@@ -137,7 +137,7 @@ def build_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
     keys = ["observer"] if scenario.observer is not None else []
-    keys += ["force"] if scenario.force.is_measured or keys else []
+    keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
     with at(" or ".join(keys) or "start.positions"):
         return make_closed_loop(
             plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
@@ -163,17 +163,17 @@ def make_plant(
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
-    check_pushes(scenario.plant_pushes, model.links)
+    check_disturbances(scenario.plant_disturbances, model.links)
     adds = partial(add_robot, scenario.robot, payloads=scenario.plant_payloads)
-    parameters, pushes = scenario.plant_parameters, scenario.plant_pushes
-    robot = RobotToSimulate(model, structure, feedback, opens, adds, parameters, pushes)
+    parameters, disturbances = scenario.plant_parameters, scenario.plant_disturbances
+    robot = RobotToSimulate(model, structure, feedback, opens, adds, parameters, disturbances)
     return scenario.plant.plant(robot)
 
 
 def _law(scenario: Scenario, known: Structure) -> TrackingLaw:
     """The law of a scenario, for a system of which it knows so much."""
-    force, damping = scenario.force, scenario.constraint_damping
-    keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
+    force, damping = scenario.force_feedback, scenario.constraint_damping
+    keys = [key for key, used in (("force_feedback", force.is_measured), ("gains", True)) if used]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.

@@ -21,9 +21,9 @@ from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
@@ -95,7 +95,7 @@ def completed_model(
             robot.stages,
             scenario.forces,
             tuple(scenario.exogenous),
-            robot.loads,
+            robot.known_forces,
             scenario.compliances,
             scenario.control_weights or None,
             scenario.compiled,
@@ -111,7 +111,7 @@ class _Robot:
     links: MultibodyExpressions
     constraints: Sequence[Constraint]
     stages: Sequence[Stage]
-    loads: Sequence[KnownForce]
+    known_forces: Sequence[KnownForce]
     completed: Completed
 
 
@@ -137,14 +137,14 @@ def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payloa
     stages = _stages(scenario.actuation, links)
     _check_forces(scenario.forces, constraints, links)
     _check_compliances(scenario.compliances, constraints, links)
-    loads = each("loads", scenario.loads, lambda load: _load(load, links))
+    known_forces = each("known_forces", scenario.known_forces, lambda load: _load(load, links))
     with at("control_weights"):
         choice = control_choice(name, scenario.control_weights or None, actuators)
-    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
+    _check_exogenous(scenario.exogenous, links, [*constraints, *known_forces], stages, choice)
 
     # What it leaves open.
     completed = complete(scenario, links, constraints, plant_constraints(links), guess)
-    return _Robot(name, links, constraints, stages, loads, completed)
+    return _Robot(name, links, constraints, stages, known_forces, completed)
 
 
 def scenario_structure(model: RobotModel) -> Structure:

@@ -20,13 +20,16 @@ def observed_structure(scenario: Scenario, model: RobotModel, structure: Structu
     with at("observer"):
         if scenario.exogenous:
             raise ModelError("not beside exogenous signals, whose port it feeds")
-        rubbing = {c.name: c.friction_parameter for c in model.constraints if c.friction_parameter}
-        for name in observer.friction:
-            if name not in rubbing:
+        frictional = {
+            c.name: c.friction_parameter for c in model.constraints if c.friction_parameter
+        }
+        for name in observer.identify_friction:
+            if name not in frictional:
                 raise ModelError(
-                    f"friction: '{name}' is no constraint with friction; give it friction: 0.0 "
-                    f"where it is not known. With friction: {', '.join(rubbing) or 'none'}"
+                    f"identify_friction: '{name}' is not a constraint with friction; give it "
+                    "friction: 0.0 if it is unknown. With friction: "
+                    f"{', '.join(frictional) or 'none'}"
                 )
         velocities = [signal.name for signal in model.links.velocity_signals]
-        frictions = [rubbing[name] for name in observer.friction]
+        frictions = [frictional[name] for name in observer.identify_friction]
         return find_structure(with_disturbance(model.dae, velocities, frictions))

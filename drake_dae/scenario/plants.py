@@ -19,7 +19,7 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.contact.pushes import Push
+from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 from drake_dae.systems.plants.unilateral.contacts import coefficient
@@ -36,7 +36,7 @@ class RobotToSimulate:
         opens: The contact that a task opens and closes; empty without a task.
         add_robot: Adds the robot with what the plant carries to a MultibodyPlant.
         parameters: Parameter name -> what the plant has otherwise.
-        pushes: Forces on the plant that its law does not know.
+        disturbances: Forces on the plant that its law does not know.
     """
 
     model: RobotModel
@@ -45,16 +45,16 @@ class RobotToSimulate:
     opens: str
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
-    pushes: Sequence[Push]
+    disturbances: Sequence[DisturbanceForce]
 
 
 class ScenarioPlant(ABC):
     """The contract of what stands under `plant` in a scenario.
 
-    1. `plant` makes the plant of a robot, which keeps the contract of `Plant`.
-    2. With `carries` it has payloads, pushes and other parameters in it when it is made. Without,
-       the scenario makes a model with these payloads and pushes, and sets the parameters in the
-       context.
+    1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
+    2. With `carries` the plant includes payloads, disturbances and changed parameters. Otherwise
+       the scenario makes a model with these payloads and disturbances, and sets the parameters in
+       the context.
     3. `material` is how its contacts give way; None where they do not.
     """
 
@@ -114,7 +114,7 @@ class Unilateral(ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
-            pushing = [one.name for one in robot.model.constraints if any(one.can_only_push)]
+            pushing = [one.name for one in robot.model.constraints if any(one.is_unilateral)]
             if not pushing:
                 raise ModelError(
                     "the robot has no constraint that can only push, so that none opens"
@@ -156,7 +156,7 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 self,
                 structure=robot.structure,
                 parameters=robot.parameters,
-                pushes=robot.pushes,
+                disturbances=robot.disturbances,
             )
 
 

@@ -58,7 +58,9 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    seeds = {"force_noise": scenario.force.seed} if scenario.force.is_measured else {}
+    seeds = (
+        {"force_noise": scenario.force_feedback.seed} if scenario.force_feedback.is_measured else {}
+    )
     if scenario.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
     (found,) = run_loop(

@@ -21,6 +21,7 @@ from drake_dae.scenario.forms.reader import Reader
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
+    DisturbanceForce,
     Encoders,
     Force,
     ForceOutput,
@@ -30,7 +31,6 @@ from drake_dae.scenario.parts.families import (
     Output,
     Payload,
     Plant,
-    Push,
     Reference,
     Sampling,
     Stage,
@@ -90,12 +90,12 @@ class Scenario:
             takes the control with the least sum of weight * (u - free_control)^2. The parameter
             "free_control" is zero where `exogenous` has it not.
         actuation: Stages from the joints toward the motor; none is rigid joints.
-        force: Whether the law uses its model's force or a measured one.
+        force_feedback: Whether the law uses its model's force or a measured one.
         plant_parameters: Parameter name -> what the plant has and the law's model does not; one
             number for all entries, or a list. A surface that may be tilted has `rpy`.
         plant_payloads: Masses that the plant carries and the law's model does not.
-        plant_pushes: Forces on the plant for some time, which the law does not know.
-        loads: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
+        plant_disturbances: Disturbance forces on the plant, unknown to the law.
+        known_forces: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
             `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
             for example.
@@ -107,13 +107,13 @@ class Scenario:
             `integral`, `constraint_damping` and `observer`, and with measured force; see
             `contact_gains`. The scenario as run has them all. With `actuation` nothing is advised
             there.
-        integral: Names of outputs whose errors are integrated as well, which take a pole more:
-            positions, and forces where `force` is measured; none where left out beside `gains`.
+        integral: Names of outputs whose errors are integrated as well, with one more pole:
+            positions, and forces if `force_feedback` is measured; none if left out while `gains`
+            are given.
         constraint_damping: What the law's model demands of constraints that give way, written as
             gains are, for r_i - 1 poles per constraint; none where left out beside `gains`.
-        observer: How the law observes what its model lacks, a disturbance and coefficients of
-            friction, where `force` is measured and the law is sampled; not at all where left out
-            beside `gains`.
+        observer: The observer of a disturbance and of coefficients of friction, for a sampled law
+            with measured `force_feedback`; none if left out while `gains` are given.
         plant: Whether constraints are ideal; or open and close; or Drake's own contact is in their
             place: a discrete MultibodyPlant, with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; left out, it acts continuously.
@@ -144,11 +144,11 @@ class Scenario:
     forces: list[ForceOutput] | None = None
     control_weights: list[float] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)
-    force: Force = field(default_factory=parts.ModelForce)
+    force_feedback: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, float | list[float]] = field(default_factory=dict)
     plant_payloads: list[Payload] = field(default_factory=list)
-    plant_pushes: list[Push] = field(default_factory=list)
-    loads: list[Load] = field(default_factory=list)
+    plant_disturbances: list[DisturbanceForce] = field(default_factory=list)
+    known_forces: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
     gains: Gains | None = None

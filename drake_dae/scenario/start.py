@@ -48,7 +48,7 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
             plant.set_state(own, _standing(scenario, loop, plant.current_parameters(own)))
     else:
         _begin_with_references(scenario, loop, context)
-    loop.set_seed(context, scenario.force.seed)
+    loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
     return context

@@ -16,7 +16,7 @@ _SETTINGS = {
     "encoders": "encoders",
     "tolerances": "tolerances",
     "plant_payloads": "plant_exogenous",
-    "plant_pushes": "plant_exogenous",
+    "plant_disturbances": "plant_exogenous",
 }
 """Key of a scenario -> what it becomes among the settings of a loop."""
 
@@ -67,7 +67,7 @@ def task_controller(
 def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
     """The constraint that opens and closes."""
     assert scenario.task is not None
-    fitting = {one.name: one for one in model.constraints if one.can_only_push == (True,)}
+    fitting = {one.name: one for one in model.constraints if one.is_unilateral == (True,)}
     name = scenario.task.contact
     with at("task.contact"):
         if name:

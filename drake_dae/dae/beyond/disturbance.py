@@ -154,8 +154,8 @@ class Observation:
             for j, i in enumerate(frictions.values())
         ]
         pressed = {"constraint_input": v}
-        rubbing = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
-        friction = system.trace("friction", rubbing, pressed)
+        frictional = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
+        friction = system.trace("friction", frictional, pressed)
 
         reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
         projector = ca.SX.eye(len(rows)) + reaction

@@ -40,7 +40,7 @@ class ContactMargin:
     time: float | None = None
 
     @property
-    def jams(self) -> bool:
+    def is_paradoxical(self) -> bool:
         """Whether the Painleve paradox occurs with the present friction."""
         return not self.reserve > 0.0
 
@@ -54,12 +54,12 @@ class ContactMargins:
     """
 
     def __init__(self, system: DaeSystem, matrix: ca.SX) -> None:
-        self._system, self._rubbing = system, system.rubbing
+        self._system, self._contacts = system, system.frictional_contacts
         self._places = [
-            system.parameter_slice(p.name).start for p in self._rubbing.frictions if p is not None
+            system.parameter_slice(p.name).start for p in self._contacts.frictions if p is not None
         ]
-        self._names = [p.name for p in self._rubbing.frictions if p is not None]
-        reserve = self._rubbing.reserve(matrix)
+        self._names = [p.name for p in self._contacts.frictions if p is not None]
+        reserve = self._contacts.reserve(matrix)
         outputs = {"matrix": ca.densify(matrix), "reserve": reserve}
         self._values = system.trace("contact margin", outputs, often=False)
         slope = {"reserve": reserve, "gradient": ca.gradient(reserve, system.state)}
@@ -77,7 +77,7 @@ class ContactMargins:
             self._values(state, values)[0].reshape(size, size)
             for values in (without, self._with_friction(parameters, unit))
         )
-        factor = critical_factor(A_0, A_0 - A_1, self._rubbing.rows)
+        factor = critical_factor(A_0, A_0 - A_1, self._contacts.rows)
         if factor * unit.max() > MEANINGLESS:
             factor = np.inf
         critical = dict(zip(self._names, (factor * unit).tolist(), strict=True))

@@ -221,7 +221,7 @@ def examine_constraints(
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
     # Friction can change the sign of A(x); the Painleve paradox is tested along motions.
-    matrix = system.rubbing.without_friction(elimination.constraint_matrix)
+    matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
     found = ConstraintStructure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),
@@ -255,7 +255,7 @@ def constraint_violation(found: ConstraintStructure) -> Violation | None:
     violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
     if margin is None:
         return None
-    matrix = found.system.rubbing.without_friction(found.elimination.constraint_matrix)
+    matrix = found.system.frictional_contacts.without_friction(found.elimination.constraint_matrix)
     violation = with_numbers(violation, 2, found.manifold, found.states, matrix)
     if violation is None or violation.cause is Cause.BOUNDS:
         return violation

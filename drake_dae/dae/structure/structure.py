@@ -92,7 +92,7 @@ class Structure(ConstraintStructure):
             not determined; None if the control is not found in this way, or if friction may leave
             the motion undetermined.
         """
-        if self.system.control_metric is not None or self.system.rubbing:
+        if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
         motion = self.derivatives
         shown = ca.vertcat(motion.rate, motion.constraint_input)

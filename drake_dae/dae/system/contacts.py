@@ -42,7 +42,7 @@ class Contact:
     friction: str | None = None
 
 
-class Jam(Enum):
+class PainleveOutcome(Enum):
     """The number of motions in a Painleve paradox; the value describes it."""
 
     INCONSISTENT = (
@@ -179,13 +179,13 @@ def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[in
     return 1.0 / largest if largest > 0.0 else np.inf
 
 
-def jam(
+def painleve_outcome(
     matrix: FloatArray,
     without: FloatArray,
     force: FloatArray,
     size: FloatArray,
     rows: Sequence[int],
-) -> Jam | None:
+) -> PainleveOutcome | None:
     """The outcome of a Painleve paradox, by the linear complementarity problem of all sets.
 
     Args:
@@ -199,12 +199,12 @@ def jam(
         None if exactly one set of forces fits and keeps a contact, or if this cannot be decided.
     """
     if not np.all(np.isfinite(force)):
-        return Jam.INCONSISTENT
+        return PainleveOutcome.INCONSISTENT
     edge = np.abs(without) @ np.abs(force)
     if not np.all(edge <= FAR * size):
-        return Jam.INCONSISTENT  # A is singular, and no forces balance b.
+        return PainleveOutcome.INCONSISTENT  # A is singular, and no forces balance b.
     if np.all(np.abs(matrix @ force) <= edge / FAR):
-        return Jam.INDETERMINATE  # A is singular, and several forces balance b.
+        return PainleveOutcome.INDETERMINATE  # A is singular, and several forces balance b.
     free = -matrix @ force
     fitting = []
     for used in _sets(len(matrix), rows, with_none=True):
@@ -218,10 +218,10 @@ def jam(
         if np.all(force[rows][kept] >= 0.0) and np.all(rate[~kept] >= 0.0):
             fitting.append(kept)
     if not fitting:
-        return Jam.INCONSISTENT
+        return PainleveOutcome.INCONSISTENT
     if len(fitting) > 1:
-        return Jam.INDETERMINATE
-    return None if fitting[0].any() else Jam.OPENING
+        return PainleveOutcome.INDETERMINATE
+    return None if fitting[0].any() else PainleveOutcome.OPENING
 
 
 def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:

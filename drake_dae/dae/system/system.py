@@ -258,7 +258,7 @@ class DaeSystem:
         return Exogenous(self.name, self.parameters)
 
     @cached_property
-    def rubbing(self) -> Contacts:
+    def frictional_contacts(self) -> Contacts:
         """The unilateral contacts, if friction acts on one of them; see `dae.system.contacts`."""
         return Contacts(self.name, self.constraint_input_signals, self.parameters, self.contacts)
 

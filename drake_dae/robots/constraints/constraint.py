@@ -101,7 +101,7 @@ class Constraint(ABC):
        rate is a velocity in m/s.
     4. `reaction` is linear in lambda: the gradient of that power with respect to the velocities.
        Further forces proportional to lambda, such as friction, are added.
-    5. `can_only_push` marks unilateral rows: lambda >= 0 pushes the robot to the free side.
+    5. `is_unilateral` marks unilateral rows: lambda >= 0 pushes the robot to the free side.
     6. `applications` are the forces and moments of `reaction`, each on one frame, and the opposite
        on another: the plant's port `constraint_wrenches` consists of these. There are none if the
        frames are not known, as for two angles in textbook equations. Pictures show the first.
@@ -187,7 +187,7 @@ class Constraint(ABC):
         return found
 
     @property
-    def can_only_push(self) -> tuple[bool, ...]:
+    def is_unilateral(self) -> tuple[bool, ...]:
         """Whether each constraint force is unilateral (not negative)."""
         return (False,) * len(self.force_signals)
 

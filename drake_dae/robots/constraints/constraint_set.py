@@ -215,7 +215,7 @@ class ConstraintSet:
             Contact(signal.name, constraint.friction_parameter)
             for constraint in self.constraints
             for signal, pushes in zip(
-                constraint.force_signals, constraint.can_only_push, strict=True
+                constraint.force_signals, constraint.is_unilateral, strict=True
             )
             if pushes
         ]

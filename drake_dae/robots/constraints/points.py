@@ -51,7 +51,7 @@ class PointOnSurface(Constraint):
         frame: Name of the frame.
         surface: A surface in the world.
         point: The point in the frame, m, shape (3,).
-        name: XX3
+        name: The name of the constraint, the prefix of its force and its parameters.
         rpy: Roll, pitch and yaw of the surface, rad, shape (3,): about the fixed axes x, y, z in
             this order, as in Drake. None for no rotation and no such parameter.
         friction: mu, not negative; None for no friction and no such parameters.
@@ -71,19 +71,19 @@ class PointOnSurface(Constraint):
     stiction_tolerance: float = 1e-3
     viscous_friction: float | None = None
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
-    can_only_push: ClassVar[tuple[bool, ...]] = (True,)
+    is_unilateral: ClassVar[tuple[bool, ...]] = (True,)
 
     def __post_init__(self) -> None:
         position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
         turns = []
         if self.rpy is not None:
             turns.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
-        rubbing = friction_parameters(
+        frictional = friction_parameters(
             self.name, self.friction, self.stiction_tolerance, self.viscous_friction
         )
         surface, shape = with_parameters(self.name, self.surface)
         object.__setattr__(self, "surface", surface)
-        object.__setattr__(self, "parameters", (position, *turns, *rubbing, *shape))
+        object.__setattr__(self, "parameters", (position, *turns, *frictional, *shape))
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -147,16 +147,16 @@ class PointOnSurface(Constraint):
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
         pushed = super().reaction(kinematics, constraint_force)
-        rubbing = self._friction(kinematics)
-        if rubbing is None or self.friction is None:
+        frictional = self._friction(kinematics)
+        if frictional is None or self.friction is None:
             return pushed
-        return pushed + kinematics.push(self.frame, rubbing.pull * constraint_force, self.point)
+        return pushed + kinematics.push(self.frame, frictional.pull * constraint_force, self.point)
 
     def drag(self, kinematics: Kinematics) -> Reaction | None:
-        rubbing = self._friction(kinematics)
-        if rubbing is None or rubbing.drag is None:
+        frictional = self._friction(kinematics)
+        if frictional is None or frictional.drag is None:
             return None
-        return kinematics.push(self.frame, rubbing.drag, self.point)
+        return kinematics.push(self.frame, frictional.drag, self.point)
 
     def coordinates(self, frames: Frames) -> ca.SX:
         return self.surface.coordinates(self.offset(frames))
@@ -170,9 +170,9 @@ class PointOnSurface(Constraint):
         )
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        push, drag, rubbing = self._normal(kinematics), None, self._friction(kinematics)
-        if rubbing is not None:
-            push, drag = push + rubbing.pull, rubbing.drag
+        push, drag, frictional = self._normal(kinematics), None, self._friction(kinematics)
+        if frictional is not None:
+            push, drag = push + frictional.pull, frictional.drag
         point = kinematics.position(self.frame, self.point)
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
 

@@ -185,7 +185,7 @@ class RollingBall(Constraint):
     along: Vector = (1.0, 0.0, 0.0)
     name: str = "ball"
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
-    can_only_push: ClassVar[tuple[bool, ...]] = (True, False, False)
+    is_unilateral: ClassVar[tuple[bool, ...]] = (True, False, False)
 
     def __post_init__(self) -> None:
         if not self.surface.has_exact_distance:

@@ -71,14 +71,12 @@ class TrackingController(ParameterizedSystem, Controller):
         outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
         integral_limits: The largest |integral| of each error in its unit times s, a number or shape
             (k,), positive. Converted to AutoDiffXd there are no limits and no `hold`, and an
-            integrated force has direct feedthrough, so that it must come from a sensor.
-        sample_period: Integrals are sums of the errors at the multiples of this time in s, as those
-            of a `Sampling`, and do not convert; 0 for continuous integrals. For a discrete plant,
-            whose state jumps, use samples.
+            integrated force must come from a sensor.
+        sample_period: The sample period of integrals in s, as for discrete plants; they then do
+            not convert. 0 for continuous integrals.
         references: R if the port `reference` has no wire; None if it needs one.
         feedback: Whether there is an output port `feedback`, for a law that takes only the state
-            and `references`. The plant then distinguishes trial states and records the law's
-            parameters. The other ports remain for logging, and raise errors also at trial states.
+            and `references`. The other ports are then for logging.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.

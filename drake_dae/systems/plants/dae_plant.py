@@ -330,7 +330,7 @@ class DaePlant(ParameterizedSystem, Plant):
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
     ) -> SimulationError:
         """In a Painleve paradox, the error with its outcome."""
-        if not (self.dae.rubbing and isinstance(error, SingularityError)):
+        if not (self.dae.frictional_contacts and isinstance(error, SingularityError)):
             return error
         control = inputs[0] if self._is_controlled else np.zeros(0)
         given = (control,) if self._force_needs_control else ()

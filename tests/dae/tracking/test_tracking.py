@@ -61,7 +61,7 @@ def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(proble
     u = ca.SX.sym("u", system.num_controls)
     if motion is None:
         by_matrix = law.structure.derivatives.inverse(law.structure.highest_derivatives, u) is None
-        assert by_matrix or system.rubbing or system.control_metric is not None
+        assert by_matrix or system.frictional_contacts or system.control_metric is not None
         return
     rate = elimination.f_star + ca.mtimes(elimination.h_star, u)
     force = elimination.alpha + ca.mtimes(elimination.beta, u)

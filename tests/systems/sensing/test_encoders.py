@@ -191,7 +191,8 @@ def test_encoders_and_force_sensor_of_one_seed_have_noise_of_their_own(seed):
     """Numbers of one generator would make errors of the force and of the positions follow."""
     found = scenario(
         "two_link_wall",
-        f"force=!MeasuredForce {{sample_period: 2.0e-3, noise_deviation: 0.1, seed: {seed}}}",
+        "force_feedback=!MeasuredForce {sample_period: 2.0e-3, noise_deviation: 0.1, "
+        f"seed: {seed}}}",
         f"encoders={{position_noise: 1.0e-6, velocity_noise: 1.0e-3, seed: {seed}}}",
         *SAMPLED,
     )

@@ -19,10 +19,10 @@ def check_model(model: RobotModel) -> None:
     """
     if model.links.plant is None:
         raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
-    if model.dae.exogenous or model.loads:
+    if model.dae.exogenous or model.known_forces:
         raise ModelError(
-            "Drake's contact as the plant takes no exogenous signals and no loads; forces that the "
-            "law does not know are pushes (plant_pushes)"
+            "Drake's contact as the plant takes no exogenous signals and no known_forces; forces "
+            "that the law does not know are disturbance forces (plant_disturbances)"
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")

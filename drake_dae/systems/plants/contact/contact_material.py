@@ -88,7 +88,7 @@ def surface_properties(
 
 
 def _common_properties(material: ContactMaterial, friction: float) -> ProximityProperties:
-    properties, rubbing = ProximityProperties(), CoulombFriction(friction, friction)
+    properties, frictional = ProximityProperties(), CoulombFriction(friction, friction)
     # Two equal springs in series have half their stiffness.
-    AddContactMaterial(material.dissipation, 2.0 * material.stiffness, rubbing, properties)
+    AddContactMaterial(material.dissipation, 2.0 * material.stiffness, frictional, properties)
     return properties

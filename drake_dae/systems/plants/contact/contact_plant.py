@@ -46,7 +46,10 @@ from drake_dae.systems.plants.contact.contact_material import (
     ball_properties,
     surface_properties,
 )
-from drake_dae.systems.plants.contact.pushes import AppliedPushes, Push
+from drake_dae.systems.plants.contact.disturbance_forces import (
+    AppliedDisturbances,
+    DisturbanceForce,
+)
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
 from drake_dae.systems.plants.contract import Plant
 
@@ -90,7 +93,7 @@ class ContactPlant(Diagram, Plant):
         structure: The structure of the model's system.
         parameters: Parameter name -> the plant's value if it differs from the model: positions and
             friction of surfaces, masses of bodies, and numbers of stages.
-        pushes: Forces on the robot that its law does not know.
+        disturbances: Forces on the robot that its law does not know.
 
     Attributes:
         dae, model, structure, time_step: As for `Plant`.
@@ -113,7 +116,7 @@ class ContactPlant(Diagram, Plant):
         *,
         structure: ConstraintStructure,
         parameters: Mapping[str, ArrayLike] | None = None,
-        pushes: Sequence[Push] = (),
+        disturbances: Sequence[DisturbanceForce] = (),
     ) -> None:
         super().__init__()
         check_model(model)
@@ -138,9 +141,9 @@ class ContactPlant(Diagram, Plant):
         plant.Finalize()
         check_same(plant, model)
         self._masses = self._other_masses()
-        if pushes:
-            frames = [frame_named(plant, push.frame) for push in pushes]
-            applied = builder.AddSystem(AppliedPushes(plant, pushes, frames))
+        if disturbances:
+            frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
+            applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
             port = plant.get_applied_spatial_force_input_port()
             builder.Connect(applied.get_output_port(), port)
 

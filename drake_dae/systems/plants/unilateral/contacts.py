@@ -8,14 +8,14 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, number, show, unknown_name
-from drake_dae.dae.system.contacts import Jam, jam
+from drake_dae.dae.system.contacts import PainleveOutcome, painleve_outcome
 from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import JammedContactError, ModelError
+from drake_dae.errors import ModelError, PainleveError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.unilateral.frictional import Rubbing
+from drake_dae.systems.plants.unilateral.frictional import FrictionalContact
 from drake_dae.systems.plants.unilateral.impacts import Touch, is_p_matrix
 
 
@@ -51,7 +51,9 @@ class Terms:
         m = self.accelerations.size
         return self.all_impulses[:m, :m]
 
-    def jam(self, kept: Sequence[int], normals: Sequence[int]) -> Jam | None:
+    def painleve_outcome(
+        self, kept: Sequence[int], normals: Sequence[int]
+    ) -> PainleveOutcome | None:
         """What becomes of contacts that touch and rub; None where one set of forces fits.
 
         Args:
@@ -71,7 +73,7 @@ class Terms:
         force = np.full(len(rows), np.inf)
         with suppress(np.linalg.LinAlgError):
             force[:] = np.linalg.solve(matrix, -offset)
-        return jam(matrix, without, force, self.size[rows], places)
+        return painleve_outcome(matrix, without, force, self.size[rows], places)
 
 
 class UnilateralContacts:
@@ -103,8 +105,8 @@ class UnilateralContacts:
         fitting = [
             name
             for name, (constraint, _) in parts.items()
-            if sum(constraint.can_only_push) == 1
-            and constraint.can_only_push.index(True) < constraint.residual(model.links).numel()
+            if sum(constraint.is_unilateral) == 1
+            and constraint.is_unilateral.index(True) < constraint.residual(model.links).numel()
         ]
         if not restitution:
             raise ModelError(
@@ -128,7 +130,7 @@ class UnilateralContacts:
         self.touches = []
         for name in self.names:
             constraint, part = parts[name]
-            normal = part.start + constraint.can_only_push.index(True)
+            normal = part.start + constraint.is_unilateral.index(True)
             self.touches.append(Touch(normal, np.arange(part.start, part.stop)))
         own = {int(row) for touch in self.touches for row in touch.rows}
         self.kept: Indices = np.array(
@@ -192,7 +194,9 @@ class UnilateralContacts:
             start += size
         return kinematics.value(ca.vertcat(*rows))
 
-    def rubbing(self, place: int, parameters: FloatArray, restitution: float) -> Rubbing:
+    def frictional_contact(
+        self, place: int, parameters: FloatArray, restitution: float
+    ) -> FrictionalContact:
         """How a contact rubs in an impact.
 
         What restricts its velocities besides, as where it sticks, holds as far as it pushes.
@@ -200,8 +204,10 @@ class UnilateralContacts:
         touch, mu = self.touches[place], self._friction[place]
         others = touch.rows[touch.rows != touch.normal]
         if mu is None or others.size:
-            return Rubbing(touch.normal, others, np.inf, restitution)
-        return Rubbing(touch.normal, self.along[place], float(parameters[mu]), restitution)
+            return FrictionalContact(touch.normal, others, np.inf, restitution)
+        return FrictionalContact(
+            touch.normal, self.along[place], float(parameters[mu]), restitution
+        )
 
     def holds(self, closed: Sequence[bool]) -> FloatArray:
         """For each entry of the residual 1, or 0 where it is that of a contact that is open."""
@@ -232,15 +238,15 @@ class UnilateralContacts:
             size=np.abs(slope[:m]) @ np.abs(solved[:, 0]) + np.abs(drift),
         )
 
-    def jammed(
-        self, time: float, state: FloatArray, names: Sequence[str], found: Jam | None
-    ) -> JammedContactError:
-        """The error where friction jams contacts."""
+    def painleve_error(
+        self, time: float, state: FloatArray, names: Sequence[str], found: PainleveOutcome | None
+    ) -> PainleveError:
+        """The error of a Painleve paradox."""
         outcome = f". What becomes of it is {found.value}" if found else ""
-        return JammedContactError(
-            f"{self.dae.name}: friction jams the contact of {', '.join(names)} at t = {time:.6g} "
-            f"s, state {show(state)} (Painleve){outcome}. Lower the friction, slide the other way, "
-            "or hold the robot less steeply to the surface",
+        return PainleveError(
+            f"{self.dae.name}: Painleve paradox at the contact of {', '.join(names)} at "
+            f"t = {time:.6g} s, state {show(state)}{outcome}. Lower the friction, slide the other "
+            "way, or hold the robot less steeply to the surface",
             time,
             state,
             found,

@@ -40,7 +40,7 @@ HALVINGS = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Rubbing:
+class FrictionalContact:
     """The rows of one contact that rubs.
 
     Attributes:
@@ -57,7 +57,7 @@ class Rubbing:
 
 
 def impact(
-    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[FrictionalContact]
 ) -> FloatArray | None:
     """The impulses Lambda of contacts that rub, shape (k,).
 
@@ -85,7 +85,7 @@ def impact(
     return best
 
 
-def _bouncing(contacts: Sequence[Rubbing], factor: float) -> list[Rubbing]:
+def _bouncing(contacts: Sequence[FrictionalContact], factor: float) -> list[FrictionalContact]:
     return [replace(one, restitution=factor * one.restitution) for one in contacts]
 
 
@@ -97,7 +97,7 @@ def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> flo
 
 
 def _impulses(
-    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[FrictionalContact]
 ) -> FloatArray | None:
     # What is kept follows from the contacts: c_k = 0.
     inverse = np.linalg.pinv(matrix[np.ix_(kept, kept)], DEPENDENT, hermitian=True)
@@ -123,7 +123,7 @@ def _impulses(
     return total
 
 
-def _axes(matrix: FloatArray, one: Rubbing) -> FloatArray:
+def _axes(matrix: FloatArray, one: FrictionalContact) -> FloatArray:
     """The normal, and those directions along the surface that it rubs along, as columns."""
     rows = one.along if one.friction else one.along[:0]
     values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])

@@ -48,7 +48,7 @@ class UnilateralRobotPlant(ModalPorts):
     - It opens where lambda falls through zero, or where a control that jumps pulls at it.
     - Where contacts depend on each other, as four feet of a table, as few as do carry it, and the
       others touch without force. Where friction leaves no motion, or two, the run ends with a
-      JammedContactError.
+      PainleveError.
 
     Drake's Simulator finds these moments as zeros of witness functions, to within a hundredth of
     the context's accuracy in s under error control, and in steps with a fixed step. So it must be
@@ -96,7 +96,7 @@ class UnilateralRobotPlant(ModalPorts):
             surface.
         AssumptionError: The constraints of a mode are dependent.
         SimulationError: No forces fit, impacts do not end, or the context has no accuracy.
-        JammedContactError: Friction jams a contact (Painleve), which has no motion, or two.
+        PainleveError: The Painleve paradox: a contact with no motion, or two.
     """
 
     __slots__ = SHARED_DICTIONARY

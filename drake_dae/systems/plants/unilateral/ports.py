@@ -246,17 +246,19 @@ class ModalPorts(ParameterizedSystem, Plant):
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
     ) -> SimulationError:
-        """Where friction jams a contact, that, and whether any motion fits."""
-        if not (self.dae.rubbing and isinstance(error, SingularityError) and self._now):
+        """In a Painleve paradox, the error with its outcome."""
+        if not (self.dae.frictional_contacts and isinstance(error, SingularityError) and self._now):
             return error
         control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
         bound = self._contacts
         terms = bound.terms(error.state, control, parameters)
         places = [i for i, shut in enumerate(self._now.closed) if shut]
-        found = terms.jam(bound.kept.tolist(), [bound.normals[i] for i in places])
+        found = terms.painleve_outcome(bound.kept.tolist(), [bound.normals[i] for i in places])
         if found is None:
             return error
-        return bound.jammed(error.time, error.state, [self.contacts[i] for i in places], found)
+        return bound.painleve_error(
+            error.time, error.state, [self.contacts[i] for i in places], found
+        )
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:
         output.SetFrom(context.get_continuous_state_vector())

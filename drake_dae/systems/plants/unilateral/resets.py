@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.system.contacts import Jam
+from drake_dae.dae.system.contacts import PainleveOutcome
 from drake_dae.errors import SimulationError
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 from drake_dae.systems.plants.unilateral.contacts import Terms, UnilateralContacts
@@ -126,10 +126,12 @@ class Resets:
                 x,
             )
         touches = [contacts.touches[i] for i in touching]
-        if contacts.dae.rubbing:
-            found = terms.jam(contacts.kept.tolist(), [touch.normal for touch in touches])
-            if found in (Jam.INCONSISTENT, Jam.INDETERMINATE):
-                raise contacts.jammed(time, x, [contacts.names[i] for i in touching], found)
+        if contacts.dae.frictional_contacts:
+            found = terms.painleve_outcome(
+                contacts.kept.tolist(), [touch.normal for touch in touches]
+            )
+            if found in (PainleveOutcome.INCONSISTENT, PainleveOutcome.INDETERMINATE):
+                raise contacts.painleve_error(time, x, [contacts.names[i] for i in touching], found)
         fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
         pushing = {touching[place] for place in fit.pushing}
         closed = tuple(i in pushing for i in range(len(closed)))
@@ -164,9 +166,12 @@ class Resets:
         touches = [contacts.touches[i] for i in touching]
         normals = np.array([touch.normal for touch in touches])
         matrix = terms.all_impulses
-        rubbing = [contacts.rubbing(i, parameters, own) for i, own in zip(touching, e, strict=True)]
-        if any(0.0 < one.friction < np.inf for one in rubbing):
-            found = impact(matrix, before, contacts.kept, rubbing)
+        frictional = [
+            contacts.frictional_contact(i, parameters, own)
+            for i, own in zip(touching, e, strict=True)
+        ]
+        if any(0.0 < one.friction < np.inf for one in frictional):
+            found = impact(matrix, before, contacts.kept, frictional)
             if found is None:
                 raise self._unfit(time, state)
             impulse = found
