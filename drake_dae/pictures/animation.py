@@ -17,8 +17,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import LEAST_SCALE, PATH_COLOR, path_of
-from drake_dae.pictures.course import Course, Loop, follow, run_extent
-from drake_dae.pictures.phases import Span, phase_spans
+from drake_dae.pictures.course import Course, ShownLoop, follow, run_extent
+from drake_dae.pictures.phases import PhaseSpan, phase_spans
 from drake_dae.pictures.surroundings import scene_extent, surroundings
 from drake_dae.pictures.view import (
     FRAME_RATE,
@@ -53,7 +53,9 @@ class AnimationPage(str):
 
 
 @checked(ModelError)
-def make_animation(loop: Loop, record: Record, context: Context, title: str = "") -> AnimationPage:
+def make_animation(
+    loop: ShownLoop, record: Record, context: Context, title: str = ""
+) -> AnimationPage:
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
 
     The page shows the clock and the size of each constraint force at its arrow, draws the path that
@@ -80,7 +82,7 @@ def animate(
     course: Course,
     scene_graph: SceneGraph | None,
     title: str = "",
-    phases: Sequence[Span] = (),
+    phases: Sequence[PhaseSpan] = (),
 ) -> AnimationPage:
     """The page of `make_animation`.
 
@@ -208,7 +210,7 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
     return rings.reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def _with_overlay(page: str, course: Course, title: str, phases: Sequence[Span]) -> str:
+def _with_overlay(page: str, course: Course, title: str, phases: Sequence[PhaseSpan]) -> str:
     """Meshcat's page with a title, the clock, the sizes of the forces, and paths that grow."""
     constraints = course.acting.constraints
     sizes = np.linalg.norm([wrench.forces for wrench in course.wrenches], axis=2)

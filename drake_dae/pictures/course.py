@@ -26,7 +26,7 @@ _PLACES = 12
 """So many states of a run tell how much room it takes."""
 
 
-class Loop(Protocol):
+class ShownLoop(Protocol):
     """A diagram with a plant and its geometry, as a `ClosedLoop`."""
 
     @property
@@ -100,7 +100,7 @@ class ContactPath:
     points_left: bool = False
 
 
-def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
+def follow(loop: ShownLoop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
     """The course of a run of a robot.
 
     Args:

@@ -35,7 +35,7 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.course import Course, Loop, follow, run_extent
+from drake_dae.pictures.course import Course, ShownLoop, follow, run_extent
 from drake_dae.pictures.phases import phases_at
 from drake_dae.pictures.surroundings import surroundings
 from drake_dae.robots.constraint_wrenches import own_values
@@ -65,7 +65,7 @@ Pixels = NDArray[np.uint8]
 
 
 @checked(ModelError)
-def save_film(loop: Loop, record: Record, context: Context, path: str | Path) -> None:
+def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Path) -> None:
     """Films a record of a robot with the paths and the forces of its contacts.
 
     The path so far is blue, the one that the reference wants green; a star is an impact.

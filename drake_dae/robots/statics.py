@@ -6,7 +6,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
 
 class Placing:
@@ -42,7 +42,7 @@ class Placing:
             phi, h_1, _, _ = self._function(q, parameters)
             return np.concatenate([phi, h_1[:count] - outputs])  # (58)
 
-        def linearize(q: FloatArray) -> Linearization | None:
+        def linearize(q: FloatArray) -> NewtonModel | None:
             _, _, J, P = self._function(q, parameters)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
@@ -108,7 +108,7 @@ class Balance:
         def residual(unknown: FloatArray) -> FloatArray:
             return self._function(q, forces, unknown, parameters)[0]
 
-        def linearize(unknown: FloatArray) -> Linearization | None:
+        def linearize(unknown: FloatArray) -> NewtonModel | None:
             balance, gradient, _ = self._function(q, forces, unknown, parameters)
             gradient = gradient.reshape(balance.size, -1)
             # Currents and forces differ by orders of magnitude.
@@ -116,7 +116,7 @@ class Balance:
             steps = shortest_steps(gradient / scale, residual)
             if steps is None:
                 return None
-            return Linearization(lambda x: steps.step(x) / scale, steps.is_regular)
+            return NewtonModel(lambda x: steps.step(x) / scale, steps.is_regular)
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
         left, _, constraint_force = self._function(q, forces, solution, parameters)

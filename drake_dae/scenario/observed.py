@@ -1,4 +1,4 @@
-"""The system that the law of a scenario with an observer is for."""
+"""The system of the law of a scenario with an observer."""
 
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
@@ -9,7 +9,7 @@ from drake_dae.scenario.scenario import Scenario
 
 
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
-    """The structure of what a scenario's law is for: with a disturbance, where it is observed.
+    """The structure of the system of a scenario's law, with a disturbance if it is observed.
 
     Raises:
         ScenarioError: The observer does not fit; the message names its key.

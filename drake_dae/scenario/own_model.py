@@ -19,12 +19,12 @@ from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 
 @dataclass(frozen=True, eq=False)
 class OwnModel:
-    """The model of a plant that is not its law's.
+    """The model of a plant that differs from its law's.
 
     Attributes:
         scenario: The scenario in which the payloads and disturbances are known.
         model, structure: The robot with them.
-        scene_graph: Where its geometry is registered.
+        scene_graph: The scene graph of its geometry.
     """
 
     scenario: Scenario
@@ -34,7 +34,7 @@ class OwnModel:
 
 
 def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
-    """The model of a scenario's ideal plant; None if that of its law will do.
+    """The model of a scenario's ideal plant; None if it is that of its law.
 
     A payload is a further body, and a disturbance is a force like those of `known_forces` as an
     exogenous signal.
@@ -71,7 +71,7 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
 
 
 def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:
-    """Refuses disturbances on frames that are not there, or stand still.
+    """Refuses disturbances on unknown or fixed frames.
 
     Raises:
         ScenarioError: There is no such frame of the robot.

@@ -1,4 +1,4 @@
-"""The controller of a scenario with a task, and what such a scenario cannot have."""
+"""The controller of a scenario with a task, and the keys that it excludes."""
 
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ScenarioError
@@ -18,11 +18,11 @@ _SETTINGS = {
     "plant_payloads": "plant_exogenous",
     "plant_disturbances": "plant_exogenous",
 }
-"""Key of a scenario -> what it becomes among the settings of a loop."""
+"""Key of a scenario -> the setting of the loop."""
 
 
 def check_task(scenario: Scenario) -> None:
-    """Refuses what a task has no use for.
+    """Refuses keys that a task does not support.
 
     Raises:
         ScenarioError: A key does not fit a task, or start.positions are missing.

@@ -31,7 +31,7 @@ LENGTHS = tuple(0.5**k for k in range(30))
 """The fractions of a Newton step that are tried."""
 
 
-class Linearization(NamedTuple):
+class NewtonModel(NamedTuple):
     """Equations linearized at an iterate.
 
     Attributes:
@@ -50,7 +50,7 @@ class Linearization(NamedTuple):
 @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
 def newton(
     start: FloatArray,
-    linearize: Callable[[FloatArray], Linearization | None],
+    linearize: Callable[[FloatArray], NewtonModel | None],
     iterations: int = ITERATIONS,
 ) -> tuple[FloatArray, bool]:
     """Damped Newton's method; a step must make the next one, by the same matrix, shorter.
@@ -124,7 +124,7 @@ def norm(vector: FloatArray) -> float:
 
 def shortest_steps(
     gradients: FloatArray, residual: Callable[[FloatArray], FloatArray]
-) -> Linearization | None:
+) -> NewtonModel | None:
     """The shortest dx with C dx = -residual(x); regular if the rows of C are independent.
 
     The rows are scaled to length one. If they are dependent, for example at the start of a search,
@@ -142,9 +142,9 @@ def shortest_steps(
     q, r = scipy.linalg.qr(rows.T, mode="economic", check_finite=False)
     if len(rows) > len(q) or np.min(np.abs(np.diag(r)), initial=1.0) <= DEPENDENT:
         inverse = np.linalg.pinv(rows, DEPENDENT)
-        return Linearization(lambda x: -inverse @ (residual(x) / length), False)
+        return NewtonModel(lambda x: -inverse @ (residual(x) / length), False)
     solve = scipy.linalg.solve_triangular
-    return Linearization(
+    return NewtonModel(
         lambda x: -q @ solve(r, residual(x) / length, trans="T", check_finite=False), True
     )
 
@@ -153,7 +153,7 @@ def steps_along(
     gradients: FloatArray,
     directions: FloatArray,
     residual: Callable[[FloatArray], FloatArray],
-) -> Linearization | None:
+) -> NewtonModel | None:
     """The steps D mu with C D mu = -residual(x); None if mu is not determined.
 
     Args:
@@ -172,7 +172,7 @@ def steps_along(
     if np.min(np.diag(factors[0])) <= DEPENDENT:
         return None
     along = directions / size
-    return Linearization(
+    return NewtonModel(
         lambda x: -along @ scipy.linalg.cho_solve(factors, residual(x) / size, check_finite=False),
         True,
     )

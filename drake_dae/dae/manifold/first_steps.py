@@ -9,7 +9,7 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import PRECISION, ROUNDING
 from drake_dae.trace.round_off import positive
 
-STEPS = 6
+NEWTON_STEPS = 6
 """The number of Newton steps in the function. One or two lead from the end of a simulation step to
 N*, the others reduce the error to round-off. One projection in a thousand takes more."""
 
@@ -36,7 +36,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
     left, gradient = ca.cse([residual.expression, residual.gradient])
     function = ca.Function("residual", [state, p], [left], {"cse": False})
     (step_for, pivots), steps = shortest_step(gradient, scale), []
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         steps.append(scale * step_for(function(state, p)))
         state += steps[-1]
     start = system.state

@@ -13,7 +13,7 @@ from drake_dae.trace.factorization import smallest_sine
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     ROUND_OFF,
-    Linearization,
+    NewtonModel,
     are_dependent,
     newton,
     norm,
@@ -98,10 +98,10 @@ class Search:
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
 
-    def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
+    def _linearize(self, state: FloatArray, parameters: FloatArray) -> NewtonModel:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""
         scale = self._residual.scale
-        return Linearization(
+        return NewtonModel(
             lambda z: self._residual.newton_step.evaluate(scale * z, state, parameters)[0].copy(),
             is_regular=True,
         )
@@ -135,7 +135,7 @@ class Search:
                 return x * self._residual.scale
         return None
 
-    def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
         """Least-squares steps that decrease the residual; its rows are scaled to length one."""
         scale = self._residual.scale
         gradients = self._residual.gradients(state, parameters) * scale

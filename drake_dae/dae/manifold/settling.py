@@ -11,7 +11,7 @@ from drake_dae.dae.manifold.residual import Residual
 from drake_dae.dae.system.layout import Indices, Layout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
-from drake_dae.trace.newton import Linearization, newton, shortest_steps, steps_along
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps, steps_along
 
 
 class Settling:
@@ -77,7 +77,7 @@ def _settle_level(
     def left(z: FloatArray) -> FloatArray:
         return residual.function(filled(z), parameters)[0][rows]
 
-    def linearize(z: FloatArray) -> Linearization | None:
+    def linearize(z: FloatArray) -> NewtonModel | None:
         x = filled(z)
         gradients = residual.gradients(x, parameters)[np.ix_(rows, columns)]
         if energy is None:

@@ -14,7 +14,7 @@ from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import ROUND_OFF, Linearization, newton
+from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton
 
 
 @checked(ModelError)
@@ -175,11 +175,11 @@ class NormalForm:
         def left(z: FloatArray) -> FloatArray:
             return target - self._coordinates.evaluate(scale * z, parameters)[0]
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             solve = _solver(self._at(scale * z, parameters)[1] * scale)
             if solve is None:
                 return None
-            return Linearization(lambda z: solve(left(z)), True)
+            return NewtonModel(lambda z: solve(left(z)), True)
 
         found, converged = newton(state / scale, linearize)
         return scale * found if converged else None

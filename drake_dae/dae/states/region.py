@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.newton import Linearization, newton
+from drake_dae.trace.newton import NewtonModel, newton
 
 _SLACK = 1e-6
 """The allowed distance of a state from the box after Newton's method, relative to the box."""
@@ -166,7 +166,7 @@ class ConsistentRegion:
         scale = self.manifold.system.scale
         low, high = region.low / scale, region.high / scale
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             gradient = self.manifold.gradients(scale * z) * scale
             if not np.all(np.isfinite(gradient)):
                 return None
@@ -175,7 +175,7 @@ class ConsistentRegion:
                 residual = self.manifold.residual(scale * z)
                 return _bounded_step(gradient, residual, low - z, high - z)
 
-            return Linearization(step, True)
+            return NewtonModel(step, True)
 
         return scale * newton(np.clip(guess / scale, low, high), linearize)[0]
 

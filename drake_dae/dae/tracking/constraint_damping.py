@@ -17,7 +17,7 @@ from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.errors import AdviceWarning, GainError, ModelError
 from drake_dae.trace.given import result_of
 
-STEPS = 200
+INTERVALS = 200
 """The number of steps of an interval in the search for the best damping, which is refined once."""
 
 STIFFER = 2.0
@@ -165,9 +165,9 @@ def best_damping(stiffness: float, mobility: float, sample_time: float, delay: i
         return critical
     step, low, high = _step(frequency, sample_time), 0.0, critical
     for _ in range(2):
-        tried = np.linspace(low, high, STEPS + 1)
+        tried = np.linspace(low, high, INTERVALS + 1)
         best = int(np.argmin([_radius(step, c, delay) for c in tried]))
-        low, high = tried[max(best - 1, 0)], tried[min(best + 1, STEPS)]
+        low, high = tried[max(best - 1, 0)], tried[min(best + 1, INTERVALS)]
     return float(tried[best])
 
 

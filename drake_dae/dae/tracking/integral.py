@@ -9,7 +9,7 @@ from drake_dae.arrays import unknown_name
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.measured_force import MeasuredForce
+from drake_dae.dae.tracking.measured_force import ForceMeasurement
 from drake_dae.errors import GainError
 
 
@@ -41,7 +41,7 @@ class IntegralAction:
         system: DaeSystem,
         degrees: Sequence[int],
         names: Sequence[str],
-        measured: MeasuredForce | None,
+        measured: ForceMeasurement | None,
     ) -> "IntegralAction":
         """Integral action on outputs by their names.
 
@@ -91,7 +91,7 @@ class IntegralAction:
             rows.append(errors[starts[i] : starts[i] + degree, :])
         return ca.vertcat(ca.SX(0, 1), *rows)
 
-    def rate(self, chain: ca.SX, values: ca.SX, measured: MeasuredForce | None) -> ca.SX:
+    def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
         """sigma' = z - r of these outputs, shape (k, 1).
 
         Args:

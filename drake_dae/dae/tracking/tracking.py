@@ -17,7 +17,7 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.constraint_damping import damped
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.integral import IntegralAction
-from drake_dae.dae.tracking.measured_force import MeasuredForce
+from drake_dae.dae.tracking.measured_force import ForceMeasurement
 from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.given import result_of
@@ -33,7 +33,7 @@ class TrackingLaw:
     with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
     exactly. If there are more controls than outputs, the system's `control_metric` and
     `free_control` choose u. The law needs the state x. It does not need a measurement of the
-    constraint inputs, but can use one with `measured_force`; see `MeasuredForce`.
+    constraint inputs, but can use one with `measured_force`; see `ForceMeasurement`.
 
     The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
     numbers.
@@ -301,9 +301,9 @@ class TrackingLaw:
 
 def _measured_force(
     system: DaeSystem, layout: Layout, wanted: bool, gain: ArrayLike
-) -> MeasuredForce | None:
+) -> ForceMeasurement | None:
     if wanted:
-        return MeasuredForce.of(system, layout, gain)
+        return ForceMeasurement.of(system, layout, gain)
     if numbers("force_gain", gain, GainError).any():
         raise GainError("force_gain needs measured_force=True")
     return None

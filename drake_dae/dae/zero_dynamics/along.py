@@ -6,9 +6,9 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause, PinnedMotion
+from drake_dae.dae.zero_dynamics.long_term import Behavior, behavior_of, carry_in_halves, leave
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause, PinnedMotion
 from drake_dae.dae.zero_dynamics.returns import Return, close, find_multiple
-from drake_dae.dae.zero_dynamics.settling import Fate, carry_in_halves, fate_of, leave
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 
@@ -58,7 +58,7 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
         period: The period of the reference; None if it has none.
     """
     if motion.ending is not None:
-        unbounded = motion.ending.cause is Cause.UNBOUNDED
+        unbounded = motion.ending.cause is EndCause.UNBOUNDED
         verdict = Verdict.UNSTABLE if unbounded else Verdict.UNDECIDED
         return StabilityAlong.without_numbers(verdict, f"the motion ends: {motion.ending}", period)
     if motion.times.size < 2:
@@ -103,10 +103,10 @@ def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
         repeating, turning = flow.repeating(begin, period), 2.0 * np.pi / period
         rate = float(exponents[0])
         course = leave(repeating, closed.state, begin, rate, turning, period)
-        verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
-            course.fate, verdict
+        verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
+            course.behavior, verdict
         )
-        if course.fate not in (Fate.UNCLEAR, Fate.GROWS, Fate.SPREADS):
+        if course.behavior not in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
             reason += f"; what leaves it {course}"
     else:
         count = np.count_nonzero(np.abs(sizes - 1.0) <= errors)
@@ -126,22 +126,22 @@ def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> Sta
     try:
         passage, halves = carry_in_halves(flow, motion.states[middle], begin, end)
     except Lost as lost:
-        verdict = Verdict.UNSTABLE if lost.cause is Cause.UNBOUNDED else Verdict.UNDECIDED
+        verdict = Verdict.UNSTABLE if lost.cause is EndCause.UNBOUNDED else Verdict.UNDECIDED
         reason = f"from x = {show(motion.states[middle])}: {lost}"
         return StabilityAlong.without_numbers(verdict, reason, period)
-    fate = fate_of(passage, *halves)
+    behavior = behavior_of(passage, *halves)
     verdict = {
-        Fate.SPREADS: Verdict.UNSTABLE,
-        Fate.SETTLES: Verdict.STABLE,
-    }.get(fate, Verdict.UNDECIDED)
+        Behavior.SPREADS: Verdict.UNSTABLE,
+        Behavior.SETTLES: Verdict.STABLE,
+    }.get(behavior, Verdict.UNDECIDED)
     sizes = np.linalg.svd(passage.transition, compute_uv=False)
     exponents = (np.log(np.maximum(sizes, 1e-300)) + passage.growth) / (end - begin)
     reason = (
         f"from {begin:.6g} to {end:.6g} s disturbances of the motion change by a factor "
         f"{np.exp(min(passage.growth, 700.0)):.3g} at most, {exponents[0]:.3g} 1/s"
     )
-    if fate is Fate.WANDERS:
-        reason += f"; the motion {fate.value}"
+    if behavior is Behavior.WANDERS:
+        reason += f"; the motion {behavior.value}"
     elif verdict is Verdict.UNDECIDED:
         reason += "; that is not long enough to tell"
     none = np.zeros(0, dtype=complex)

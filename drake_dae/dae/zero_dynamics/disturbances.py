@@ -17,7 +17,7 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.zero_dynamics.periods import find_period
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
 from drake_dae.trace.given import result_of
@@ -25,7 +25,7 @@ from drake_dae.trace.given import result_of
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""
 
-STEPS = 5000
+MOST_STEPS = 5000
 """The largest number of steps in one interval."""
 
 SECTIONS = 16
@@ -36,13 +36,13 @@ renewed."""
 class Lost(Exception):
     """A motion cannot be followed to the end of an interval."""
 
-    def __init__(self, cause: Cause) -> None:
+    def __init__(self, cause: EndCause) -> None:
         super().__init__(cause.value)
         self.cause = cause
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
+class Transition:
     """The flow of a state on Z(R) and of its disturbances over an interval of time.
 
     Attributes:
@@ -121,12 +121,12 @@ class Flow:
         """
         found, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
         if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
-            raise Lost(Cause.NO_WAY_ON)
+            raise Lost(EndCause.NO_WAY_ON)
         return found
 
     def carry(
         self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
-    ) -> Passage:
+    ) -> Transition:
         """The state and its disturbances at the end of an interval.
 
         Raises:
@@ -134,7 +134,7 @@ class Flow:
         """
         d = self.pinned.structure.zero_dynamics_dimension
         basis, transition, growth, volume = self.basis(state, begin), np.eye(d), 0.0, 0.0
-        times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
+        times, steps = np.linspace(begin, end, SECTIONS + 1), MOST_STEPS
         for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
             columns = basis if disturbed else basis[:, :0]
             state, columns, steps = self._integrate(state, columns, start, stop, steps)
@@ -146,7 +146,7 @@ class Flow:
                 size = max(float(np.linalg.norm(transition, 2)), 1e-300)
                 transition, growth = transition / size, growth + float(np.log(size))
                 volume += max(float(np.linalg.slogdet(scaled)[1]), -700.0)
-        return Passage(state, basis, transition, growth, volume)
+        return Transition(state, basis, transition, growth, volume)
 
     def way(
         self, state: FloatArray, begin: float, end: float
@@ -156,12 +156,12 @@ class Flow:
         Raises:
             Lost: As `carry`.
         """
-        times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
+        times, steps = np.linspace(begin, end, SECTIONS + 1), MOST_STEPS
         for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
             for time, there, _ in self._steps(state, self.basis(state, start)[:, :0], start, stop):
                 steps -= 1
                 if steps < 0:
-                    raise Lost(Cause.TOO_FAST)
+                    raise Lost(EndCause.TOO_FAST)
                 state = there
                 yield time, state
             state = self.onto(state, stop)
@@ -173,7 +173,7 @@ class Flow:
         for _, there, along in self._steps(state, columns, begin, end):
             state, columns, steps = there, along, steps - 1
             if steps < 0:
-                raise Lost(Cause.TOO_FAST)
+                raise Lost(EndCause.TOO_FAST)
         return state, columns, steps
 
     def _steps(
@@ -196,7 +196,7 @@ class Flow:
                 self.pinned.rate(x, goal, p), self.pinned.slopes_along(x, goal, p, along)
             )
             if not np.all(np.isfinite(moved)):
-                raise Lost(Cause.NO_WAY_ON)
+                raise Lost(EndCause.NO_WAY_ON)
             return moved
 
         def slopes(time: float, both: FloatArray) -> FloatArray:
@@ -220,7 +220,7 @@ class Flow:
         while solver.status == "running":
             quietly(solver.step)
             if not np.max(np.abs(solver.y[:n])) <= bound:
-                raise Lost(Cause.UNBOUNDED)
+                raise Lost(EndCause.UNBOUNDED)
             if solver.status == "failed":
-                raise Lost(Cause.TOO_FAST)
+                raise Lost(EndCause.TOO_FAST)
             yield solver.t, *split(solver.y)

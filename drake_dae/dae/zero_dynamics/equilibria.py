@@ -10,14 +10,14 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.isolation import Isolation, isolation
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     balanced_norm,
     linearized_eigenvalues,
 )
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
+from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
 
 AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
@@ -115,7 +115,7 @@ class Equilibria:
 
         scale = pinned.system.scale
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             gradients = pinned.gradients(scale * z, parameters) * scale
             onto = shortest_steps(
                 gradients, lambda z: pinned.residual(scale * z, reference, parameters)
@@ -134,7 +134,7 @@ class Equilibria:
                 rate = pinned.rate(scale * z, reference, parameters) / scale
                 return across - inner @ (rate + slopes @ across)
 
-            return Linearization(step, onto.is_regular)
+            return NewtonModel(step, onto.is_regular)
 
         start = pinned.state(reference, guess, parameters)
         z, converged = newton(start / scale, linearize)

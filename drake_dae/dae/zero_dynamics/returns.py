@@ -30,7 +30,7 @@ MULTIPLES = 6
 LEAST = 1e-4
 """A motion of smaller extent than this, relative to the scale of the states, is at rest."""
 
-STEPS = 12
+NEWTON_STEPS = 12
 """The largest number of Newton steps."""
 
 CROSSINGS = 6
@@ -96,7 +96,7 @@ def close(
         patient: Whether to continue if the distance does not decrease for some steps.
     """
     scale, before = flow.scale, np.inf
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         basis = flow.basis(state, begin)
         try:
             passage = flow.carry(state, begin, begin + period)

@@ -17,7 +17,7 @@ from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 from drake_dae.trace.smoothness import length_of
 
 Vector = tuple[float, float, float]
@@ -137,7 +137,7 @@ class Surface(ABC):
             {"distance": distance, "gradient": ca.gradient(distance, p)},
         )
 
-        def linearize(point: FloatArray) -> Linearization | None:
+        def linearize(point: FloatArray) -> NewtonModel | None:
             gradient = function(point)[1]
             return shortest_steps(gradient[None], lambda x: function(x)[0])
 

@@ -62,9 +62,8 @@ class TrackingController(ParameterizedSystem, Controller):
     wire it is 0.
 
     The first two output ports have direct feedthrough from all input ports except `hold`, and
-    except `measured_force` if the law only integrates it. The context holds the model's parameters
-    and then the gains as one numeric parameter; see `set_parameter` and `set_gains`. The block
-    converts to AutoDiffXd.
+    except `measured_force` if the law only integrates it. Numeric parameter 0 holds the model's
+    parameters and then the gains. The block converts to AutoDiffXd.
 
     Args:
         law: The law.

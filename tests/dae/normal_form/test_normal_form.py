@@ -16,7 +16,7 @@ from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import Linearization, newton
+from drake_dae.trace.newton import NewtonModel, newton
 
 ROBOTS = {
     "two_link": lambda: arm("two_link").structure,
@@ -336,7 +336,7 @@ def test_continuation_arrives_where_newtons_method_alone_does_not(outputs, guess
 
     def linearize(state):
         inverse = np.linalg.inv(normal_form.jacobian(state))
-        return Linearization(
+        return NewtonModel(
             lambda z: inverse @ (coordinates - normal_form.coordinates(z)), is_regular=True
         )
 

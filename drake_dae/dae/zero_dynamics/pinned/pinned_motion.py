@@ -6,7 +6,7 @@ from enum import Enum
 from drake_dae.arrays import FloatArray
 
 
-class Cause(Enum):
+class EndCause(Enum):
     """The cause for the end of a motion with pinned outputs; the value describes it."""
 
     NO_START = "no state has the outputs that the reference begins with"
@@ -23,7 +23,7 @@ class Cause(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Ending:
+class MotionEnd:
     """The end of a motion with pinned outputs, and its cause.
 
     Attributes:
@@ -34,7 +34,7 @@ class Ending:
         text: The same as a sentence.
     """
 
-    cause: Cause
+    cause: EndCause
     time: float
     text: str
     state: FloatArray | None = None
@@ -66,4 +66,4 @@ class PinnedMotion:
     parameters: FloatArray
     constraint_margins: FloatArray
     control_margins: FloatArray
-    ending: Ending | None
+    ending: MotionEnd | None

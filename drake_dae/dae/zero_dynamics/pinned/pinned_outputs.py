@@ -18,10 +18,10 @@ from drake_dae.dae.manifold.search import CONSISTENT
 from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
 VANISHED = 1e-9
 """A or B counts as singular below this fraction of its usual margin, also if it is a single
@@ -126,7 +126,7 @@ class PinnedOutputs:
         def residual(z: FloatArray) -> FloatArray:
             return self._residual.evaluate(scale * z, reference, parameters)[0]
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             return shortest_steps(self.gradients(scale * z, parameters) * scale, residual)
 
         found, converged = newton(start / scale, linearize)

@@ -1,4 +1,4 @@
-"""The contacts of a robot that open and close, and their numbers at a state."""
+"""The opening contacts of a robot, and their matrices at a state."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,21 +16,21 @@ from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.plants.unilateral.frictional import FrictionalContact
-from drake_dae.systems.plants.unilateral.impacts import Touch, is_p_matrix
+from drake_dae.systems.plants.unilateral.impacts import TouchRows, is_p_matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """What decides of contacts at one state, for all constraints, shape (m,) each.
+    """The rates, accelerations and matrices of all constraints at one state.
 
     Attributes:
-        all_rates: The rates c of the constraints, phi' or what restricts velocities alone, and
-            below them the velocities at which contacts slide that rub, shape (m + s,).
+        all_rates: The rates c of the constraints, phi' or nonholonomic rows, then the sliding
+            velocities of frictional contacts, shape (m + s,).
         accelerations: c' without constraint forces.
-        force_matrix: How constraint forces enter c', shape (m, m).
-        all_impulses: How impulses enter `all_rates`, shape (m + s, m + s).
-        velocity_change: How impulses enter x, shape (n, m + s).
-        size: How large the terms are that `accelerations` are the sums of.
+        force_matrix: The matrix of constraint forces in c', shape (m, m).
+        all_impulses: The matrix of impulses in `all_rates`, shape (m + s, m + s).
+        velocity_change: The matrix of impulses in x, shape (n, m + s).
+        size: The sizes of the terms of `accelerations`.
     """
 
     all_rates: FloatArray
@@ -47,17 +47,17 @@ class Terms:
 
     @property
     def impulse_matrix(self) -> FloatArray:
-        """How impulses of constraints enter their rates, shape (m, m)."""
+        """The matrix of impulses of constraints in their rates, shape (m, m)."""
         m = self.accelerations.size
         return self.all_impulses[:m, :m]
 
     def painleve_outcome(
         self, kept: Sequence[int], normals: Sequence[int]
     ) -> PainleveOutcome | None:
-        """What becomes of contacts that touch and rub; None where one set of forces fits.
+        """The outcome of a Painleve paradox of touching contacts; None if one set of forces fits.
 
         Args:
-            kept: The rows that nothing opens.
+            kept: The bilateral rows.
             normals: The rows of the contacts.
         """
         rows = [*kept, *normals]
@@ -77,7 +77,7 @@ class Terms:
 
 
 class UnilateralContacts:
-    """Those constraints of a robot that open and close.
+    """The constraints of a robot that open and close.
 
     Args:
         model: The robot.
@@ -88,16 +88,16 @@ class UnilateralContacts:
         dae: The system with all contacts closed.
         restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
-        along: Where the velocities of each contact stand along which it rubs, among `all_rates`.
+        along: The rows of the sliding velocities of each contact in `all_rates`.
         kept: The rows of all other constraints.
-        normals: The row of each contact that can only push.
+        normals: The normal row of each contact.
         gaps: A function of state and parameters: phi of each contact, and phi'.
-        rates: The rates of all constraints, shape (m, 1), and `drift`, that part of their
-            derivatives which exogenous signals make.
-        residual: phi_i, phi_i' of each, or what restricts velocities alone.
+        rates: The rates of all constraints, shape (m, 1), and `drift`, the part of their
+            derivatives from exogenous signals.
+        residual: phi_i, phi_i' of each, or nonholonomic rows.
 
     Raises:
-        ModelError: There is no such constraint, or it is none that can only push.
+        ModelError: There is no such constraint, or it is not unilateral.
     """
 
     def __init__(self, model: RobotModel, restitution: Mapping[str, float]) -> None:
@@ -131,7 +131,7 @@ class UnilateralContacts:
         for name in self.names:
             constraint, part = parts[name]
             normal = part.start + constraint.is_unilateral.index(True)
-            self.touches.append(Touch(normal, np.arange(part.start, part.stop)))
+            self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
         own = {int(row) for touch in self.touches for row in touch.rows}
         self.kept: Indices = np.array(
             [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
@@ -178,7 +178,7 @@ class UnilateralContacts:
         )
 
     def _sliding(self, model: RobotModel, parts: Mapping[str, tuple[Constraint, slice]]) -> ca.SX:
-        """The velocities of contacts that rub, shape (s, 1); notes where they stand, and mu."""
+        """The sliding velocities of frictional contacts, shape (s, 1); stores rows and mu."""
         kinematics, rows = model.links.kinematics(), [ca.SX(0, 1)]
         start = self.dae.num_constraints
         self.along: list[Indices] = []
@@ -197,9 +197,10 @@ class UnilateralContacts:
     def frictional_contact(
         self, place: int, parameters: FloatArray, restitution: float
     ) -> FrictionalContact:
-        """How a contact rubs in an impact.
+        """The friction of a contact in an impact.
 
-        What restricts its velocities besides, as where it sticks, holds as far as it pushes.
+        Further rows that restrict its velocities, such as sticking, hold while it has a normal
+        impulse.
         """
         touch, mu = self.touches[place], self._friction[place]
         others = touch.rows[touch.rows != touch.normal]
@@ -210,7 +211,7 @@ class UnilateralContacts:
         )
 
     def holds(self, closed: Sequence[bool]) -> FloatArray:
-        """For each entry of the residual 1, or 0 where it is that of a contact that is open."""
+        """For each entry of the residual 1, or 0 if its contact is open."""
         rows = np.ones(self.dae.num_constraints)
         for touch, shut in zip(self.touches, closed, strict=True):
             rows[touch.rows] = shut
@@ -254,7 +255,7 @@ class UnilateralContacts:
 
 
 def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
-    """The system in which some constraints hold and the others are not there.
+    """The system with some of the constraints only.
 
     Args:
         contacts: The contacts.

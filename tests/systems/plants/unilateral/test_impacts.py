@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 
 from drake_dae.systems.plants.unilateral.frictional import FrictionalContact, impact
 from drake_dae.systems.plants.unilateral.impacts import (
-    Touch,
+    TouchRows,
     complementary,
     is_p_matrix,
     rows_of,
@@ -19,7 +19,7 @@ def rows(*numbers):
     return np.array(numbers, dtype=int)
 
 
-TOUCHES = [Touch(i, rows(i)) for i in range(1, 5)]
+TOUCHES = [TouchRows(i, rows(i)) for i in range(1, 5)]
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -56,7 +56,7 @@ def test_which_contacts_push_does_not_depend_on_units(seed):
 def test_a_contact_that_would_pull_opens_in_any_units(scale):
     """Held, row 0 would keep both closed, with y_0 = -1: so it opens, and row 1 has y_1 = 1/2."""
     A, b, s = np.array([[1.0, -0.9], [-0.9, 1.0]]), np.array([1.0, -0.5]), np.array([scale, 1.0])
-    touches = [Touch(0, rows(0)), Touch(1, rows(1))]
+    touches = [TouchRows(0, rows(0)), TouchRows(1, rows(1))]
     fit = complementary(A * s * s[:, None], b * s, rows(), touches)
     assert fit.pushing == (1,)
     assert_allclose(fit.values, [0.0, 0.5], rtol=1e-14)
@@ -70,7 +70,9 @@ def test_an_impact_gains_no_energy_and_pierces_nothing(seed):
     J = np.column_stack([np.ones(4), random.uniform(-1.0, 1.0, (4, 2))])
     before = J @ np.array([-1.0, *random.uniform(-0.5, 0.5, 2)])
     e = random.uniform(0.0, 1.0, 4)
-    fit = complementary(J @ J.T, (1.0 + e) * before, rows(), [Touch(i, rows(i)) for i in range(4)])
+    fit = complementary(
+        J @ J.T, (1.0 + e) * before, rows(), [TouchRows(i, rows(i)) for i in range(4)]
+    )
     after = before + J @ J.T @ fit.values
     assert np.all(after >= -1e-10)
     assert fit.values @ (before + after) <= 1e-12
@@ -80,7 +82,7 @@ def test_of_a_table_with_four_feet_two_carry_it_and_it_comes_to_rest():
     """A body on feet at (+-1, +-1): any three normals are independent, all four are not."""
     feet = np.array([[1.0, x, y] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
     A = feet @ feet.T
-    touches = [Touch(i, rows(i)) for i in range(4)]
+    touches = [TouchRows(i, rows(i)) for i in range(4)]
     fit = complementary(A, np.full(4, -1.0), rows(), touches)
     assert_allclose(A @ fit.values, 1.0, rtol=1e-14)
     assert len(fit.pushing) == 2
@@ -88,7 +90,7 @@ def test_of_a_table_with_four_feet_two_carry_it_and_it_comes_to_rest():
     assert rows_of(A, rows(), touches[:3]).tolist() == [0, 1, 2]
     # Two feet that stick need one of their tangential rows.
     J = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    pair = [Touch(0, rows(0, 1)), Touch(2, rows(2, 3))]
+    pair = [TouchRows(0, rows(0, 1)), TouchRows(2, rows(2, 3))]
     assert rows_of(J @ J.T, rows(), pair).tolist() == [0, 2, 1]
     stopped = stopping(J @ J.T, np.array([-1.0, 0.3, -1.0, 0.3]), rows(0, 1, 2, 3))
     assert_allclose(J @ J.T @ stopped, [1.0, -0.3, 1.0, -0.3], atol=1e-14)
@@ -99,7 +101,7 @@ def test_friction_may_leave_none_or_two():
     assert is_p_matrix(smooth, smooth, [0, 1])
     assert not is_p_matrix(turned, smooth, [0, 1])
     assert complementary(turned, np.array([-1.0, 1.0]), rows(), TOUCHES[:0]) is not None
-    touches = [Touch(0, rows(0)), Touch(1, rows(1))]
+    touches = [TouchRows(0, rows(0)), TouchRows(1, rows(1))]
     assert complementary(turned, np.array([-1.0, 1.0]), rows(), touches) is None
 
 

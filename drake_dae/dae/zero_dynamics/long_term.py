@@ -6,9 +6,9 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Passage
+from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Transition
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.returns import Return, find_multiple, find_return
 from drake_dae.dae.zero_dynamics.stability import (
     Stability,
@@ -39,37 +39,39 @@ SLOWEST = 1e-4
 """Rates below this, relative to the fastest, are ignored."""
 
 
-class Fate(Enum):
+class Behavior(Enum):
     """The long-term behavior of a motion; the value describes it."""
 
     GROWS = "grows without bound"
-    SETTLES = "settles into another motion, which is stable"
-    CIRCLES = "settles into a bounded motion, a limit cycle"
-    LEAVES = "comes to a periodic motion that it leaves again"
-    WANDERS = "draws its neighbours to it, but was not seen to return: it may drift"
-    SPREADS = "stays beside no neighbour: small disturbances grow on and on"
-    UNCLEAR = "was not followed long enough to tell"
+    SETTLES = "converges to another stable motion"
+    CIRCLES = "converges to a limit cycle"
+    LEAVES = "approaches an unstable periodic motion"
+    WANDERS = "attracts its neighbours but did not return: it may drift"
+    SPREADS = "is unstable: small disturbances grow exponentially"
+    UNCLEAR = "was not followed long enough to decide"
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class LongTerm:
     """The long-term behavior of a motion, with its evidence.
 
     Attributes:
-        fate: The behavior.
+        behavior: The behavior.
         state: The last state; None if it is not known.
         closed: The periodic motion to which it converges; None without one.
     """
 
-    fate: Fate
+    behavior: Behavior
     state: FloatArray | None = None
     closed: Return | None = None
 
     def __str__(self) -> str:
-        return self.fate.value if self.closed is None else f"{self.fate.value} ({self.closed})"
+        return (
+            self.behavior.value if self.closed is None else f"{self.behavior.value} ({self.closed})"
+        )
 
 
-def fate_of(passage: Passage, *halves: Passage) -> Fate:
+def behavior_of(passage: Transition, *halves: Transition) -> Behavior:
     """The behavior of a motion, from its disturbances over a late interval.
 
     If a motion attracts its neighbours, disturbances decay in all directions. On a limit cycle,
@@ -84,17 +86,17 @@ def fate_of(passage: Passage, *halves: Passage) -> Fate:
     """
     grows = passage.growth > 0.8 * sum(max(half.growth, 0.0) for half in halves)
     if passage.growth > PLAIN and grows:
-        return Fate.SPREADS
+        return Behavior.SPREADS
     if passage.growth < -PLAIN:
-        return Fate.SETTLES
+        return Behavior.SETTLES
     if abs(passage.growth) < 0.7 * PLAIN and passage.volume < -2.0 * PLAIN:
-        return Fate.WANDERS
-    return Fate.UNCLEAR
+        return Behavior.WANDERS
+    return Behavior.UNCLEAR
 
 
 def watch(
     flow: Flow, state: FloatArray, begin: float, end: float, period: float | None = None
-) -> Course:
+) -> LongTerm:
     """The long-term behavior of the motion from a state.
 
     Args:
@@ -108,24 +110,24 @@ def watch(
         later = flow.carry(state, begin, middle, disturbed=False).state
         passage, halves = carry_in_halves(flow, later, middle, end)
     except Lost as lost:
-        return Course(Fate.GROWS if lost.cause is Cause.UNBOUNDED else Fate.UNCLEAR)
-    fate, last = fate_of(passage, *halves), passage.state
-    if fate is not Fate.WANDERS:
-        return Course(fate, last)
+        return LongTerm(Behavior.GROWS if lost.cause is EndCause.UNBOUNDED else Behavior.UNCLEAR)
+    behavior, last = behavior_of(passage, *halves), passage.state
+    if behavior is not Behavior.WANDERS:
+        return LongTerm(behavior, last)
     if period is None:
         closed = find_return(flow, last, PATIENCE * (end - begin))
     else:
         closed = find_multiple(flow, last, end, period)
     if closed is not None and closed.attracts:
-        return Course(Fate.CIRCLES, closed.state, closed)
+        return LongTerm(Behavior.CIRCLES, closed.state, closed)
     if closed is not None and closed.repels:
-        return Course(Fate.LEAVES, closed.state, closed)
-    return Course(fate, last)
+        return LongTerm(Behavior.LEAVES, closed.state, closed)
+    return LongTerm(behavior, last)
 
 
 def carry_in_halves(
     flow: Flow, state: FloatArray, begin: float, end: float
-) -> tuple[Passage, tuple[Passage, Passage]]:
+) -> tuple[Transition, tuple[Transition, Transition]]:
     """The flow over an interval and over its halves.
 
     Raises:
@@ -136,7 +138,7 @@ def carry_in_halves(
     second = flow.carry(first.state, middle, end)
     transition = second.transition @ first.transition
     size = max(float(np.linalg.norm(transition, 2)), 1e-300)
-    whole = Passage(
+    whole = Transition(
         second.state,
         second.basis,
         transition / size,
@@ -146,7 +148,7 @@ def carry_in_halves(
     return whole, (first, second)
 
 
-def watch_from(flow: Flow, state: FloatArray) -> Course:
+def watch_from(flow: Flow, state: FloatArray) -> LongTerm:
     """The long-term behavior from a state that is not at rest, for a constant reference.
 
     The duration follows from the rates of its disturbances.
@@ -155,11 +157,11 @@ def watch_from(flow: Flow, state: FloatArray) -> Course:
     slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters(0.0))
     slopes = slopes * flow.scale / flow.scale[:, None]
     if not np.all(np.isfinite(slopes)):
-        return Course(Fate.UNCLEAR)
+        return LongTerm(Behavior.UNCLEAR)
     rates = np.abs(np.linalg.eigvals(basis.T @ slopes @ basis))
     rates = rates[rates > SLOWEST * np.linalg.norm(slopes, 2)]
     if not rates.size:
-        return Course(Fate.UNCLEAR)
+        return LongTerm(Behavior.UNCLEAR)
     return watch(flow, state, 0.0, FOLDINGS / float(rates.min()))
 
 
@@ -170,7 +172,7 @@ def leave(
     rate: float,
     fastest: float,
     period: float | None = None,
-) -> Course:
+) -> LongTerm:
     """The long-term behavior of the motions that leave an unstable one, on both sides.
 
     Args:
@@ -186,7 +188,7 @@ def leave(
     """
     duration = FOLDINGS / rate
     if duration * fastest > LONGEST:
-        return Course(Fate.UNCLEAR)
+        return LongTerm(Behavior.UNCLEAR)
     basis = flow.basis(state, 0.0)
     aside = basis @ np.random.default_rng(0).standard_normal(basis.shape[1])
     aside *= BESIDE / np.max(np.abs(aside) / flow.scale)
@@ -195,12 +197,12 @@ def leave(
         try:
             start = flow.onto(state + side, time)
         except Lost:
-            return Course(Fate.UNCLEAR)
+            return LongTerm(Behavior.UNCLEAR)
         courses.append(watch(flow, start, time, time + duration, period))
-        if courses[-1].fate not in (Fate.CIRCLES, Fate.SETTLES, Fate.WANDERS):
+        if courses[-1].behavior not in (Behavior.CIRCLES, Behavior.SETTLES, Behavior.WANDERS):
             return courses[-1]
-    order = (Fate.WANDERS, Fate.SETTLES, Fate.CIRCLES)
-    return min(courses, key=lambda course: order.index(course.fate))
+    order = (Behavior.WANDERS, Behavior.SETTLES, Behavior.CIRCLES)
+    return min(courses, key=lambda course: order.index(course.behavior))
 
 
 def judge_at_rest(
@@ -225,14 +227,16 @@ def judge_at_rest(
     return _after(found, course)
 
 
-def _after(found: Stability, course: Course) -> Stability:
+def _after(found: Stability, course: LongTerm) -> Stability:
     """The verdict on an unstable equilibrium, given the behavior of motions that leave it."""
-    verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
-        course.fate, Verdict.UNSTABLE
+    verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
+        course.behavior, Verdict.UNSTABLE
     )
-    if course.fate in (Fate.UNCLEAR, Fate.GROWS, Fate.SPREADS):
+    if course.behavior in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
         return found
-    return replace(found, verdict=verdict, reason=f"{found.reason}; what leaves it {course}")
+    return replace(
+        found, verdict=verdict, reason=f"{found.reason}; a motion that leaves it {course}"
+    )
 
 
 def judge_without_rest(
@@ -255,17 +259,17 @@ def judge_without_rest(
     flow = Flow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
         course = watch_from(flow, pinned.state(goal, start, parameters))
-        if course.fate is Fate.SETTLES and course.state is not None:
+        if course.behavior is Behavior.SETTLES and course.state is not None:
             rest = equilibria.find(goal, course.state, parameters)
             return judge_at_rest(equilibria, goal, rest, parameters)
     except InconsistentStateError:
         return Stability(Verdict.UNDECIDED, nothing, None, reason)
     verdict = {
-        Fate.GROWS: Verdict.UNSTABLE,
-        Fate.LEAVES: Verdict.UNSTABLE,
-        Fate.CIRCLES: Verdict.BOUNDED,
-        Fate.WANDERS: Verdict.UNDECIDED,
-    }.get(course.fate)
+        Behavior.GROWS: Verdict.UNSTABLE,
+        Behavior.LEAVES: Verdict.UNSTABLE,
+        Behavior.CIRCLES: Verdict.BOUNDED,
+        Behavior.WANDERS: Verdict.UNDECIDED,
+    }.get(course.behavior)
     if verdict is None:
         return Stability(Verdict.UNDECIDED, nothing, None, reason)
     return Stability(verdict, nothing, None, f"{reason}; the motion from there {course}")
