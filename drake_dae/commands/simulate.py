@@ -42,7 +42,7 @@ from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.real_time import attainable_rate
-from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
+from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
@@ -53,7 +53,7 @@ from drake_dae.simulation.remarks import (
 )
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, shortfalls, summary
-from drake_dae.simulation.verdict import Verdict, as_data, judge
+from drake_dae.simulation.verdict import RunVerdict, as_data, judge
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -171,7 +171,7 @@ def _roll(run: _Run) -> RunStatistics:
     if run.loop.generator is None:
         raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
-    with ending_signals(ending := Ending()):
+    with ending_signals(ending := Interruption()):
         found = roll_scenario(
             run.scenario, run.loop, run.context, stop=lambda: ending.signal is not None
         )
@@ -215,7 +215,7 @@ def _write(run: _Run) -> bool:
     loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
     # A signal that comes now does not stop before the record is written, but before the pictures.
-    with ending_signals(ending := Ending()):
+    with ending_signals(ending := Interruption()):
         record = run.record or loop.record(run.context)
         if record.time.size == 0:
             return True
@@ -287,7 +287,7 @@ def _behind(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBeh
     return links_behind(plant.model, record.time, record["state"], own)
 
 
-def _as_data(run: _Run, verdict: Verdict, reasons: Sequence[str]) -> dict[str, Any]:
+def _as_data(run: _Run, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
     """What JSON says of a run."""
     found = run.statistics
     return {
@@ -309,10 +309,12 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
             scenario.plant_parameters
         ),
         "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
-        "the plant is pushed, and the law does not know it": bool(scenario.plant_pushes),
+        "disturbance forces act on the plant, unknown to the law": bool(
+            scenario.plant_disturbances
+        ),
         "Drake's own contact gives way": not loop.plant.is_ideal,
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
-        "the force is measured by a sensor": scenario.force.is_measured,
+        "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }

@@ -1,4 +1,4 @@
-"""The run of a scenario by `rollout`, as the command and studies make it."""
+"""The run of a scenario by `rollout`, for the command and for studies."""
 
 from collections.abc import Callable
 from math import ceil
@@ -15,14 +15,14 @@ from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
 
 ROWS = 1000
-"""So many rows has the record of a rollout under error control, after the first."""
+"""The number of rows of a record of a rollout under error control, after the first."""
 
 MOST_ROWS = 1e7
-"""Of more rows, each a fixed step, the record takes gigabytes."""
+"""The largest number of rows of fixed steps; a larger record takes gigabytes."""
 
 
 def rollout_times(scenario: Scenario) -> FloatArray:
-    """When the record of a scenario's rollout has rows, in s: even ones, or the fixed steps."""
+    """The times of the rows of a rollout's record, in s: equidistant, or the fixed steps."""
     config, rows = scenario.integrator, ROWS
     if not config.use_error_control:
         steps = scenario.duration / config.max_step_size
@@ -49,16 +49,18 @@ def roll_scenario(
         scenario: The scenario.
         loop: Its closed loop.
         context: The start, by `start_scenario`.
-        lasting: How long this loop will be run altogether, in s, which decides on machine code
-            alone; None if this run is all, and what is in the cache is welcome.
-        stop: Whether to stop where the run is, looked at now and then.
+        lasting: The expected total duration of runs of this loop, in s, for the decision on machine
+            code; None for a single run, which uses the cache.
+        stop: A function that is called regularly and says whether to stop.
 
     Raises:
-        ModelError: The loop has what no rollout has.
+        ModelError: The loop cannot be rolled out.
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    seeds = {"force_noise": scenario.force.seed} if scenario.force.is_measured else {}
+    seeds = (
+        {"force_noise": scenario.force_feedback.seed} if scenario.force_feedback.is_measured else {}
+    )
     if scenario.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
     (found,) = run_loop(

@@ -30,7 +30,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import show_state
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.divergence import DivergenceWatch
-from drake_dae.simulation.records.interruption import Ending, ending_signals
+from drake_dae.simulation.records.interruption import Interruption, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines where it has no terminal, in s."""
@@ -112,7 +112,7 @@ def simulate(
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
-    ending = Ending()
+    ending = Interruption()
     began: float | None = None
     watch: DivergenceWatch | None = None
 

@@ -56,7 +56,7 @@ class Limits:
             signal.name
             for constraint in model.constraints
             for signal, pushes in zip(
-                constraint.force_signals, constraint.can_only_push, strict=True
+                constraint.force_signals, constraint.is_unilateral, strict=True
             )
             if pushes
         )

@@ -325,7 +325,7 @@ VARY = (
     "gains.all=[]",
     "a=",
     "=",
-    "force.seed=0..1e300",
+    "force_feedback.seed=0..1e300",
     "duration=1..0:3",
     "duration=1..2",
     "gains.all=0..1:999999999",
@@ -392,7 +392,10 @@ SETTINGS = (
         "encoders={velocity_bandwidth: 1.0e-9}",
         "robot.free=[link1]",
     ),
-    *("force=!MeasuredForce {}", "force=!MeasuredForce {time_constant: 1.0e-9, gain: [1, 2]}"),
+    *(
+        "force_feedback=!MeasuredForce {}",
+        "force_feedback=!MeasuredForce {time_constant: 1.0e-9, gain: [1, 2]}",
+    ),
     *(
         "constraints.0.friction=1.0e+9",
         "constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 0}",
@@ -423,7 +426,7 @@ SETTINGS = (
         "observer={}",
         "constraint_damping={all: [-1]}",
         "task={phases: []}",
-        "loads=[{frame: tool}]",
+        "known_forces=[{frame: tool}]",
     ),
 )
 """Each makes no sense, or little, or turns to another kind of run."""

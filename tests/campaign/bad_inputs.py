@@ -107,7 +107,7 @@ def attempt(seed: int, folder: Path) -> Outcome:
 
 def _is_exact(scenario: Scenario) -> bool:
     """Whether the plant is what the law's model says, so that (30) and (31) hold."""
-    return not (scenario.plant_parameters or scenario.force.is_measured)
+    return not (scenario.plant_parameters or scenario.force_feedback.is_measured)
 
 
 # One mistake each, and why what it makes may run.

@@ -140,10 +140,10 @@ def test_a_task_that_begins_in_contact_starts_on_it(file):
 
 
 def test_a_task_has_the_noise_of_its_seed(file):
-    noisy = "force=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
+    noisy = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
     found = []
     for seed in (1, 2, 1):
-        loop, context = build_scenario(load_scenario(file, [noisy, f"force.seed={seed}"]))
+        loop, context = build_scenario(load_scenario(file, [noisy, f"force_feedback.seed={seed}"]))
         own = loop.noise.GetMyContextFromRoot(context)
         found.append(loop.noise.get_output_port().Eval(own).item())
     assert found[0] == found[2] != found[1]
