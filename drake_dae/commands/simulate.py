@@ -43,7 +43,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
-from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
@@ -128,6 +128,7 @@ class _Run:
     failure: str = ""
     pictures: bool = True
     record: Record | None = None
+    recorded: RecordAfter | None = None
     told: dict[str, Any] = field(default_factory=dict)
 
 
@@ -171,11 +172,16 @@ def _roll(run: _Run) -> RunStatistics:
     if run.loop.generator is None:
         raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
+
+    def look(record: RecordAfter) -> bool:
+        run.recorded = record
+        if run.scenario.write.record:
+            run.writer.update(run.context)
+        return ending.signal is not None
+
     with ending_signals(ending := Ending()):
-        found = roll_scenario(
-            run.scenario, run.loop, run.context, stop=lambda: ending.signal is not None
-        )
-    run.record = found.record
+        found = roll_scenario(run.scenario, run.loop, run.context, look=look)
+    run.record, run.recorded = found.record, found.record.after
     if found.failure is not None:
         raise found.failure
     times, wall = run.record.time, time.perf_counter() - began
@@ -193,7 +199,11 @@ def _run(
 ) -> tuple[int, dict[str, Any]]:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     about = {"scenario": scenario_data(completed.scenario)}
-    with RecordWriter(folder / PART, loop.record, about) as writer:
+
+    def recorded(context: Context, after: float | None) -> Record:
+        return loop.record(context, after) if run.recorded is None else run.recorded(after)
+
+    with RecordWriter(folder / PART, recorded, about) as writer:
         run = _Run(loop, context, completed.scenario, folder, writer, title, completed.notes)
         try:
             run.statistics = simulate_by(run)

@@ -1,6 +1,6 @@
 """What every controller of a loop keeps: the rules that wiring, records and starts use."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,9 @@ else:
 Derived = dict[str, tuple[FloatArray, tuple[Signal, ...]]]
 """Name of a signal -> its values, one row for each time, and their names and units."""
 
+Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
+"""Outputs z, what they should be, both of shape (k,), and their names and units."""
+
 
 @checked(ModelError)
 class Controller(System):
@@ -50,6 +53,7 @@ class Controller(System):
     5. What is computed afterwards. With `follows` its control is a function of the logged state,
        the reference, the forces, the integrals and its parameters: `law.function`. Otherwise it is
        logged. `derived` is what else a record has of it, from the other signals.
+       `compared` is what a run is watched by: outputs now, and what they should be.
     6. Theory. `predicted_error` is what the tracking error of a record should be.
     7. Starts. With `takes_over` its references begin with the outputs that the robot has then;
        otherwise they come from a generator, and a run begins where that begins. A run begins on the
@@ -121,6 +125,23 @@ class Controller(System):
                 time.
         """
         return {}
+
+    def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
+        """The outputs now and what they should be, with their names; None where nobody tells it.
+
+        Args:
+            context: The context of this system.
+            shown: Name of a signal of the plant, such as "controlled_output" -> its value.
+        """
+        if (reference := self.reference_now(context)) is None:
+            return None
+        law = self.law
+        return shown("controlled_output"), reference[law.layout.lowest], law.system.output_signals
+
+    def reference_now(self, context: Context) -> FloatArray | None:
+        """R: what is wired or fixed, or what the references are by themselves; None without any."""
+        port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
+        return port.Eval(context) if port is not None and port.HasValue(context) else None
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
