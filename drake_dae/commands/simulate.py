@@ -35,6 +35,7 @@ from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.view import start_meshcat
 from drake_dae.robots.clearances import LinkBehind, links_behind
+from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -236,7 +237,7 @@ def _write(run: _Run) -> bool:
         fixed = loop.plant.time_step or not config.use_error_control
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
-        behind = _behind(loop, record, run.context)
+        behind = _ways(loop, record, run.context)
         text = summary(
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
         )
@@ -286,15 +287,17 @@ def _write(run: _Run) -> bool:
     return not problems
 
 
-def _behind(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind, ...]:
-    """The links that went behind a surface in a run."""
+def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind | Collision, ...]:
+    """The links that went behind a surface in a run, and those that collided."""
     plant = loop.plant
     if plant.model is None:
         return ()
     own = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
     if "exogenous" in record.signals:
         own[:, plant.exogenous_places] = record["exogenous"]
-    return links_behind(plant.model, record.time, record["state"], own)
+    shapes, states = LinkShapes(plant.model, loop.scene_graph), record["state"]
+    behind = links_behind(plant.model, record.time, states, own, shapes)
+    return *behind, *collisions(shapes, record.time, states)
 
 
 def _as_data(run: _Run, verdict: Verdict, reasons: Sequence[str]) -> dict[str, Any]:
