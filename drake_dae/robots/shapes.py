@@ -17,7 +17,7 @@ from pydrake.geometry import (
     SceneGraph,
     Sphere,
 )
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, JointIndex
 
 from drake_dae.arrays import FloatArray
 from drake_dae.robots.links.frames import frame_named
@@ -28,6 +28,9 @@ ROWS = 60
 
 TOUCHING = 1e-3
 """Shapes that overlap by less than this, in m, touch."""
+
+COARSE = 0.02
+"""So much, in m, shapes may overlap with one link between them: those of vendors do in use."""
 
 MOST_CORNERS = 200
 """So many corners of a mesh are looked at, at most."""
@@ -163,16 +166,26 @@ class LinkShapes:
 
     def moved_with(self, frame: str) -> set[int]:
         """A frame's link, and those that the joint moves that it hangs on."""
-        body = frame_named(self._plant, frame).body()
-        joints = [self._plant.get_joint(index) for index in self._plant.GetJointIndices()]
+        body = int(frame_named(self._plant, frame).body().index())
+        joints = self.joints_below(body)
+        moved = self._plant.GetBodiesKinematicallyAffectedBy(joints[:1]) if joints else []
+        return {body, *map(int, moved)}
+
+    def joints_below(self, index: int) -> list[JointIndex]:
+        """The joints that move between a link and the world, its own one first."""
+        joints = [self._plant.get_joint(each) for each in self._plant.GetJointIndices()]
         inboard = {int(joint.child_body().index()): joint for joint in joints}
-        at = int(body.index())
-        while at in inboard and not inboard[at].num_positions():
-            at = int(inboard[at].parent_body().index())
-        if at not in inboard:
-            return {int(body.index())}
-        moved = self._plant.GetBodiesKinematicallyAffectedBy([inboard[at].index()])
-        return {int(index) for index in moved}
+        found = []
+        while index in inboard:
+            if inboard[index].num_positions():
+                found.append(inboard[index].index())
+            index = int(inboard[index].parent_body().index())
+        return found
+
+    def may_overlap(self, pair: tuple[int, int]) -> float:
+        """By how much two links may overlap as their shapes are made, in m."""
+        first, second = map(self.joints_below, pair)
+        return COARSE if len({*first} ^ {*second}) < 3 else TOUCHING
 
 
 def collisions(shapes: LinkShapes, times: FloatArray, states: FloatArray) -> tuple[Collision, ...]:
@@ -199,7 +212,7 @@ def collisions(shapes: LinkShapes, times: FloatArray, states: FloatArray) -> tup
     usual, held = shapes.overlaps(), shapes.held()
     collided = []
     for pair, depths in found.items():
-        deep = depths > TOUCHING
+        deep = depths > shapes.may_overlap(pair)
         if not deep.any() or (pair in usual and deep.all()) or pair in held:
             continue
         at = chosen[[int(np.argmax(depths)), int(np.argmax(deep))]]

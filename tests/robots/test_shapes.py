@@ -137,6 +137,15 @@ def test_links_that_collide_are_named_with_pair_depth_and_time():
     assert all({each.first, each.second} != {"link0", "link1"} for each in others)
 
 
+def test_shapes_with_one_link_between_them_may_overlap_a_little():
+    """Vendors' shapes do, as those of a base and an upper arm: the ends of two links apart."""
+    _, shapes = chain(Plane(point=[0.0, 0.0, -9.0], normal=[0.0, 0.0, 1.0]))
+    for overlap, count in ((0.015, 0), (0.03, 1)):
+        fold = 2 * np.arccos((2 * RADIUS - overlap) / (2 * LENGTH))
+        state = np.array([[0.0, 0.2, fold, 0.2, 0, 0, 0, 0]])
+        assert len(collisions(shapes, np.zeros(1), state)) == count
+
+
 def test_shapes_that_always_overlap_are_how_the_file_has_them():
     _, shapes = chain(
         Plane(point=[0.0, 0.0, -9.0], normal=[0.0, 0.0, 1.0]), '<sphere radius="0.6"/>'
