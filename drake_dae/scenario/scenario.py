@@ -18,6 +18,7 @@ from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
 from drake_dae.scenario.forms.reader import Reader
+from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
@@ -99,6 +100,10 @@ class Scenario:
             `plant_parameters` has it.
         exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
             for example.
+        bounds: Parameter name -> its lowest and its highest value, between which it stays, in this
+            run and in every other: "wall.position" for example, each a number or one for each
+            entry. Relative degrees are looked at for all such values; bounds of one value hold it.
+            They restrict no run.
         compliances: Constraint force -> its compliance relative to the others, where constraints
             are redundant: their forces are shared by least squares. {} is all alike; left out, no
             constraint may be redundant.
@@ -150,6 +155,7 @@ class Scenario:
     plant_pushes: list[Push] = field(default_factory=list)
     loads: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
+    bounds: dict[str, Interval] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
