@@ -74,17 +74,18 @@ class DivergenceWatch:
         """Whether there is anything to watch."""
         return bool(self._states)
 
-    def look(self, context: Context) -> None:
+    def look(self, context: Context, *, always: bool = False) -> None:
         """Looks at an accepted step, at some of them.
 
         Args:
             context: The context of the diagram.
+            always: Whether to look at this one, as at the last.
 
         Raises:
             SimulationError: The run diverges.
         """
         self._steps += 1
-        if self._steps % EVERY:
+        if self._steps % EVERY and not always:
             return
         self.look_at_states(context)
         for controller, errors in self._errors:

@@ -148,6 +148,8 @@ def simulate(
             elapsed = time.perf_counter() - began
             steps = simulator.get_num_steps_taken()
             simulator.AdvancePendingEvents()
+            if watch is not None:
+                watch.look(context, always=True)
         except (DrakeDaeError, RuntimeError) as error:
             if began is None and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
