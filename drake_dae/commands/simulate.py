@@ -35,6 +35,7 @@ from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.view import start_meshcat
 from drake_dae.robots.clearances import LinkBehind, links_behind
+from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -43,7 +44,7 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
-from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
@@ -128,6 +129,7 @@ class _Run:
     failure: str = ""
     pictures: bool = True
     record: Record | None = None
+    recorded: RecordAfter | None = None
     told: dict[str, Any] = field(default_factory=dict)
 
 
@@ -171,11 +173,16 @@ def _roll(run: _Run) -> RunStatistics:
     if run.loop.generator is None:
         raise ModelError("a rollout does not know tasks; leave --rollout out")
     began = time.perf_counter()
+
+    def look(record: RecordAfter) -> bool:
+        run.recorded = record
+        if run.scenario.write.record:
+            run.writer.update(run.context)
+        return ending.signal is not None
+
     with ending_signals(ending := Interruption()):
-        found = roll_scenario(
-            run.scenario, run.loop, run.context, stop=lambda: ending.signal is not None
-        )
-    run.record = found.record
+        found = roll_scenario(run.scenario, run.loop, run.context, look=look)
+    run.record, run.recorded = found.record, found.record.after
     if found.failure is not None:
         raise found.failure
     times, wall = run.record.time, time.perf_counter() - began
@@ -193,7 +200,11 @@ def _run(
 ) -> tuple[int, dict[str, Any]]:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     about = {"scenario": scenario_data(completed.scenario)}
-    with RecordWriter(folder / PART, loop.record, about) as writer:
+
+    def recorded(context: Context, after: float | None) -> Record:
+        return loop.record(context, after) if run.recorded is None else run.recorded(after)
+
+    with RecordWriter(folder / PART, recorded, about) as writer:
         run = _Run(loop, context, completed.scenario, folder, writer, title, completed.notes)
         try:
             run.statistics = simulate_by(run)
@@ -226,7 +237,7 @@ def _write(run: _Run) -> bool:
         fixed = loop.plant.time_step or not config.use_error_control
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
-        behind = _behind(loop, record, run.context)
+        behind = _ways(loop, record, run.context)
         text = summary(
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
         )
@@ -276,15 +287,17 @@ def _write(run: _Run) -> bool:
     return not problems
 
 
-def _behind(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind, ...]:
-    """The links that went behind a surface in a run."""
+def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind | Collision, ...]:
+    """The links that went behind a surface in a run, and those that collided."""
     plant = loop.plant
     if plant.model is None:
         return ()
     own = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
     if "exogenous" in record.signals:
         own[:, plant.exogenous_places] = record["exogenous"]
-    return links_behind(plant.model, record.time, record["state"], own)
+    shapes, states = LinkShapes(plant.model, loop.scene_graph), record["state"]
+    behind = links_behind(plant.model, record.time, states, own, shapes)
+    return *behind, *collisions(shapes, record.time, states)
 
 
 def _as_data(run: _Run, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:

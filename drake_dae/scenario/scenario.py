@@ -18,6 +18,7 @@ from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
 from drake_dae.scenario.forms.reader import Reader
+from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
@@ -99,6 +100,9 @@ class Scenario:
             `plant_parameters`.
         exogenous: Parameter name -> references of its entries, known to plant and law;
             "wall.position" for example.
+        bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; each
+            a number or one for each entry. Relative degrees are checked for all such values; bounds
+            of one value fix it. They do not restrict a run.
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
@@ -148,6 +152,7 @@ class Scenario:
     plant_disturbances: list[DisturbanceForce] = field(default_factory=list)
     known_forces: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
+    bounds: dict[str, Interval] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
     gains: Gains | None = None
     integral: list[str] | None = None

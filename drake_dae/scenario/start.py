@@ -62,6 +62,7 @@ def _standing(scenario: Scenario, loop: ClosedLoop, parameters: FloatArray) -> F
     forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
     near = model.rest_state(guess, forces, parameters)
     q = loop.controller.start_structure.manifold.settle(near, parameters)[: guess.size]
+    _check_limits(model, q, "Give")
     return model.rest_state(q, forces, parameters)
 
 
@@ -135,6 +136,12 @@ def _configuration(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
+    _check_limits(model, q, "Change the first values of the references, or give")
+    return q
+
+
+def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
+    """Refuses a configuration with joints outside of their limits."""
     low, high = model.links.position_limits
     outside = [
         f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
@@ -146,10 +153,8 @@ def _configuration(
     if outside:
         raise ModelError(
             f"the robot cannot start outside of its limits, and the start near start.positions has "
-            f"{'; '.join(outside)}. Change the first values of the references, or give "
-            "start.positions of all joints near where they shall be"
+            f"{'; '.join(outside)}. {remedy} start.positions of all joints near where they shall be"
         )
-    return q
 
 
 def _unwound(

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +22,7 @@ from drake_dae.running.rollout.fused import Fused
 from drake_dae.running.rollout.problems import checked_times, problems_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, num_cores
-from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
@@ -47,14 +48,12 @@ class Rollout:
     @cached_property
     def record(self) -> Record:
         """Its signals at the given times, up to where it came."""
-        columns = self._program.signals
-        stops = np.cumsum([len(signals) for signals in columns.values()])
-        parts = np.split(self._rows, stops[:-1], axis=1)
-        signals = {
-            name: Recorded(part, tuple(columns[name]))
-            for name, part in zip(columns, parts, strict=True)
-        }
-        return self._program.complete(Record(self._times[: len(self._rows)], signals))
+        return _record(self._program, self._times, self._rows)
+
+    def ended(self, failure: SimulationError) -> Self:
+        """The same where it ended with a failure; its record goes up to the failure's time."""
+        stop = int(np.searchsorted(self._times[: len(self._rows)], failure.time, side="right"))
+        return replace(self, failure=failure, _rows=self._rows[:stop])
 
 
 @checked(ModelError)
@@ -116,7 +115,7 @@ def run_loop(
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
     lasting: float | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    look: Callable[[RecordAfter], bool] = lambda record: False,
 ) -> list[Rollout]:
     """`rollout`, where these runs may be some of many, and may be stopped.
 
@@ -124,7 +123,8 @@ def run_loop(
         lasting: How long all of them last together, in s. Then this alone decides on machine code,
             not what the cache has: the numbers are the same whenever they are computed. None if
             these are all.
-        stop: Whether to stop where a run is, looked at now and then; its record goes up to there.
+        look: Called now and then with a function from a time in s, or None, to what a run has
+            recorded later; whether to stop where it is. Its record goes up to there.
     """
     config = config or SimulatorConfig()
     check_config(config)
@@ -132,7 +132,11 @@ def run_loop(
     choice: Compiled = program.choice if compiled is None else compiled
     check_choice("rollout", choice)
     moments = checked_times(times)
-    settings = Settings.of(config, program.compiled.scale, stop)
+
+    def looked(rows: Callable[[], FloatArray]) -> bool:
+        return look(lambda after: _record(program, moments, rows(), after))
+
+    settings = Settings.of(config, program.compiled.scale, looked)
     problems = problems_of(program, starts, parameters, moments, seeds)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
     kinds = [program.compiled.has_twins(problem.parameters) for problem in problems]
@@ -200,3 +204,18 @@ def _result(program: Program, problem: Problem, run: Run) -> Rollout:
     if run.ending not in (Ending.DONE, Ending.PAUSED):
         failure = failure_of(program, problem, run)
     return Rollout(run.steps, failure, program, problem.times, run.rows)
+
+
+def _record(
+    program: Program, times: FloatArray, rows: FloatArray, after: float | None = None
+) -> Record:
+    """The rows of a run as a record, or those that are later than a time in s."""
+    first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
+    columns = program.signals
+    stops = np.cumsum([len(signals) for signals in columns.values()])
+    parts = np.split(rows[first:], stops[:-1], axis=1)
+    signals = {
+        name: Recorded(part, tuple(columns[name]))
+        for name, part in zip(columns, parts, strict=True)
+    }
+    return program.complete(Record(times[first : len(rows)], signals))

@@ -13,6 +13,8 @@ from scipy.integrate import RK23, RK45
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 
+Look = Callable[[Callable[[], FloatArray]], bool]
+
 SHARE = 1e-3
 """Of the accuracy that a step may use up: then what is read between long steps is as good."""
 
@@ -72,23 +74,24 @@ class Settings:
         tableau: The method of fixed steps; None for error control, by DOP853.
         absolute: The error that a step may make, for each state, shape (n,).
         relative: The same relative to the state.
-        stop: Whether to stop where the run is, looked at now and then.
+        look: Called now and then with what returns the rows written up to then; whether to stop
+            where the run is.
     """
 
     longest: float
     tableau: Tableau | None
     absolute: FloatArray
     relative: float
-    stop: Callable[[], bool]
+    look: Look
 
     @classmethod
-    def of(cls, config: SimulatorConfig, scale: FloatArray, stop: Callable[[], bool]) -> Self:
+    def of(cls, config: SimulatorConfig, scale: FloatArray, look: Look) -> Self:
         """The settings of a scenario.
 
         Args:
             config: Drake's settings.
             scale: How large the states are, shape (n,).
-            stop: As the attribute.
+            look: As the attribute.
 
         Raises:
             ModelError: Its scheme has fixed steps, and is implicit.
@@ -104,7 +107,7 @@ class Settings:
         elif not scale.size:  # Without a state there is no error.
             tableau = FIXED["explicit_euler"]
         relative = max(SHARE * config.accuracy, SMALLEST)
-        return cls(config.max_step_size, tableau, relative * scale, relative, stop)
+        return cls(config.max_step_size, tableau, relative * scale, relative, look)
 
 
 @dataclass(frozen=True, eq=False)

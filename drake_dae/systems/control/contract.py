@@ -1,6 +1,6 @@
 """The contract of a controller: the rules for wiring, records and starts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,9 @@ else:
 Derived = dict[str, tuple[FloatArray, tuple[Signal, ...]]]
 """Name of a signal -> its values, one row for each time, and their names and units."""
 
+Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
+"""Outputs z, what they should be, both of shape (k,), and their names and units."""
+
 
 @checked(ModelError)
 class Controller(System):
@@ -49,7 +52,8 @@ class Controller(System):
        of a loop that it does not support, each with a sentence.
     5. Computed afterwards. With `follows` its control is `law.function` of the logged state,
        reference, forces, integrals and parameters. Otherwise it is logged. `derived` are further
-       signals of a record, computed from the others.
+       signals of a record, computed from the others. `compared` are outputs and their references
+       now, for the check of divergence.
     6. Theory. `predicted_error` is the predicted tracking error of a record.
     7. Starts. With `takes_over` its references start at the current outputs; otherwise they come
        from a generator, and a run starts at their start. A run starts on the manifold of
@@ -122,6 +126,23 @@ class Controller(System):
                 time.
         """
         return {}
+
+    def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
+        """The outputs now and what they should be, with their names; None where nobody tells it.
+
+        Args:
+            context: The context of this system.
+            shown: Name of a signal of the plant, such as "controlled_output" -> its value.
+        """
+        if (reference := self.reference_now(context)) is None:
+            return None
+        law = self.law
+        return shown("controlled_output"), reference[law.layout.lowest], law.system.output_signals
+
+    def reference_now(self, context: Context) -> FloatArray | None:
+        """R: what is wired or fixed, or what the references are by themselves; None without any."""
+        port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
+        return port.Eval(context) if port is not None and port.HasValue(context) else None
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray

@@ -125,7 +125,7 @@ class TrackingController(ParameterizedSystem, Controller):
         if references is not None:
             self._reference_at = references.function
             self._reference_port = self.GetInputPort("reference")
-            self._evaluators[1] = weakly(self._reference)
+            self._evaluators[1] = weakly(self.reference_now)
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         if law.integral.outputs:
@@ -290,10 +290,9 @@ class TrackingController(ParameterizedSystem, Controller):
 
         value.set_value(Feedback(self.law.function, reference, parameters, self._signals))
 
-    def _reference(self, context: Context) -> FloatArray:
-        """R from the port, or from the references at the context's time."""
-        if self._reference_port.HasValue(context):
-            return self._reference_port.Eval(context)
+    def reference_now(self, context: Context) -> FloatArray | None:
+        if self._references is None or self._reference_port.HasValue(context):
+            return super().reference_now(context)
         return self._reference_at(context.get_time())
 
     @property

@@ -405,7 +405,9 @@ def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
     times, looks = np.linspace(0.0, 3.0, 31), iter([False] * (1 if compiled else 40))
     settings = {"config": chosen.integrator, "compiled": compiled}
     (whole,) = run_loop(loop, start, parameters, times, **settings)
-    (part,) = run_loop(loop, start, parameters, times, stop=lambda: next(looks, True), **settings)
+    (part,) = run_loop(
+        loop, start, parameters, times, look=lambda record: next(looks, True), **settings
+    )
     assert part.failure is None
     assert 1 < part.record.time.size < 31
     for name in whole.record.signals:
