@@ -26,7 +26,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house pictures clean lint
+.PHONY: help demo check test processor benchmark campaign robots unknowns friction peers house equations pictures clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -42,6 +42,7 @@ help:
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
+	@echo 'make equations   from each equation of the paper to its line and its test'
 	@echo 'make pictures    film the demo, and plot it, into $(PICTURES)/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
@@ -84,16 +85,16 @@ robots: $(VENV)/installed-dev
 unknowns: $(VENV)/installed
 	$(BIN)/drake-dae sweep wall_point_contact --random $(RUNS) --seed $(SEED) --out runs/unknowns \
 		--set duration=1.6 --set 'constraints.0.rpy=[0, 0, 0]' \
-		--set 'force=!MeasuredForce {sample_period: 0.001}' \
+		--set 'force_feedback=!MeasuredForce {sample_period: 0.001}' \
 		--set 'tolerances={outputs: {tool.y: 0.005, tool.z: 0.005, wall.force: 10}, after: 0.5}' \
 		--vary plant.friction=0.1..0.6 --vary 'plant.stiffness=[3.0e+4, 1.0e+5, 3.0e+5, 1.0e+6]' \
 		--vary 'plant_parameters.wall.position=[[0.698..0.702, 0, 0]]' \
 		--vary 'plant_parameters.wall.rpy=[[0, -0.02..0.02, -0.02..0.02]]' \
 		--vary plant_parameters.link3.mass=5.6..6.9 \
 		--vary 'plant_payloads=[[{frame: tool, mass: 0.01..0.5}]]' \
-		--vary 'plant_pushes=[[{frame: tool, force: [-10..10, -10..10, -10..10], start_time: 0.6, end_time: 0.7}]]' \
+		--vary 'plant_disturbances=[[{frame: tool, force: [-10..10, -10..10, -10..10], start_time: 0.6, end_time: 0.7}]]' \
 		--vary 'encoders=[{resolution: 1.0e-5, velocity_bandwidth: 500}, {position_noise: 5.0e-6, velocity_noise: 0.001}]' \
-		--vary force.bias=-0.3..0.3 --vary force.noise_deviation=0..0.3 --vary force.seed=1..1000
+		--vary force_feedback.bias=-0.3..0.3 --vary force_feedback.noise_deviation=0..0.3 --vary force_feedback.seed=1..1000
 
 friction: $(VENV)/installed
 	$(BIN)/python examples/unknown_friction
@@ -103,6 +104,9 @@ peers: $(VENV)/installed
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/support/draw_house.py $(HOUSE)
+
+equations:
+	@$(PYTHON) tests/support/equations.py
 
 pictures: $(VENV)/installed
 	$(BIN)/drake-dae simulate wall_polish --out runs/polish

@@ -72,9 +72,9 @@ from .robots.force_outputs import ForceCombination as ForceCombination
 from .robots.force_outputs import ForceOutput as ForceOutput
 from .robots.force_outputs import NamedForce as NamedForce
 from .robots.force_outputs import Squeeze as Squeeze
+from .robots.known_forces import KnownForce as KnownForce
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
-from .robots.loads import KnownForce as KnownForce
 from .robots.model import RobotModel as RobotModel
 from .robots.outputs import AxisCoordinates as AxisCoordinates
 from .robots.outputs import ExpressionOutput as ExpressionOutput
@@ -122,7 +122,7 @@ from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
-from .systems.plants.contact.pushes import Push as Push
+from .systems.plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
 from .systems.plants.contact_events import ContactChange as ContactChange
 from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant

@@ -177,16 +177,17 @@ def _any_of(members: set[Any], order: Sequence[Any]) -> _Rule:
     rules += [_rule(member) for member in order if member in members]
     words = " or ".join(dict.fromkeys(rule.words for rule in rules))
 
-    def fitting(value: Any) -> list[_Rule]:
-        return [rule for rule in rules if rule.holds(value)]
-
     def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
-        fits = fitting(value)
+        fits = [rule for rule in rules if rule.holds(value)]
         if all(_wrong(what, value, rule) for rule in fits):
             yield what, value, fits[0]
 
     has_parts = any(rule.inside for rule in rules)
-    return _Rule(words, lambda value: bool(fitting(value)), inside if has_parts else None)
+
+    def holds(value: Any) -> bool:
+        return any(rule.holds(value) for rule in rules)
+
+    return _Rule(words, holds, inside if has_parts else None)
 
 
 def _list(entry: _Rule) -> _Rule:
@@ -226,7 +227,8 @@ def _mapping(key: _Rule, entry: _Rule) -> _Rule:
     def inside(what: str, value: Any) -> Iterator[tuple[str, Any, _Rule]]:
         for name, part in value.items():
             yield f"a key of {what}", name, key
-            yield f"{what}[{brief(name)}]", part, entry
+            if _wrong(what, part, entry):
+                yield f"{what}[{brief(name)}]", part, entry
 
     return _Rule("a dictionary", lambda value: isinstance(value, Mapping), inside)
 

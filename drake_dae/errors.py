@@ -103,19 +103,19 @@ class SingularityError(SimulationError):
     """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank on the way."""
 
 
-class JammedContactError(SingularityError):
-    """A contact that friction jams on the way (Painleve): A(x) is no P-matrix any more.
+class PainleveError(SingularityError):
+    """The Painleve paradox in a frictional contact: A(x) is not a P-matrix.
 
     Attributes:
-        jam: What becomes of the contact, as a `dae.contacts.Jam`; None where that is not known.
+        outcome: A `dae.system.contacts.PainleveOutcome`; None if it is not known.
     """
 
-    def __init__(self, message: str, time: float, state: ArrayLike, jam: Any = None) -> None:
+    def __init__(self, message: str, time: float, state: ArrayLike, outcome: Any = None) -> None:
         super().__init__(message, time, state)
-        self.jam = jam
+        self.outcome = outcome
 
-    def retold(self, message: str, time: float, state: ArrayLike) -> "JammedContactError":
-        return type(self)(message, time, state, self.jam)
+    def retold(self, message: str, time: float, state: ArrayLike) -> "PainleveError":
+        return type(self)(message, time, state, self.outcome)
 
 
 class NonFiniteError(SimulationError):

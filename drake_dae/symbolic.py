@@ -39,7 +39,7 @@ _FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {
 }
 
 
-_STEPS: dict[ExpressionKind, Callable[..., ca.SX]] = {
+_DISCONTINUOUS: dict[ExpressionKind, Callable[..., ca.SX]] = {
     ExpressionKind.Abs: ca.fabs,
     ExpressionKind.Min: ca.fmin,
     ExpressionKind.Max: ca.fmax,
@@ -176,7 +176,7 @@ def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True
             f"{_NOT_SMOOTH[kind]} has no derivatives everywhere, and the theory differentiates; "
             "use a smooth function instead"
         )
-    known = _RELATIONS if isinstance(expression, Formula) else _FUNCTIONS | _STEPS
+    known = _RELATIONS if isinstance(expression, Formula) else _FUNCTIONS | _DISCONTINUOUS
     if kind not in known:
         raise ModelError(f"nothing is known of the function {expression}")
     _, parts = expression.Unapply()

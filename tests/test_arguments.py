@@ -248,7 +248,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "axis of RevoluteLoopJoint": lambda: "x",
     "major_radius": lambda: 2.0,
     "size": lambda: 1,
-    "force of Push": lambda: (0.0, 0.0, 5.0),
+    "force of DisturbanceForce": lambda: (0.0, 0.0, 5.0),
     "size of StateSensor": lambda: 4,
     "n": lambda: 1,
     "components": lambda: "xy",

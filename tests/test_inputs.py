@@ -219,7 +219,7 @@ def test_a_start_from_which_time_does_not_go_on_is_refused(start):
 
 def test_a_lag_that_is_none_ends_the_run_and_leaves_a_finite_record():
     chosen = scenario(
-        "two_link_wall", "force=!MeasuredForce {time_constant: 1e-300}", "duration=0.1"
+        "two_link_wall", "force_feedback=!MeasuredForce {time_constant: 1e-300}", "duration=0.1"
     )
     loop, context = build_scenario(chosen)
     with pytest.raises((NonFiniteError, DrakeDaeError)):

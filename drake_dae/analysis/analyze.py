@@ -73,8 +73,8 @@ def analyze(
     rule. There is no proof that none was missed.
 
     Where friction acts on contacts that can only push, the margin of A(x) is that without friction,
-    and `contact_margin` tells with its sign how far friction is from jamming a contact (Painleve),
-    and at which coefficient that would be; likewise along a reference.
+    and the sign of `contact_margin` shows how far friction is from the Painleve paradox, with the
+    critical coefficients; the same along a reference.
 
     Args:
         system: The system (1)-(3).
@@ -134,7 +134,7 @@ def analyze(
         ) from error
     samples = around
     if states is not None:
-        # Degrees are decided around them, too; margins are theirs alone.
+        # Degrees are decided also at states around them, margins only at them.
         samples = Samples(around.manifold, given)
         check_consistent(samples.manifold, given, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
@@ -151,13 +151,14 @@ def analyze(
             equilibria=_equilibria(dynamics, stability, samples.states, None),
         )
     layout = analysis.structure.layout
-    with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion tells when.
+    with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion has the time.
         check_reference(system, layout, reference, times)
     guess = samples.states[0] if start is None else start
     motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
     rest, outputs = samples.states[0], None
     if motion.times.size:
-        # The state does not tell outputs with mu_i = 0: they are as the reference begins.
+        # The state does not determine outputs with mu_i = 0: they are taken from the start of the
+        # reference.
         rest = motion.states[0]
         outputs = layout.values(reference(float(motion.times[0])))
     stability = dynamics.stability(rest, outputs=outputs)
@@ -165,7 +166,7 @@ def analyze(
     if dynamics.dimension and motion.times.size > 1:
         along = dynamics.stability_along(reference, motion, exogenous=exogenous)
     contact_margin_along = None
-    if system.rubbing and motion.times.size:
+    if system.frictional_contacts and motion.times.size:
         contacts = ContactMargins(system, analysis.structure.elimination.constraint_matrix)
         contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
     return replace(
@@ -212,14 +213,14 @@ def _examine(
         margins[violation.assumption if violation else number] = margin
 
     if constrained.constraint_margin is not None:
-        matrix = system.rubbing.without_friction(elimination.constraint_matrix)
+        matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
         margin = find_margin(samples, matrix, search=search)
         constrained = replace(constrained, constraint_margin=margin)
         judge(margin, constraint_violation(constrained), 2)
         regular = is_regular(samples, matrix)
     if regular:
         known["constraint_structure"] = constrained
-        if system.rubbing:
+        if system.frictional_contacts:
             margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
             known["contact_margin"] = margins_of_contacts.over(samples, search)
     without_law = why_no_law(system)

@@ -1,4 +1,4 @@
-"""How far friction is from jamming a contact, as text and data."""
+"""The distance of friction from the Painleve paradox, as text and data."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from drake_dae.dae.states.contact_margin import ContactMargin
 
 
 def contact_margin_in_words(findings: Findings, where: str, margin: ContactMargin) -> str:
-    """How much of A(x) friction leaves, and how much friction there may be."""
+    """The share of A(x) that remains with friction, and the critical coefficients."""
     critical = ", ".join(f"{name} {value:.4g}" for name, value in margin.critical_friction.items())
     if not np.all(np.isfinite([*margin.critical_friction.values()])):
-        return f"Friction: {where} no amount of it jams a contact."
+        return f"Friction: {where} no amount of it leads to the Painleve paradox."
     when = "" if margin.time is None else f"t = {margin.time:.4g} s, "
     constrained, system = findings.constraint_structure, findings.system
     used = None
@@ -23,13 +23,13 @@ def contact_margin_in_words(findings: Findings, where: str, margin: ContactMargi
         used = ca.which_depends(matrix, system.state, 1, False)
     place = named_values(system.state_signals, margin.state, used)
     return (
-        f"Friction: {where} at least {margin.reserve:.3g} of A(x) is left, and a contact would jam "
+        f"Friction: {where} at least {margin.reserve:.3g} of A(x) is left; the Painleve paradox is "
         f"at {critical}, nearest at {when}{place}."
     )
 
 
 def contact_margin_as_dict(margin: ContactMargin | None) -> dict[str, Any] | None:
-    """The margin as plain numbers; a coefficient that never jams is None."""
+    """The margin as plain numbers; a coefficient without a critical value is None."""
     if margin is None:
         return None
     return {

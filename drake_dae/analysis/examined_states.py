@@ -1,4 +1,4 @@
-"""The states that an analysis is asked to examine, and how it says which these are."""
+"""The states that an analysis examines, and their description."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -43,7 +43,8 @@ class ExaminedStates:
         """The nominal state first, then random ones, in a region or around the nominal one.
 
         Raises:
-            ModelError: A name is that of no state, or an interval is no two finite ordered numbers.
+            ModelError: A name is not that of a state, or an interval is not two finite ordered
+                numbers.
         """
         nominal = system.nominal_state
         drawn = nominal + system.nominal_spread * random.standard_normal((count, nominal.size))
@@ -100,7 +101,7 @@ def check_consistent(manifold: Manifold, given: FloatArray, taken: FloatArray) -
     Args:
         manifold: N*.
         given: The given states, shape (k, n).
-        taken: Those that were found consistent and inside the domain, shape (l, n).
+        taken: Those of them that are consistent and inside the domain, shape (l, n).
 
     Raises:
         InconsistentStateError: A state is not consistent; the message tells which, and why.

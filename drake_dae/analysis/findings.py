@@ -1,4 +1,4 @@
-"""What an examination finds of a system, as values."""
+"""The results of the analysis of a system, as values."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -19,7 +19,7 @@ from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
 
 class Finding(StrEnum):
-    """What became of an assumption."""
+    """The verdict on an assumption."""
 
     SATISFIED = "satisfied"
     VIOLATED = "violated"
@@ -30,7 +30,7 @@ class Finding(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """One of Assumptions (1)-(5) and what was found of it.
+    """One of Assumptions (1)-(5) and the verdict on it.
 
     Attributes:
         number: Its number in the paper.
@@ -56,14 +56,14 @@ OF_VERDICT = {
     Verdict.UNSTABLE: Finding.VIOLATED,
     Verdict.UNDECIDED: Finding.UNDECIDED,
 }
-"""What is found of the zero dynamics says of Assumption 2.2, which asks for bounded states."""
+"""The verdict on Assumption 2.2, which asks for bounded states, from that on the zero dynamics."""
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
     """What the theory says about one system, as values.
 
-    What is not known, because an assumption fails before, is None.
+    Values that are not known, since an assumption is violated, are None.
 
     Attributes:
         system: The system.
@@ -80,13 +80,13 @@ class Findings:
             the examined states.
         zero_dynamics_along: Assumption 2.2 along the reference; None also without one.
         motion: The motion along the reference; None also without one.
-        contact_margin: How far friction is from jamming a contact; None without friction.
+        contact_margin: The distance of friction from the Painleve paradox; None without friction.
         contact_margin_along: The same along the reference; None also without one.
-        constraint_structure: What the constraints alone decide, for `DaePlant`; None where A(x) is
-            singular at an examined state itself, or there are no degrees.
-        structure: The structure, for laws and blocks; None where A(x) or B(x) is singular at an
-            examined state itself. One that is singular only between them violates its assumption,
-            no more.
+        constraint_structure: The structure of the constraints alone, for `DaePlant`; None if A(x)
+            is singular at an examined state, or a constraint has no degree.
+        structure: The structure, for laws and blocks; None if A(x) or B(x) is singular at an
+            examined state. If it is singular only between them, the assumption is violated but
+            there is a structure.
     """
 
     system: DaeSystem
@@ -140,10 +140,10 @@ class Findings:
 
     @property
     def decisive(self) -> Stability | StabilityAlong | None:
-        """What decides on Assumption 2.2: the reference where that says anything, or else rest.
+        """What decides Assumption 2.2: the verdict along the reference, otherwise that at rest.
 
-        Where the reference has no period, its end is not the end of time: an unstable equilibrium
-        beside it decides, too.
+        If the reference is not periodic, an unstable equilibrium decides as well, since the
+        reference ends.
         """
         rest, along = self.zero_dynamics, self.zero_dynamics_along
         if along is None or rest is None or along.verdict is Verdict.UNDECIDED:
@@ -154,7 +154,7 @@ class Findings:
 
     @property
     def unstable_inside(self) -> tuple[Stability, ...]:
-        """Unstable equilibria inside the region that was asked for, beside what is decisive."""
+        """Further unstable equilibria inside the given region."""
         if self.region is None:
             return ()
         return tuple(
@@ -168,29 +168,29 @@ class Findings:
 
     @property
     def zero_dynamics_finding(self) -> Finding:
-        """What is found of Assumption 2.2: what is decisive, or violated in the region."""
+        """The verdict on Assumption 2.2: the decisive one, or a violation inside the region."""
         if self.unstable_inside:
             return Finding.VIOLATED
         return Finding.NOT_EXAMINED if self.decisive is None else OF_VERDICT[self.decisive.verdict]
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What is violated, one text each; empty if nothing is."""
+        """The violations, one text each; empty if there are none."""
         found = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
-        # Where an assumption fails, the theorem may as well, and says nothing new.
+        # Where an assumption is violated, the theorem adds nothing.
         if not found and self.independence is not None and self.independence.is_singular:
             place = named_values(self.system.state_signals, self.independence.state)
             found.append(
                 "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
                 f"depend on each other at {place}"
             )
-        # Along a reference the motion decides: elsewhere no contact need be.
+        # Along a reference the motion decides: elsewhere there may be no contact.
         contact = self.contact_margin_along or self.contact_margin
-        if contact is not None and contact.jams:
+        if contact is not None and contact.is_paradoxical:
             when = "" if contact.time is None else f"t = {contact.time:.6g} s, "
             critical = ", ".join(f"{k} = {v:.4g}" for k, v in contact.critical_friction.items())
             found.append(
-                "Friction: a contact jams (Painleve's paradox) at "
+                "Friction: the Painleve paradox occurs at "
                 f"{when}{named_values(self.system.state_signals, contact.state)}: a principal "
                 f"minor of A(x) is {contact.reserve:.3g} of what it is without friction, and "
                 f"{critical} is critical there. Lower the friction, slide the other way, or hold "

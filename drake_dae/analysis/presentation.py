@@ -18,7 +18,7 @@ from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 
 def as_dict(findings: Findings) -> dict[str, Any]:
-    """What is printed, as plain numbers, lists and texts, with the states of the margins."""
+    """The printed results as plain numbers, lists and texts, with the states of the margins."""
     system = findings.system
     zero, motion = findings.zero_dynamics, findings.motion
     along = findings.zero_dynamics_along
@@ -183,11 +183,11 @@ def _findings(findings: Findings) -> Table:
 
 
 def _places(findings: Findings) -> list[Part]:
-    """Where the margins are smallest, what the zero dynamics do, and why no more is known."""
+    """The smallest margins, the zero dynamics, and why further results are missing."""
     matrices = {}
     if findings.constraint_structure is not None:
         matrix = findings.constraint_structure.elimination.constraint_matrix
-        matrices[2] = findings.system.rubbing.without_friction(matrix)
+        matrices[2] = findings.system.frictional_contacts.without_friction(matrix)
     if findings.structure is not None:
         matrices[5] = findings.structure.control_matrix
     lines = [

@@ -1,4 +1,4 @@
-"""Whether a reference is what it says: each entry the derivative of the one before."""
+"""Checks that each entry of a reference is the derivative of the one before."""
 
 from collections.abc import Callable
 
@@ -16,8 +16,8 @@ def check_reference(
 ) -> None:
     """Refuses a reference whose derivatives are not those of its values.
 
-    They are compared with central differences of two steps: where these do not agree with each
-    other, as at a kink of the highest derivative, nothing is said.
+    They are compared with central differences of two step sizes. Where these disagree, as at a kink
+    of the highest derivative, nothing is checked.
 
     Args:
         system: The system (1)-(3).
@@ -48,7 +48,7 @@ def check_reference(
     step = 1e-6 * length
     if step <= 1e-9 * np.max(np.abs(grid)):
         return
-    # Not at round fractions, where references have their breaks.
+    # Not at round fractions, where references have their breakpoints.
     tried = grid[0] + length * (0.05 + 0.9 * (np.arange(1, 10) * 0.6180339887 % 1.0))
     values = np.array([value(time) for time in tried])
     slopes, coarse = (

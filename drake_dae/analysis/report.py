@@ -1,4 +1,4 @@
-"""What the theory says about one system: findings that print themselves."""
+"""The printable results of the analysis of a system."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +27,7 @@ class Analysis(Findings):
         return to_markdown([*self.parts(), *([problem] for problem in self.problems)])
 
     def _repr_markdown_(self) -> str:
-        """What notebooks show."""
+        """The display in notebooks."""
         return self.to_markdown()
 
     def to_dict(self) -> dict[str, Any]:

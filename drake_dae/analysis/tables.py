@@ -13,12 +13,12 @@ _WIDTH = 100
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of text: the first `left` ones and those without a head to the left, others right.
+    """Columns of text, the first `left` ones and those without a head left-aligned.
 
     Attributes:
         head: A title per column.
         rows: As many texts in each row.
-        left: How many columns begin at the left.
+        left: The number of left-aligned columns.
     """
 
     head: Sequence[str]
@@ -51,7 +51,7 @@ class Table:
 
 
 def digits(value: float) -> str:
-    """A number with four digits; what is only round-off of numbers that people use is 0."""
+    """A number with four digits; round-off is 0."""
     return f"{value:.4g}" if abs(value) > 1e-12 else "0"
 
 
@@ -87,7 +87,7 @@ def count_of(number: int, noun: str) -> str:
 def named_values(
     signals: Sequence[Signal], values: FloatArray, chosen: Sequence[bool] | None = None
 ) -> str:
-    """Values, or those that are chosen, as "name=value unit, ..."."""
+    """Values, all or chosen ones, as "name=value unit, ..."."""
     return ", ".join(
         f"{signal.name}={digits(value)} {signal.unit}".rstrip()
         for i, (signal, value) in enumerate(zip(signals, values, strict=True))

@@ -176,7 +176,7 @@ def _add_sweep(commands: Any, named: argparse.ArgumentParser) -> None:
         help='what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
         '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
         '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
-        '"force.seed=1..20:20"; may be repeated',
+        '"force_feedback.seed=1..20:20"; may be repeated',
     )
     chosen = study.add_mutually_exclusive_group()
     chosen.add_argument(

@@ -13,7 +13,7 @@ from tempfile import mkdtemp
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
+from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 
 SCENARIO = "scenario.yaml"
 PART = "record.part"
@@ -167,7 +167,7 @@ def _workplace(folder: Path) -> Iterator[str]:
     A signal waits while the folder is made and while it is removed.
     """
     place = None
-    ending, last = Ending(), Ending()
+    ending, last = Interruption(), Interruption()
     try:
         with ending_signals(ending):
             place = mkdtemp(prefix=_STAGE, dir=folder)

@@ -35,6 +35,7 @@ from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.view import start_meshcat
 from drake_dae.robots.clearances import LinkBehind, links_behind
+from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
@@ -42,8 +43,8 @@ from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.real_time import attainable_rate
-from drake_dae.simulation.records.interruption import Ending, end_at_once, ending_signals
-from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
+from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.remarks import (
     ball_remarks,
@@ -53,7 +54,7 @@ from drake_dae.simulation.remarks import (
 )
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import Limits, shortfalls, summary
-from drake_dae.simulation.verdict import Verdict, as_data, judge
+from drake_dae.simulation.verdict import RunVerdict, as_data, judge
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -128,6 +129,7 @@ class _Run:
     failure: str = ""
     pictures: bool = True
     record: Record | None = None
+    recorded: RecordAfter | None = None
     told: dict[str, Any] = field(default_factory=dict)
 
 
@@ -169,11 +171,17 @@ def _roll(run: _Run) -> RunStatistics:
     from drake_dae.scenario.rolled import roll_scenario
 
     began = time.perf_counter()
-    with ending_signals(ending := Ending()):
-        found = roll_scenario(
-            run.scenario, run.loop, run.context, stop=lambda: ending.signal is not None
-        )
-    run.record, run.context = found.record, found.context or run.context
+
+    def look(record: RecordAfter) -> bool:
+        run.recorded = record
+        if run.scenario.write.record:
+            run.writer.update(run.context)
+        return ending.signal is not None
+
+    with ending_signals(ending := Interruption()):
+        found = roll_scenario(run.scenario, run.loop, run.context, look=look)
+    run.record, run.recorded = found.record, found.record.after
+    run.context = found.context or run.context
     if found.failure is not None:
         raise found.failure
     times, wall = run.record.time, time.perf_counter() - began
@@ -191,7 +199,11 @@ def _run(
 ) -> tuple[int, dict[str, Any]]:
     """Runs and writes; what was recorded is kept also when the run fails or is interrupted."""
     about = {"scenario": scenario_data(completed.scenario)}
-    with RecordWriter(folder / PART, loop.record, about) as writer:
+
+    def recorded(context: Context, after: float | None) -> Record:
+        return loop.record(context, after) if run.recorded is None else run.recorded(after)
+
+    with RecordWriter(folder / PART, recorded, about) as writer:
         run = _Run(loop, context, completed.scenario, folder, writer, title, completed.notes)
         try:
             run.statistics = simulate_by(run)
@@ -213,7 +225,7 @@ def _write(run: _Run) -> bool:
     loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
     # A signal that comes now does not stop before the record is written, but before the pictures.
-    with ending_signals(ending := Ending()):
+    with ending_signals(ending := Interruption()):
         record = run.record or loop.record(run.context)
         if record.time.size == 0:
             return True
@@ -224,7 +236,7 @@ def _write(run: _Run) -> bool:
         fixed = loop.plant.time_step or not config.use_error_control
         accuracy = None if fixed else config.accuracy
         reasons = _reasons(run.scenario, loop, record)
-        behind = _behind(loop, record, run.context)
+        behind = _ways(loop, record, run.context)
         text = summary(
             record, predicted, limits, run.statistics, run.failure, accuracy, reasons, behind
         )
@@ -274,18 +286,20 @@ def _write(run: _Run) -> bool:
     return not problems
 
 
-def _behind(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind, ...]:
-    """The links that went behind a surface in a run."""
+def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehind | Collision, ...]:
+    """The links that went behind a surface in a run, and those that collided."""
     plant = loop.plant
     if plant.model is None:
         return ()
     own = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
     if "exogenous" in record.signals:
         own[:, plant.exogenous_places] = record["exogenous"]
-    return links_behind(plant.model, record.time, record["state"], own)
+    shapes, states = LinkShapes(plant.model, loop.scene_graph), record["state"]
+    behind = links_behind(plant.model, record.time, states, own, shapes)
+    return *behind, *collisions(shapes, record.time, states)
 
 
-def _as_data(run: _Run, verdict: Verdict, reasons: Sequence[str]) -> dict[str, Any]:
+def _as_data(run: _Run, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
     """What JSON says of a run."""
     found = run.statistics
     return {
@@ -307,10 +321,12 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
             scenario.plant_parameters
         ),
         "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
-        "the plant is pushed, and the law does not know it": bool(scenario.plant_pushes),
+        "disturbance forces act on the plant, unknown to the law": bool(
+            scenario.plant_disturbances
+        ),
         "Drake's own contact gives way": not loop.plant.is_ideal,
         "a contact was open": "mode" in record.signals and not record["mode"].all(),
-        "the force is measured by a sensor": scenario.force.is_measured,
+        "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }

@@ -5,11 +5,11 @@ expanding f* and differentiating the whole, the equations of the motion are diff
 
     E x' = f + g v + h u,    c' = 0,
 
-with c the last derivatives L_f^(r_i - 1) k_i of the constraints; where there are exogenous signals,
-they and their derivatives move, too. Each order brings new unknowns
-(x'', v'), (x''', v''), ... that solve a linear system with one and the same matrix,
+where c are the last derivatives L_f^(r_i - 1) k_i of the constraints. Exogenous signals and their
+derivatives change with time as well. Each order brings new unknowns (x'', v'), (x''', v''), ...
+that solve a linear system with one and the same matrix,
 
-    [[E, -g], [dc/dx, 0]] (x^(k+1), v^(k)) = what is known of the orders before,
+    [[E, -g], [dc/dx, 0]] (x^(k+1), v^(k)) = terms of the lower orders,
 
 so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and A is J M^-1 J^T.
 """
@@ -34,15 +34,16 @@ class Derivatives:
     Args:
         system: The system (1)-(3).
         constraint: The column c = (L_f^(r_1 - 1) k_1, ..., L_f^(r_m - 1) k_m), shape (m, 1).
-        damping: What c' is to be with the opposite sign, an expression of the state that vanishes
-            on N*, shape (m, 1); c' = 0 if None. Higher derivatives of c are zero nevertheless.
+        damping: The prescribed value of -c', an expression of the state that vanishes on N*, shape
+            (m, 1); c' = 0 if None. Higher derivatives of c are zero in both cases.
 
     Attributes:
         control: The symbols u, shape (p, 1).
         constraint_gradient: dc/dx, shape (m, n).
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        pivot: A scalar that is 0 exactly where A(x) is singular, see `trace.factorization`, and not
-            positive where a contact jams, see `dae.contacts`.
+        pivot: A scalar that is 0 exactly where A(x) is singular, see `trace.factorization`. With
+            frictional contacts it is not positive where the Painleve paradox occurs, see
+            `dae.system.contacts`.
     """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX, damping: ca.SX | None = None) -> None:
@@ -74,7 +75,7 @@ class Derivatives:
         #: The constraint input v of (1) as an unknown of the motion, shape (m, 1).
         self.constraint_input = first[len(self._rows) :, :]  # A slice [1:] of a scalar is a row.
         balance, self._constraint_rate = self._first_order(constraint)
-        self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)
+        self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)  # (1)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
         if _agree(system, gradient, g_rows):
             gradient = g_rows
@@ -84,8 +85,10 @@ class Derivatives:
         self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
             mass[self._rows, self._rows], g_rows, gradient
         )
-        if system.rubbing:
-            self.pivot = ca.fmin(self.pivot, system.rubbing.reserve(self.constraint_matrix))
+        if system.frictional_contacts:
+            self.pivot = ca.fmin(
+                self.pivot, system.frictional_contacts.reserve(self.constraint_matrix)
+            )
         self._equations: list[ca.SX] = []
         self._control_slopes: list[ca.SX] = []
         self._solve_order(damping)
@@ -115,8 +118,8 @@ class Derivatives:
     def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
         """a(x) and B(x) of an expression a(x) + B(x) u of the motion, as (9)-(14) and (16) read.
 
-        B goes from unknown to unknown, as they solve the equations of the motion: that takes far
-        fewer operations than to differentiate what stands for them.
+        B is formed by the chain rule over the unknowns, which takes far fewer operations than
+        differentiating the expanded expression.
 
         Args:
             expression: Of the state and of the unknowns, shape (k, 1).
@@ -138,7 +141,7 @@ class Derivatives:
         return both[:size, :], ca.sparsify(ca.reshape(both[size:, :], slope.shape))
 
     def _orders_in(self, expression: ca.SX) -> int:
-        """How many orders of unknowns an expression is in terms of."""
+        """The number of orders of unknowns in an expression."""
         used = [k for k, w in enumerate(self._symbols[1:], 1) if ca.depends_on(expression, w)]
         return max(used, default=0)
 
@@ -173,7 +176,7 @@ class Derivatives:
         Args:
             expression: Of the state and of the unknowns, shape (p, 1).
             wanted: The wanted values, shape (p, 1).
-            shown: What else of the motion is asked for, at that control, shape (k, 1).
+            shown: Further expressions of the motion to evaluate at that control, shape (k, 1).
 
         Returns:
             u in terms of the state, shape (p, 1), a scalar that is 0 exactly where it is not
@@ -200,7 +203,7 @@ class Derivatives:
         waiting = list(range(unknowns.numel()))
         for stage in block_stages(matrix.sparsity()):
             ahead = unknowns[waiting]
-            # What is solved for later may stand here with a slope that cancels.
+            # An unknown that is solved for later may appear here with a slope that cancels.
             every = equations[[row for rows, _ in stage for row in rows]]
             known = ca.vertsplit(
                 ca.substitute(every, ahead, ca.SX.zeros(ahead.numel())),
@@ -211,7 +214,7 @@ class Derivatives:
                 blocks.append((columns, factors.solve(-right), factors.pivot))
             solved = {column for _, columns in stage for column in columns}
             waiting = [column for column in waiting if column not in solved]
-        # From the control back to what it needs: the rest moves, but nobody asks for it.
+        # Only the unknowns that the control depends on are solved for.
         solutions = [solution for _, solution, _ in blocks]
         uses = nonzeros(ca.jacobian_sparsity(ca.vertcat(ca.SX(0, 1), *solutions), unknowns))
         needed, pivot, last = [self.control, shown], ca.SX(1), len(uses)
@@ -260,7 +263,7 @@ class Derivatives:
         if system.implicit is None:
             return balance, constraint_rate
         shorter = ca.vertcat(*system.implicit(rate, self.constraint_input))
-        if system.exogenous:  # Of constraints that move, `implicit` knows the state's part alone.
+        if system.exogenous:  # `implicit` has the part of the state alone.
             shorter = ca.vertcat(shorter[: system.num_states], constraint_rate)
         longer = ca.vertcat(balance, constraint_rate)
         if shorter.shape != longer.shape or not _agree(
@@ -314,9 +317,9 @@ class Derivatives:
 
 
 def _agree(system: DaeSystem, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
-    """Whether two expressions are the same function, by their numbers around the nominal state.
+    """Whether two expressions have the same values at random states around the nominal one.
 
-    The parameters are changed, too: what agrees at their defaults alone is not the same.
+    The parameters are varied as well: expressions that agree at their defaults alone are different.
     """
     symbols = [system.state, *unknowns, system.parameter_symbol]
     function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])

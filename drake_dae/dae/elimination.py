@@ -45,8 +45,8 @@ class Elimination:
 def eliminate(derivatives: Derivatives) -> Elimination:
     """Reads (9)-(14) off the derivatives on N*, which are affine in the control."""
     system = derivatives.system
-    alpha, beta = derivatives.by_control(derivatives.constraint_input)
-    f_star, h_star = derivatives.by_control(derivatives.rate)
+    alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14)
+    f_star, h_star = derivatives.by_control(derivatives.rate)  # (9), (10)
     return Elimination(
         constraint_gradient=derivatives.constraint_gradient,
         constraint_matrix=derivatives.constraint_matrix,
@@ -54,8 +54,8 @@ def eliminate(derivatives: Derivatives) -> Elimination:
         beta=beta,
         f_star=f_star,
         h_star=h_star,
-        l_star=system.outputs(alpha),
-        n_star=ca.sparsify(ca.mtimes(system.m, beta)),
+        l_star=system.outputs(alpha),  # (11)
+        n_star=ca.sparsify(ca.mtimes(system.m, beta)),  # (12)
         pivot=derivatives.pivot,
     )
 
@@ -67,10 +67,10 @@ def eliminate_numbers(
     scale: FloatArray,
     negligible: float,
 ) -> tuple[Sized, Sized]:
-    """h* (10) and n* (12) at one state, where what is zero but for round-off is zero.
+    """h* (10) and n* (12) at one state; entries that are only round-off are set to zero.
 
-    The expressions of `eliminate` do not tell how large the terms were that cancelled in them; the
-    factors of beta (14) do.
+    The expressions of `eliminate` do not show how large their cancelled terms were; the factors of
+    beta (14) do.
 
     Args:
         fields: g, h and m of the system with E = 1, by letter.

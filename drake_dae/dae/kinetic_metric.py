@@ -1,14 +1,13 @@
 """A projection onto N* in the metric of kinetic energy, where constraint forces do no work.
 
-A mechanical system E x' = f + g v has constraint forces along the gradients of its constraints. An
-impulse of them changes the velocities that are in the way and no others: dv = M^-1 J^T mu, the
-change of least kinetic energy. Positions move likewise, dq = N M^-1 N^T J_q^T mu with q' = N v. So
-what is heavy stays, in any units, and what no constraint force reaches stays as it is.
+A mechanical system E x' = f + g v has constraint forces along the gradients of its constraints.
+Their impulses change velocities by dv = M^-1 J^T mu, the change of least kinetic energy. Positions
+change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So heavy bodies move little in any
+units, and coordinates that no constraint force acts on stay unchanged.
 """
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import Indices, Layout
@@ -31,7 +30,7 @@ class KineticMetric:
         self._system = system
         orders, degrees = layout.orders, np.array(layout.degrees, dtype=int)
         owners = np.repeat(np.arange(degrees.size), degrees)
-        # How many derivatives of a row are left until the constraint inputs act.
+        # The number of further derivatives of a row until the constraint inputs act.
         left = degrees[owners] - 1 - orders if degrees.size else np.zeros(0, dtype=int)
         groups = _groups(system, int(max(degrees, default=0)))
         self.levels: list[tuple[Indices, Indices, int]] = [
@@ -44,7 +43,7 @@ class KineticMetric:
         if not self.is_known:
             return
         moving = groups[0].tolist()
-        forces = system.rubbing.without_friction(system.g)[moving, :]
+        forces = system.frictional_contacts.without_friction(system.g)[moving, :]
         outputs = {
             "mass": ca.densify(system.mass_matrix[moving, moving]),
             "forces": ca.densify(forces),
@@ -72,9 +71,9 @@ class KineticMetric:
         lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
         if not all(np.all(np.isfinite(one)) and np.all(one > 0.0) for one in lengths):
             return False
-        basis = scipy.linalg.orth(across / lengths[0])
-        unit = forces / lengths[1]
-        return bool(np.max(np.abs(unit - basis @ (basis.T @ unit))) <= ALONG)
+        basis, unit = across / lengths[0], forces / lengths[1]
+        left = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
+        return bool(np.max(np.abs(left)) <= ALONG)
 
     def directions(
         self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int

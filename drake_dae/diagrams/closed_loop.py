@@ -84,13 +84,6 @@ class ClosedLoop:
             )
         return self.generator
 
-    @property
-    def moves_otherwise(self) -> bool:
-        """Whether the plant has other exogenous signals than its law knows."""
-        pair = (self.exogenous, self.plant_exogenous)
-        known, own = ([id(one) for one in each.references] if each else [] for each in pair)
-        return known != own
-
     def set_seed(self, context: Context, seed: int) -> None:
         """Chooses the noise of the sensor; without a call it is the same in every run.
 

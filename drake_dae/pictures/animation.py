@@ -17,8 +17,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import LEAST_SCALE, PATH_COLOR, path_of
-from drake_dae.pictures.course import Course, Loop, follow, run_extent
-from drake_dae.pictures.phases import Span, phase_spans
+from drake_dae.pictures.course import Course, ShownLoop, follow, run_extent
+from drake_dae.pictures.phases import PhaseSpan, phase_spans
 from drake_dae.pictures.surroundings import scene_extent, surroundings
 from drake_dae.pictures.view import (
     FRAME_RATE,
@@ -53,7 +53,9 @@ class AnimationPage(str):
 
 
 @checked(ModelError)
-def make_animation(loop: Loop, record: Record, context: Context, title: str = "") -> AnimationPage:
+def make_animation(
+    loop: ShownLoop, record: Record, context: Context, title: str = ""
+) -> AnimationPage:
     """Replays a record of a robot in Meshcat, with the paths of the points where it is held.
 
     The page shows the clock and the size of each constraint force at its arrow, draws the path that
@@ -80,7 +82,7 @@ def animate(
     course: Course,
     scene_graph: SceneGraph | None,
     title: str = "",
-    phases: Sequence[Span] = (),
+    phases: Sequence[PhaseSpan] = (),
 ) -> AnimationPage:
     """The page of `make_animation`.
 
@@ -97,7 +99,7 @@ def animate(
     model = course.model
     arrows = draw_scene(plant, meshcat, scene_graph)
     links = view_of_links(plant, scene_graph, meshcat)
-    arrows.measure(course.loads)
+    arrows.measure(course.wrenches)
 
     # What stands still: what it touches, where it went, and where the reference wanted it.
     _, size = scene_extent(model, acting, course.states[0], scene_graph)
@@ -111,19 +113,19 @@ def animate(
     replay = links.CreateDefaultContext() if links is not None else None
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
     rows = zip(
-        course.times, course.states, course.loads, course.parameters, course.flashes, strict=True
+        course.times, course.states, course.wrenches, course.parameters, course.flashes, strict=True
     )
     flashing = _add_flashes(meshcat, course, 0.05 * size)
-    for time, state, load, own, bright in rows:
+    for time, state, wrench, own, bright in rows:
         if links is not None and replay is not None:
             replay.SetTime(time)
             link_state = links.get_input_port()
             link_state.FixValue(replay, state[: link_state.size()])
             links.ForcedPublish(replay)
-        arrows.draw(load, time)
+        arrows.draw(wrench, time)
         arrows.place(own, time)
         for row, path in flashing.items():
-            meshcat.SetTransform(path, RigidTransform(load.points[row]), time)
+            meshcat.SetTransform(path, RigidTransform(wrench.points[row]), time)
             meshcat.SetProperty(f"{path}/ball", "scale", [max(bright[row], LEAST_SCALE)] * 3, time)
     meshcat.StopRecording()
     recording = meshcat.get_mutable_recording()
@@ -160,14 +162,14 @@ def _quiet() -> Iterator[None]:
 
 def _draw_paths(
     meshcat: Meshcat,
-    loads: ConstraintWrenches,
+    wrenches: ConstraintWrenches,
     points: FloatArray,
     kind: str,
     color: Rgba,
     radius: float,
 ) -> None:
     """A line through the points of each constraint, m, shape (frames, constraints, 3)."""
-    for number, constraint in enumerate(loads.constraints):
+    for number, constraint in enumerate(wrenches.constraints):
         line = points[:, number]
         if len(line) > 1:
             vertices, faces = _tube(line, radius)
@@ -208,10 +210,10 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
     return rings.reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def _with_overlay(page: str, course: Course, title: str, phases: Sequence[Span]) -> str:
+def _with_overlay(page: str, course: Course, title: str, phases: Sequence[PhaseSpan]) -> str:
     """Meshcat's page with a title, the clock, the sizes of the forces, and paths that grow."""
     constraints = course.acting.constraints
-    sizes = np.linalg.norm([load.forces for load in course.loads], axis=2)
+    sizes = np.linalg.norm([wrench.forces for wrench in course.wrenches], axis=2)
     data = {
         "title": title,
         "rate": FRAME_RATE,

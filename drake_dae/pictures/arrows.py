@@ -46,24 +46,24 @@ class ForceArrows:
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
         self.largest_force = self.largest_moment = 1e-6
         self._meshcat, self._model = meshcat, model
-        self._loads = ConstraintWrenches(model)
-        pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
+        self._wrenches = ConstraintWrenches(model)
+        pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
         for constraint, with_moment in pairs:
             _add_arrow(meshcat, path_of(constraint, "force"), length, 1, _FORCE_COLOR)
             if with_moment:
                 _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, _MOMENT_COLOR)
 
-    def draw(self, loads: Wrenches, time: float) -> None:
+    def draw(self, wrenches: Wrenches, time: float) -> None:
         """Draws the arrows.
 
         Args:
-            loads: The loads at this moment.
+            wrenches: The wrenches at this moment.
             time: The time in a recording, s.
         """
-        self.measure([loads])
-        pairs = zip(self._loads.constraints, self._loads.with_moment, strict=True)
+        self.measure([wrenches])
+        pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
         for row, (constraint, with_moment) in enumerate(pairs):
-            point, force, moment = loads.points[row], loads.forces[row], loads.moments[row]
+            point, force, moment = wrenches.points[row], wrenches.forces[row], wrenches.moments[row]
             self._draw_arrow(path_of(constraint, "force"), point, force / self.largest_force, time)
             if with_moment:
                 turned = moment / self.largest_moment
@@ -84,11 +84,11 @@ class ForceArrows:
                 self._meshcat.SetTransform(path_of(constraint, "surface"), stands, time)
 
     def measure(self, course: Sequence[Wrenches]) -> None:
-        """Makes the arrows so short that none of these loads has one that is too long."""
-        for loads in course:
+        """Makes the arrows so short that none of these wrenches has one that is too long."""
+        for wrenches in course:
             force, moment = (
                 float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
-                for rows in (loads.forces, loads.moments)
+                for rows in (wrenches.forces, wrenches.moments)
             )
             self.largest_force = max(self.largest_force, force)
             self.largest_moment = max(self.largest_moment, moment)
@@ -165,8 +165,8 @@ class ConstraintForceVisualizer(LeafSystem):
         super().__init__()
         self.set_name("constraint_force_visualizer")
         self._model = model
-        self._arrows, self._loads = arrows, ConstraintWrenches(model)
-        self._paths = GrowingPaths(meshcat, self._loads.constraints)
+        self._arrows, self._wrenches = arrows, ConstraintWrenches(model)
+        self._paths = GrowingPaths(meshcat, self._wrenches.constraints)
         self._values, self._places = model.dae.parameter_values, list(places)
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
@@ -184,9 +184,9 @@ class ConstraintForceVisualizer(LeafSystem):
         if self._places and self._exogenous.HasValue(context):
             self._values[self._places] = self._exogenous.Eval(context)
             self._arrows.place(self._values, time)
-        loads = self._loads(state, force, self._values)
-        self._arrows.draw(loads, time)
-        self._paths.add(loads.points, time)
+        wrenches = self._wrenches(state, force, self._values)
+        self._arrows.draw(wrenches, time)
+        self._paths.add(wrenches.points, time)
         return EventStatus.Succeeded()
 
 

@@ -26,7 +26,7 @@ _PLACES = 12
 """So many states of a run tell how much room it takes."""
 
 
-class Loop(Protocol):
+class ShownLoop(Protocol):
     """A diagram with a plant and its geometry, as a `ClosedLoop`."""
 
     @property
@@ -49,7 +49,7 @@ class Course:
         start_time: When the run began, in s.
         states: x, shape (k, n).
         parameters: The values of all parameters, shape (k, number of parameters).
-        loads: What the constraints did.
+        wrenches: What the constraints did.
         wanted: Link states at rest with the desired outputs, as long as they are in reach,
             shape (j, nq + nv) with j <= k.
         acting: Where and how the constraints act, at the parameters of the start.
@@ -63,7 +63,7 @@ class Course:
     start_time: float
     states: FloatArray
     parameters: FloatArray
-    loads: Sequence[Wrenches]
+    wrenches: Sequence[Wrenches]
     wanted: FloatArray
     acting: ConstraintWrenches
     flashes: FloatArray
@@ -71,7 +71,7 @@ class Course:
     @property
     def points(self) -> FloatArray:
         """Where the constraints acted, m, shape (k, constraints, 3)."""
-        return np.array([load.points for load in self.loads])
+        return np.array([wrench.points for wrench in self.wrenches])
 
     @property
     def wanted_points(self) -> FloatArray:
@@ -100,7 +100,7 @@ class ContactPath:
     points_left: bool = False
 
 
-def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
+def follow(loop: ShownLoop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
     """The course of a run of a robot.
 
     Args:
@@ -123,11 +123,11 @@ def follow(loop: Loop, record: Record, context: Context, rate: float = FRAME_RAT
     values = np.tile(parameters, (len(times), 1))
     if "exogenous" in record.signals:
         values[:, plant.exogenous_places] = _interpolated(record, "exogenous", times)
-    loads = [acting(*row) for row in zip(states, forces, values, strict=True)]
+    wrenches = [acting(*row) for row in zip(states, forces, values, strict=True)]
     wanted = _desired_states(model, states, desired, values)
     begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
     bright = flashes(record.events, names, begin + times)
-    return Course(plant, model, times, begin, states, values, loads, wanted, acting, bright)
+    return Course(plant, model, times, begin, states, values, wrenches, wanted, acting, bright)
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
@@ -146,7 +146,7 @@ def contact_paths(course: Course) -> list[ContactPath]:
     pushes = _pushes(course)
     found = []
     for row, constraint in enumerate(course.acting.constraints):
-        if not any(constraint.can_only_push):
+        if not any(constraint.is_unilateral):
             continue
         stands = [constraint.placement(own_values(constraint, dae, p)) for p in course.parameters]
         actual, desired = (
@@ -191,7 +191,7 @@ def _pushes(course: Course) -> FloatArray:
     At rest nothing rubs, so that a push is along the normal.
     """
     model, links = course.model, course.model.links
-    ones = [np.array(constraint.can_only_push, float) for constraint in model.constraints]
+    ones = [np.array(constraint.is_unilateral, float) for constraint in model.constraints]
     push = np.concatenate([np.zeros(0), *ones])
     nq, nv = links.q.numel(), links.v.numel()
     rest = np.pad(course.states[:, :nq], ((0, 0), (0, nv)))

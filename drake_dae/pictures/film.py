@@ -35,7 +35,7 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.course import Course, Loop, follow, run_extent
+from drake_dae.pictures.course import Course, ShownLoop, follow, run_extent
 from drake_dae.pictures.phases import phases_at
 from drake_dae.pictures.surroundings import surroundings
 from drake_dae.robots.constraint_wrenches import own_values
@@ -65,7 +65,7 @@ Pixels = NDArray[np.uint8]
 
 
 @checked(ModelError)
-def save_film(loop: Loop, record: Record, context: Context, path: str | Path) -> None:
+def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Path) -> None:
     """Films a record of a robot with the paths and the forces of its contacts.
 
     The path so far is blue, the one that the reference wants green; a star is an impact.
@@ -179,7 +179,8 @@ class _Scene:
         self._context = self._diagram.CreateDefaultContext()
         self._world = scene.world_frame_id()
         self._largest = max(
-            float(np.linalg.norm(load.forces, axis=1).max(initial=0.0)) for load in course.loads
+            float(np.linalg.norm(wrench.forces, axis=1).max(initial=0.0))
+            for wrench in course.wrenches
         )
 
     def draw(self, axis: Axes, number: int) -> None:
@@ -189,15 +190,15 @@ class _Scene:
         course = self._course
         axis.imshow(self._render(number), interpolation="nearest")
         axis.set_axis_off()
-        load = course.loads[number]
+        wrench = course.wrenches[number]
         taken: list[FloatArray] = []
-        for row, force in enumerate(load.forces):
+        for row, force in enumerate(wrench.forces):
             for points, color in ((self._wanted, DESIRED), (self._points[: number + 1], ACTUAL)):
                 axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
             size = float(np.linalg.norm(force))
             if size > _LEAST_FORCE * self._largest:
-                tail = load.points[row] - 0.25 * self._size * force / self._largest
-                head, tail = self._camera.project(np.array([load.points[row], tail]))
+                tail = wrench.points[row] - 0.25 * self._size * force / self._largest
+                head, tail = self._camera.project(np.array([wrench.points[row], tail]))
                 shape = {"color": FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
                 axis.annotate("", head, tail, arrowprops=shape)
                 place = _label_place(head, tail, taken)
@@ -208,7 +209,7 @@ class _Scene:
                 )
                 told.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
             if bright := course.flashes[number, row]:
-                x, y = self._camera.project(load.points[row])[0]
+                x, y = self._camera.project(wrench.points[row])[0]
                 axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)
         time = course.start_time + course.times[number]
         axis.text(12, 24, f"t = {time:.1f} s", fontsize=11, color="0.25")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # Loaded with the first figure.
 
 
 @dataclass(frozen=True)
-class Span:
+class PhaseSpan:
     """A phase in a record.
 
     Attributes:
@@ -28,7 +28,7 @@ class Span:
     end: float
 
 
-def phase_spans(record: Record) -> list[Span]:
+def phase_spans(record: Record) -> list[PhaseSpan]:
     """The phases of a record, one after the other; none if it has no tasks."""
     if "phase" not in record.signals or not record.time.size:
         return []
@@ -40,7 +40,7 @@ def phase_spans(record: Record) -> list[Span]:
     last = np.flatnonzero(np.append(np.diff(places) != 0, True))
     begins = [record.time[0], *record.time[last[:-1]]]
     return [
-        Span(names[places[row]], float(begin), float(record.time[row]))
+        PhaseSpan(names[places[row]], float(begin), float(record.time[row]))
         for row, begin in zip(last, begins, strict=True)
     ]
 

@@ -97,7 +97,7 @@ def _coincide(first: Seen, second: Seen) -> bool:
 
 def scene_extent(
     model: RobotModel,
-    loads: ConstraintWrenches,
+    wrenches: ConstraintWrenches,
     state: FloatArray,
     scene_graph: SceneGraph | None = None,
 ) -> tuple[FloatArray, float]:
@@ -105,14 +105,14 @@ def scene_extent(
 
     Args:
         model: The robot.
-        loads: Its constraint loads.
+        wrenches: Its constraint wrenches.
         state: x, or the link state (q, v) that it begins with.
         scene_graph: The geometry of its links, or None: then each link is but its origin.
     """
     links, dae = model.links, model.dae
     inputs = {"q": links.q, "parameters": dae.parameter_symbol}
     landmarks = TracedFunction("landmarks", inputs, {"points": links.landmarks()})
-    held = loads(state, np.zeros(len(dae.force_signals))).points
+    held = wrenches(state, np.zeros(len(dae.force_signals))).points
     own = landmarks(state[: links.q.numel()], dae.parameter_values)[0].reshape(3, -1, order="F").T
     places = np.vstack([np.zeros((1, 3)), own, held, _corners(model, state, scene_graph)])
     low, high = places.min(axis=0), places.max(axis=0)

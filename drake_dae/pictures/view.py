@@ -99,10 +99,10 @@ def draw_scene(
     """
     model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
-    loads = ConstraintWrenches(model)
-    middle, size = scene_extent(model, loads, state, scene_graph)
-    points = loads(state, np.zeros(len(dae.force_signals))).points[None]
-    draw_surroundings(meshcat, surroundings(model, loads, points, dae.parameter_values, size))
+    wrenches = ConstraintWrenches(model)
+    middle, size = scene_extent(model, wrenches, state, scene_graph)
+    points = wrenches(state, np.zeros(len(dae.force_signals))).points[None]
+    draw_surroundings(meshcat, surroundings(model, wrenches, points, dae.parameter_values, size))
     look_at(meshcat, middle, size)
     return ForceArrows(meshcat, model, 0.2 * size)
 

@@ -2,18 +2,23 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.constraints.constraint import Touch
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.shapes import TOUCHING, LinkShapes, moments
 from drake_dae.trace.functions import TracedFunction
 
 SHARE = 0.05
 """A link counts as behind a surface where it is so deep, relative to its distance from the contact:
 tools lie along a surface, and surfaces give way."""
+
+SHAPE = 0.01
+"""So deep, relative to the same distance, a corner of its shape is."""
 
 NEARER = 1.1
 """A link belongs to the contact where its distance from there is below so many times that from what
@@ -30,7 +35,7 @@ class LinkBehind:
     Attributes:
         constraint: The name of the constraint that has the surface.
         link: The name of the link's frame.
-        depth: How far its origin is behind the surface at most, in m.
+        depth: How far its origin, or a corner of its shape, is behind the surface at most, in m.
         time: When, in s.
         since: When it is first behind, in s.
     """
@@ -50,83 +55,136 @@ class LinkBehind:
 
 
 def links_behind(
-    model: RobotModel, times: FloatArray, states: FloatArray, parameters: FloatArray
+    model: RobotModel,
+    times: FloatArray,
+    states: FloatArray,
+    parameters: FloatArray,
+    shapes: LinkShapes | None = None,
 ) -> tuple[LinkBehind, ...]:
     """The deepest link behind each surface, along a motion.
 
-    A link is where the origin of its frame is, and its surface asked for the distance there. A
-    surface may end before it reaches the robot's base, as a table does that the robot stands
-    beside. So a link counts where it is not farther from the contact than from what stands still.
-    Between the origins of frames nothing is looked at, and no link is compared with another one.
+    A link is where the origin of its frame is, and with `shapes` where corners of its collision
+    geometry are; its surface is asked for the distance there. A surface may end before it reaches
+    the robot's base, as a table does that the robot stands beside. So a link counts where it is not
+    farther from the contact than from what stands still; its shape also where that is in front of
+    the surface. The shapes next to the base, and of what is at the contact, count for nothing.
 
     Args:
         model: The robot.
         times: The times of the motion in s, shape (k,).
         states: x at these times, shape (k, n).
         parameters: The values of all parameters at these times, shape (k, P).
+        shapes: The collision geometry of the links, if it is to be looked at.
     """
-    chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST)).astype(int))
-    found = [
-        _deepest(model, constraint, times[chosen], states[chosen], parameters[chosen])
-        for constraint in model.constraints
-        if len(times)
-    ]
-    return tuple(one for one in found if one is not None)
+    if not len(times):
+        return ()
+    found: list[LinkBehind] = []
+    for constraint in model.constraints:
+        touch, chosen = constraint.touch(model.links), moments(len(times), MOST)
+        if touch is None:
+            continue
+        surface = _Surface(model, constraint.name, touch)
+        tried = [surface.deepest(times[chosen], states[chosen], parameters[chosen])]
+        if shapes:
+            chosen = moments(len(times))
+            tried.append(
+                surface.deepest_shape(shapes, times[chosen], states[chosen], parameters[chosen])
+            )
+        behind = [one for one in tried if one is not None]
+        found += [max(behind, key=lambda one: one.depth)] if behind else []
+    return tuple(found)
 
 
-def _deepest(
-    model: RobotModel,
-    constraint: Constraint,
-    times: FloatArray,
-    states: FloatArray,
-    parameters: FloatArray,
-) -> LinkBehind | None:
-    """The link that goes deepest behind the surface of one constraint; None if none does."""
-    links = model.links
-    touch = constraint.touch(links)
-    if touch is None:
-        return None
-    points = ca.horzsplit(links.landmarks())
-    moving = [ca.depends_on(point, links.q) for point in points]
-    names = [name for name, yes in zip(links.landmark_names, moving, strict=True) if yes]
-    of_links = [point for point, yes in zip(points, moving, strict=True) if yes]
-    # The world's own origin is no part of a robot that moves freely.
-    still = [
-        point
-        for name, point, yes in zip(links.landmark_names, points, moving, strict=True)
-        if not yes and name != "world"
-    ]
-    if not of_links:
-        return None
-    contact = links.position(touch.frame, touch.point)
-    function = TracedFunction(
-        "clearances",
-        {"q": links.q, "parameters": model.dae.parameter_symbol},
-        {
-            "depths": -ca.vertcat(*[touch.clearance(point) for point in of_links]),
-            "to_contact": _distances(of_links, [contact]),
-            "to_base": _distances(of_links, still),
-        },
-    )
-    nq = links.q.numel()
-    values = [
-        [value.ravel().copy() for value in function(state[:nq], own)]
-        for state, own in zip(states, parameters, strict=True)
-    ]
-    depths, to_contact, to_base = (np.array(each) for each in zip(*values, strict=True))
-    counts = (depths > SHARE * to_contact) & (to_contact < NEARER * to_base)
-    # What is at the contact itself is on the surface.
-    counts &= to_contact > SHARE * to_contact.max(axis=1, keepdims=True)
-    if not counts.any():
-        return None
-    row, column = np.unravel_index(np.argmax(np.where(counts, depths, 0.0)), depths.shape)
-    return LinkBehind(
-        constraint.name,
-        names[column],
-        float(depths[row, column]),
-        float(times[row]),
-        float(times[np.argmax(counts[:, column])]),
-    )
+class _Surface:
+    """What is behind a surface, along a motion."""
+
+    def __init__(self, model: RobotModel, name: str, touch: Touch) -> None:
+        links, self._name, self._touch = model.links, name, touch
+        points = ca.horzsplit(links.landmarks())
+        moving = [ca.depends_on(point, links.q) for point in points]
+        pairs = list(zip(links.landmark_names, points, moving, strict=True))
+        self._links = [name for name, _, yes in pairs if yes]
+        of_links = [point for _, point, yes in pairs if yes]
+        # The world's own origin is no part of a robot that moves freely.
+        still = [point for name, point, yes in pairs if not yes and name != "world"]
+        contact = links.position(touch.frame, touch.point)
+        self._nq = links.q.numel()
+        inputs = {"q": links.q, "parameters": model.dae.parameter_symbol}
+        depths = [-touch.clearance(point) for point in of_links]
+        self._origins = TracedFunction(
+            "clearances",
+            inputs,
+            {
+                "depths": ca.densify(ca.vertcat(*depths)),
+                "to_contact": _distances(of_links, [contact]),
+                "to_base": _distances(of_links, still),
+            },
+        )
+        self._inputs, self._contact, self._still = inputs, contact, still
+
+    @cached_property
+    def _corner(self) -> ca.Function:
+        """From points (3, k), q and parameters to how deep they are, and their distances."""
+        point, clearance = ca.SX.sym("point", 3), self._touch.clearance
+        of_still = [-clearance(each) for each in self._still]
+        return ca.Function(
+            "corner",
+            [point, *self._inputs.values()],
+            [
+                -clearance(point),
+                ca.norm_2(point - self._contact),
+                _distances([point], self._still),
+                ca.mmax(ca.vertcat(-ca.inf, *of_still)),
+            ],
+        )
+
+    def deepest(
+        self, times: FloatArray, states: FloatArray, parameters: FloatArray
+    ) -> LinkBehind | None:
+        """The link whose origin is deepest; None if none is behind."""
+        if not self._links:
+            return None
+        values = [
+            [value.ravel().copy() for value in self._origins(state[: self._nq], own)]
+            for state, own in zip(states, parameters, strict=True)
+        ]
+        depths, to_contact, to_base = (np.array(each) for each in zip(*values, strict=True))
+        counts = (depths > SHARE * to_contact) & (to_contact < NEARER * to_base)
+        # What is at the contact itself is on the surface.
+        counts &= to_contact > SHARE * to_contact.max(axis=1, keepdims=True)
+        return self._worst(times, np.where(counts, depths, 0.0), self._links)
+
+    def deepest_shape(
+        self, shapes: LinkShapes, times: FloatArray, states: FloatArray, parameters: FloatArray
+    ) -> LinkBehind | None:
+        """The link whose shape is deepest; None if none is behind."""
+        skipped, found = shapes.moved_with(self._touch.frame) | shapes.at_base(), []
+        if shapes.links <= skipped:
+            return None
+        for state, own in zip(states, parameters, strict=True):
+            shapes.place(state)
+            row = np.zeros(shapes.count)
+            for index, points, radius in shapes.corners():
+                if index in skipped:
+                    continue
+                values = self._corner(points.T, state[: self._nq], own)
+                depth, to_contact, to_base, base = (np.array(each).ravel() for each in values)
+                counts = (to_contact < NEARER * to_base) | (base < TOUCHING)
+                counts &= depth + radius > np.maximum(TOUCHING, SHAPE * to_contact)
+                row[index] = max(row[index], np.max(np.where(counts, depth + radius, 0.0)))
+            found.append(row)
+        names = [shapes.name(index) for index in range(shapes.count)]
+        return self._worst(times, np.array(found), names)
+
+    def _worst(
+        self, times: FloatArray, depths: FloatArray, names: Sequence[str]
+    ) -> LinkBehind | None:
+        row, column = divmod(int(np.argmax(depths)), len(names))
+        if not depths[row, column] > 0.0:
+            return None
+        since = times[np.argmax(depths[:, column] > 0.0)]
+        depth, time = float(depths[row, column]), float(times[row])
+        return LinkBehind(self._name, names[column], depth, time, float(since))
 
 
 def _distances(points: Sequence[ca.SX], others: Sequence[ca.SX]) -> ca.SX:

@@ -1,4 +1,4 @@
-"""What the constraints of a robot do to it: the point, the force and the moment of each.    (38)"""
+"""The wrenches of the constraints of a robot: point, force and moment of each.            (38)"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class Wrenches:
-    """What constraints do to a robot at one moment, in the world, one row per constraint.
+    """The wrenches of constraints on a robot at one time, in the world, one row per constraint.
 
     Attributes:
-        points: Where they act, m, shape (k, 3).
-        forces: The forces that act there, N, shape (k, 3).
+        points: The points of application, m, shape (k, 3).
+        forces: The forces at these points, N, shape (k, 3).
         moments: The moments, N m, shape (k, 3).
     """
 
@@ -31,7 +31,7 @@ class Wrenches:
 
 
 class ConstraintWrenches:
-    """Where and how the constraints of a robot act on it, as a fast function.
+    """The points, forces and moments of the constraints of a robot, as a fast function.
 
     Args:
         model: The robot.
@@ -69,12 +69,12 @@ class ConstraintWrenches:
     def __call__(
         self, state: FloatArray, constraint_force: ArrayLike, parameters: ArrayLike | None = None
     ) -> Wrenches:
-        """The loads at one moment.
+        """The wrenches at one time.
 
         Args:
-            state: x, or the link state (q, v) that it begins with.
+            state: x, or only its first part, the link state (q, v).
             constraint_force: lambda, shape (m,).
-            parameters: Values of all parameters at that moment, where some move.
+            parameters: Values of all parameters at that time, if some are exogenous.
         """
         nq, nv = self._sizes
         q, v = state[:nq], state[nq : nq + nv]
@@ -84,7 +84,7 @@ class ConstraintWrenches:
 
 
 def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -> FloatArray:
-    """The values of a constraint's parameters, below each other, among all of a system."""
+    """The values of a constraint's parameters in one vector, from those of the system."""
     own = [parameters[dae.parameter_slice(p.name)] for p in constraint.parameters]
     return np.concatenate([np.zeros(0), *own])
 
@@ -92,8 +92,8 @@ def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -
 def contact_normals(model: RobotModel) -> TracedFunction:
     """(x, parameters) -> the normal of each constraint of one force, toward the robot, (3 m, 1).
 
-    It is the force on the robot of a unit of its constraint force where nothing slides, so that
-    friction is none: what a contact exerts along it is the constraint force.
+    It is the force on the robot per unit of constraint force without sliding, and so without
+    friction. The component of the contact force along it is the constraint force.
     """
     links = model.links
     kinematics = links.kinematics()

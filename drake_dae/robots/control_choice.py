@@ -1,4 +1,4 @@
-"""How many outputs a robot has beside its actuators, and which control it takes of several."""
+"""The number of outputs of a robot, and the choice among several controls."""
 
 from collections.abc import Sequence
 
@@ -19,15 +19,15 @@ def check_outputs(
     positions: Sequence[Signal],
     is_chosen: bool,
 ) -> None:
-    """Refuses outputs that are not as many as the actuators, or no fewer where weights choose.
+    """Refuses a number of outputs that does not fit that of the actuators.
 
     Args:
         name: The robot's name in messages.
         links: The robot.
-        motors: The actuators beside those of the links, in joints that close loops.
-        forces: How many outputs are forces.
+        motors: The actuators in joints that close loops.
+        forces: The number of force outputs.
         positions: Names and units of the position outputs.
-        is_chosen: Whether there are weights that choose the control.
+        is_chosen: Whether weights choose the control.
 
     Raises:
         ModelError: The numbers do not fit.
@@ -63,7 +63,7 @@ def check_outputs(
             f"{nu} outputs; name in `forces` those that are outputs, take constraints "
             "away, or add actuators"
         )
-    if count + forces and count + forces != nu:  # A robot that is only simulated needs none.
+    if count + forces and count + forces != nu:  # A robot that is only simulated needs no outputs.
         names = ", ".join(signal.name for signal in positions) or "none"
         fewer = ". For fewer, control_weights choose the control" if count + forces < nu else ""
         if forces and count + forces > nu:
@@ -82,7 +82,7 @@ def control_choice(
 
     Args:
         name: The robot's name in messages.
-        weights: w, one for all controls or one for each; None where there is nothing to choose.
+        weights: w, one for all controls or one for each; None without a choice.
         controls: Names and units of u.
 
     Returns:

@@ -11,8 +11,8 @@ from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.robots.actuation.chain import ActuationChain
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.loop_state import LoopState
 
 
@@ -37,17 +37,17 @@ def robot_equations(
     bound: ConstraintSet,
     driven: ActuationChain,
     loop_joints: LoopState,
-    loads: Sequence[KnownForce],
+    known_forces: Sequence[KnownForce],
     outputs: Outputs,
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
 ) -> DaeSystem:
-    """(43)-(45), with M on the left; below the rows of the links stand those of the stages.
+    """(43)-(45), with M on the left; the rows of the stages follow those of the links.
 
     Args:
         name: The robot's name in messages.
-        links, bound, driven, loop_joints, loads, outputs: What the robot is made of.
-        choice: The parameters by which the control is chosen, if it is; see `control_choice`.
+        links, bound, driven, loop_joints, known_forces, outputs: The parts of the robot.
+        choice: The parameters of the choice of the control, if any; see `control_choice`.
         nominal: A configuration of the robot at work, shape (nq,).
     """
     nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
@@ -56,7 +56,9 @@ def robot_equations(
     h_1, S = outputs.positions, outputs.forces
     B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
     velocity = ca.mtimes(links.velocity_map, links.v)
-    torque = ca.mtimes(B, driven.joint_force) + _known_force(links, loads) + bound.drag(links)
+    torque = (
+        ca.mtimes(B, driven.joint_force) + _known_force(links, known_forces) + bound.drag(links)
+    )
     torque += loop_joints.force
     motors = loop_joints.motors
     rotors = _moved_rotors(links, driven)
@@ -69,7 +71,7 @@ def robot_equations(
             kinematics = links.kinematics()
             motion = kinematics.value(bound.rate(kinematics))
             constraint_rate += ca.jtimes(motion, links.q, slip)
-        balance = inertial - ca.mtimes(rotors, acceleration) - torque
+        balance = inertial - ca.mtimes(rotors, acceleration) - torque  # (37)
         stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
         return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
@@ -90,7 +92,7 @@ def robot_equations(
             *links.parameters,
             *driven.parameters,
             *bound.parameters,
-            *(parameter for load in loads for parameter in load.parameters),
+            *(parameter for load in known_forces for parameter in load.parameters),
             *choice,
         ),
         state_signals=(
@@ -103,7 +105,7 @@ def robot_equations(
         control_signals=controls,
         output_signals=outputs.signals,
         nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
-        state_scale=np.ones(nq + nv + k),  # Of SI units and angles.
+        state_scale=np.ones(nq + nv + k),  # For SI units and angles.
         name=name,
         implicit=implicit,
         control_metric=ca.diag(choice[0].symbol) if choice else None,
@@ -112,16 +114,16 @@ def robot_equations(
     )
 
 
-def _known_force(links: Links, loads: Sequence[KnownForce]) -> ca.SX:
-    """The generalized force of the loads, shape (nv, 1)."""
+def _known_force(links: Links, known_forces: Sequence[KnownForce]) -> ca.SX:
+    """The generalized force of the known_forces, shape (nv, 1)."""
     total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
-    for load in loads:
+    for load in known_forces:
         total += links.generalized_force(kinematics, load.reaction(kinematics))
     return total
 
 
 def _moved_rotors(links: Links, driven: ActuationChain) -> ca.SX:
-    """What of M turns with a stage, and not with the links, shape (nv, nv)."""
+    """The part of M that moves with a stage instead of the links, shape (nv, nv)."""
     B = links.actuation_matrix
     if not driven.carries_rotors:
         return ca.SX(B.shape[0], B.shape[0])

@@ -21,10 +21,9 @@ class ForceOutput(ABC):
     1. `expression` is linear in the constraint forces lambda, shape (m, 1); its coefficients, rows
        of S, are smooth functions of q and of parameters of the robot. There is one row for each of
        `signals`.
-    2. No row depends on the others of a robot, wherever it may be: B(x) would be singular.
-    3. A name stands once in all outputs of a robot.
-    4. What the robot does not have (a constraint, a force, a frame) raises ModelError, which names
-       what it has.
+    2. The rows of a robot are independent in all configurations; otherwise B(x) is singular.
+    3. Names are unique among all outputs of a robot.
+    4. An unknown constraint, force or frame raises ModelError, which lists the known ones.
     """
 
     @abstractmethod
@@ -41,7 +40,7 @@ class ForceOutput(ABC):
 @checked(ModelError)
 @dataclass(frozen=True)
 class NamedForce(ForceOutput):
-    """One constraint force as it is: a row of the identity. In lists its name alone stands for it.
+    """A single constraint force: a row of the identity. In lists, its name is enough.
 
     Attributes:
         name: The name of the constraint force.
@@ -92,26 +91,25 @@ class ForceCombination(ForceOutput):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Squeeze(ForceOutput):
-    """How much two contacts i and j press an object together, in N: the internal force
+    """The internal force between two contacts i and j of an object, in N:
 
         z = e_ij . (f_i - f_j) / 2,   e_ij = (p_j - p_i) / |p_j - p_i|,
 
     with the forces f that the contacts exert on the object at the points p; positive where they
-    press toward each other. Let the contacts transmit forces along e_ij in full, as
-    `CoincidentPoints` and `WeldedFrames` do: then lambda = S^T c is e_ij c / 2 at i and the
-    opposite at j, whose sum is zero, and so is the sum of its moments, (p_i - p_j) x e_ij c / 2. So
-    the row lies in the null space of the object's grasp map: what it commands squeezes the object
-    and does not move it. Three contacts at the corners of a triangle have three such outputs, one
-    for each side, which are all of their internal forces. Of the six between four contacts in one
-    plane only five are independent: what is left of their internal forces is normal to that plane,
-    up at two opposite ones and down at the others.
+    press toward each other. If the contacts transmit forces along e_ij, as `CoincidentPoints` and
+    `WeldedFrames` do, then lambda = S^T c is e_ij c / 2 at i and the opposite at j. Their sum is
+    zero, and so is the sum of their moments, (p_i - p_j) x e_ij c / 2. So the row lies in the null
+    space of the object's grasp map: it squeezes the object and does not move it. Three contacts in
+    a triangle have three such outputs, which span their internal forces. Of the six between four
+    contacts in one plane only five are independent: the remaining internal force is normal to that
+    plane, up at two opposite contacts and down at the others.
 
-    For contacts that only push it tells the pressure between two, not that each one presses: see
-    the table of a run. It is no force of a single contact; name that, or take a `ForceCombination`.
+    For unilateral contacts it does not guarantee that each normal force is positive: see the table
+    of a run. For the force of a single contact give its name, or use a `ForceCombination`.
 
     Attributes:
-        frame: The name of the object's frame, on which both constraints act. "world" is fine, as
-            for two feet that press the ground together.
+        frame: The name of the object's frame, on which both constraints act. It may be "world", for
+            example for two feet on the ground.
         first, second: The names of the two constraints.
         name: The name of the output; "<first>.<second>.squeeze" if empty.
     """
@@ -142,10 +140,10 @@ class Squeeze(ForceOutput):
 def force_outputs(
     forces: Sequence[str | ForceOutput] | None, constraints: ConstraintSet
 ) -> tuple[ForceOutput, ...]:
-    """The force outputs that a list means: a name stands for that force, None for all forces.
+    """The force outputs of a list: a name is that force, None are all forces.
 
     Raises:
-        ModelError: There is no such force, or one is named twice.
+        ModelError: There is no such force, or a name occurs twice.
     """
     if forces is None:
         return tuple(NamedForce(signal.name) for signal in constraints.force_signals)

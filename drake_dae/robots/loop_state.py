@@ -1,4 +1,4 @@
-"""The joints of a robot that close loops: where they are, and what acts along them."""
+"""The joints of a robot that close loops: their coordinates and forces."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -22,7 +22,7 @@ class LoopState:
         limits: The lower and the upper limits of (c, c'), shape (2 l,) each, infinite where there
             are none.
         force: The generalized force of their springs and dampers, shape (nv, 1).
-        motors: How their motors act, shape (nv, k).
+        motors: The generalized forces of their motors, shape (nv, k).
     """
 
     state: ca.SX
@@ -33,7 +33,7 @@ class LoopState:
 
     @classmethod
     def of(cls, bound: ConstraintSet, links: Links) -> Self:
-        """Those of a robot, in the order of its constraints."""
+        """The state of these joints, in the order of the constraints."""
         if not bound.joints:
             nv, none = links.v.numel(), np.zeros(0)
             return cls(ca.SX(0, 1), (), (none, none), ca.SX(nv, 1), ca.SX(nv, 0))

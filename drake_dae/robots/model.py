@@ -23,9 +23,9 @@ from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.equations import Outputs, robot_equations
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import Balance, Placing
@@ -40,54 +40,52 @@ class RobotModel:
         M(q) v' + H(q, v) = J(q)^T lambda + B tau,    q' = N(q) v,
         0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
 
-    with J = (dphi/dq) N. A constraint with friction has a G(q, v) of its own in place of J^T;
-    viscous friction is a part of H; one that restricts velocities alone has its rate in place of
-    phi, and r = 1. With rigid joints tau = u; stages of actuation put their own dynamics between u
-    and tau: E s' = drift(q, v, s) + drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The
-    state is x = (q, v, s), the constraint input is lambda, and the controlled outputs are z = (z_1,
-    z_2), so there are as many position outputs as actuators less constraints. Where fewer forces
-    can or shall be steered, as those of wheels and of mimic joints, or combinations of them, as in
-    a grasp, `forces` tells which: z_2 = S(q) lambda, and there are as many position outputs as
-    actuators less these. All of lambda is on the plant's port nevertheless. Where there are fewer
-    outputs than actuators, as in a parallel robot with more motors than freedoms, `control_weights`
-    w says which control it shall be: that with the least sum w_i (u_i - u_0i)^2 of all that steer
-    the outputs alike; see `DaeSystem`. u_0 is the parameter "free_control", zero where nobody sets
-    or moves it: it presses and moves what the outputs leave free, and no output. Behind springs
-    that is one deflection for each actuator too many, which nothing damps: rather make the force
-    that it presses with an output.
+    with J = (dphi/dq) N. With friction, G(q, v) takes the place of J^T; viscous friction is part of
+    H. A nonholonomic constraint has its rate in place of phi, and r = 1. With rigid joints tau = u;
+    stages of actuation add dynamics between u and tau: E s' = drift(q, v, s) + drive u, tau =
+    tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), the constraint input is
+    lambda, and the controlled outputs are z = (z_1, z_2), so the number of position outputs is that
+    of actuators minus constraints. If fewer forces are controlled (wheels, mimic joints), or
+    combinations of them (a grasp), `forces` chooses them: z_2 = S(q) lambda, and the number of
+    position outputs is that of actuators minus these. The plant's port always has all of lambda.
+    With fewer outputs than actuators, as in a redundantly actuated parallel robot,
+    `control_weights` w chooses the control with the least sum w_i (u_i - u_0i)^2 among all with the
+    same outputs; see `DaeSystem`. u_0 is the parameter "free_control", zero by default: it affects
+    internal forces and motions that are not outputs. With flexible joints each additional actuator
+    leaves one undamped deflection: rather make the internal force an output.
 
     Args:
         links: The links, which provide M, H and the frames.
-        constraints: The constraints phi, one below the other; a robot without moves freely. Those
-            of the links' MultibodyPlant follow them: see `plant_constraints`.
-        positions: The position outputs h_1, one below the other.
+        constraints: The constraints phi in their order; none for a robot in free motion. Those of
+            the links' MultibodyPlant are appended: see `plant_constraints`.
+        positions: The position outputs h_1 in their order.
         nominal_positions: A configuration of the robot at work, shape (nq,), near which the
             structure is examined; `links.default_positions` if None.
         name: The robot's name in messages.
-        actuation: The stages from the joints toward the motor; none is rigid joints.
+        actuation: The stages from the joints toward the motor; none for rigid joints.
         forces: The force outputs z_2, in their order: names of constraint forces, and combinations
             of forces, as a `Squeeze`; all constraint forces if None, none without actuators.
-        exogenous: The names of parameters that move, "wall.position" for example, as signals w
-            with known derivatives; see `DaeSystem`.
-        loads: Known forces on frames, which are zero where nobody sets their parameters.
-        compliances: For a robot whose constraints are redundant: name of a constraint force -> how
-            compliant it is relative to the others, 1 where not named, {} for all alike. The forces
-            are then shared by least squares, see `share_forces`: their split is not determined, and
-            an output that depends on it is refused. None takes no redundant constraints.
+        exogenous: The names of parameters that are exogenous signals w with known derivatives,
+            "wall.position" for example; see `DaeSystem`.
+        known_forces: Known forces on frames; zero by default.
+        compliances: For a robot whose constraints are redundant: name of a constraint force -> its
+            relative compliance, 1 if not named, {} for equal ones. The forces are then shared by
+            least squares, see `share_forces`. An output that depends on the split is refused, since
+            it is not determined. None refuses redundant constraints.
         control_weights: w, positive, for more actuators than outputs: one for each, shape (nu,), or
-            a number for all, where all controls have one unit. The squares of 1 / limit share the
-            load as the limits are. It becomes the parameter "control_weights".
+            a number for all if all controls have the same unit. Weights 1 / limit^2 share the
+            effort in proportion to the limits. It becomes the parameter "control_weights".
         compiled: Whether functions become machine code: True, False or "auto"; see `DaeSystem`.
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, positions, nominal_positions, name, loads: The arguments.
+        links, positions, nominal_positions, name, known_forces: The arguments.
         constraints: The constraints, with those of the plant.
         forces: The force outputs; a name is a `NamedForce`.
         stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
-        control_limits: The largest |u| per actuator, infinite where there is none or where u is
-            no joint force; those in joints that close loops come last.
+        control_limits: The largest |u| per actuator; infinite without a limit or if u is not a
+            joint force. Those in joints that close loops come last.
         loop_joints: The joints that close loops, with their coordinates and limits.
 
     Raises:
@@ -105,7 +103,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
-        loads: Sequence[KnownForce] = (),
+        known_forces: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
@@ -115,14 +113,14 @@ class RobotModel:
         self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
         self.positions = tuple(positions)
         self.name = name
-        self.loads = tuple(loads)
+        self.known_forces = tuple(known_forces)
         bound = ConstraintSet(self.constraints)
         if forces is None and not (links.actuator_signals or bound.motors):
-            forces = ()  # Nothing steers them: the robot is only simulated.
+            forces = ()  # The robot has no actuators and is only simulated.
         self.forces = force_outputs(forces, bound)
-        S = force_rows(self.forces, bound, links)
+        S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
-        h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])
+        h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])  # (39)
         signals = [signal for output in self.positions for signal in output.signals(links)]
         weighted = control_weights is not None
         check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)
@@ -152,7 +150,7 @@ class RobotModel:
             bound,
             driven,
             self.loop_joints,
-            self.loads,
+            self.known_forces,
             Outputs(h_1, S, steered),
             choice,
             nominal,
@@ -181,7 +179,7 @@ class RobotModel:
         actuation: Sequence[Stage] = (),
         forces: Sequence[str | ForceOutput] | None = None,
         exogenous: Sequence[str] = (),
-        loads: Sequence[KnownForce] = (),
+        known_forces: Sequence[KnownForce] = (),
         compliances: Mapping[str, float] | None = None,
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
@@ -189,7 +187,7 @@ class RobotModel:
         """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
 
         Raises:
-            ModelError: The plant has what cannot be represented; the message names it.
+            ModelError: The plant has an element that cannot be represented; the message names it.
         """
         links = MultibodyExpressions(plant)
         return cls(
@@ -201,7 +199,7 @@ class RobotModel:
             actuation,
             forces,
             exogenous,
-            loads,
+            known_forces,
             compliances,
             control_weights,
             compiled,
@@ -233,7 +231,7 @@ class RobotModel:
             parameters: Values of all parameters; the defaults if None.
 
         Returns:
-            q, shape (nq,); where the outputs leave freedom, the one next to the guess.
+            q, shape (nq,); if the outputs do not determine it, the one next to the guess.
 
         Raises:
             InconsistentStateError: There is no such configuration near the guess.
@@ -259,8 +257,8 @@ class RobotModel:
     ) -> FloatArray:
         """The state at rest in a configuration with given constraint forces.
 
-        What the stages need to hold the robot there (shaft positions, currents, actuator forces)
-        is solved for, with the forces that are no outputs: v = 0, v' = 0, s' = 0.
+        The states of the stages (shaft positions, currents, actuator forces) and the forces that
+        are not outputs are solved for with v = 0, v' = 0, s' = 0.
 
         Args:
             positions: q, shape (nq,), on the constraints.
@@ -288,7 +286,7 @@ class RobotModel:
     def rest_forces(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """All constraint forces at rest in a configuration, of which some or none are outputs.
+        """All constraint forces at rest in a configuration, for given force outputs.
 
         Args:
             positions: q, shape (nq,), on the constraints.
@@ -304,7 +302,7 @@ class RobotModel:
         return self._balance.rest(q, load, values)[1]
 
     def _check_exogenous(self) -> None:
-        """Refuses to move what restricts velocities alone: its own rate would lack a part."""
+        """Refuses exogenous parameters of nonholonomic constraints: their rate is incomplete."""
         moving = {p.name for p in self.dae.exogenous.moving}
         for constraint in self.constraints:
             names = [p.name for p in constraint.parameters if p.name in moving]
@@ -320,14 +318,14 @@ class RobotModel:
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
 
     def _nominal_rest(self, nominal: FloatArray) -> FloatArray:
-        """The state at rest on the constraints: shafts off them would strain the springs."""
+        """The state at rest on the constraints, with unstrained shafts."""
         with suppress(InconsistentStateError):
             nominal = self.configuration(None, nominal)
         forces = np.zeros(self._num_forces)
         return self._balance.rest(nominal, forces, self.dae.parameter_values)[0]
 
     def _check_mass_matrix(self, nominal: FloatArray) -> None:
-        """Refuses an M (less the rotors that turn with a stage) that is no mass matrix."""
+        """Refuses an M, without rotors that move with a stage, that is not positive definite."""
         nq, nv = self.links.q.numel(), self.links.v.numel()
         inputs = {"q": self.links.q, "parameters": self.dae.parameter_symbol}
         expression = self.dae.mass_matrix[nq : nq + nv, nq : nq + nv]

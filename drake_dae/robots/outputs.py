@@ -1,4 +1,4 @@
-"""Position outputs h_1(q) that, with the constraints, fix where the robot is.       (39)"""
+"""Position outputs h_1(q), which with the constraints determine the configuration.   (39)"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -22,9 +22,9 @@ class PositionOutput(ABC):
     """Some components of h_1(q).
 
     1. `expression` is a smooth function of q (and of parameters of the robot), one row for each of
-       `signals`. It is no function of the rows of the constraints: those outputs are zero anyway.
-    2. A name stands once in all outputs of a robot.
-    3. What the robot does not have (a frame, a joint) raises ModelError, which names what it has.
+       `signals`. It must not be a function of the constraints, since such outputs are always zero.
+    2. Names are unique among all outputs of a robot.
+    3. An unknown frame or joint raises ModelError, which lists the known ones.
     """
 
     @abstractmethod
@@ -45,8 +45,8 @@ class PointCoordinates(PositionOutput):
         frame: Name of the frame.
         axes: The axes, letters of "xyz", for example "yz".
         point: The point in the frame, m, shape (3,).
-        name: What stands before the axis in the names, "<name>.y"; the frame's name if empty. Two
-            points of one frame need it.
+        name: The prefix of the output names, "<name>.y"; the frame's name if empty. Needed for two
+            points of one frame.
     """
 
     frame: str
@@ -67,7 +67,7 @@ class PointCoordinates(PositionOutput):
 @checked(ModelError)
 @dataclass(frozen=True)
 class AxisCoordinates(PositionOutput):
-    """The world components of an axis of a frame: two of them steer where the axis points.
+    """The world components of an axis of a frame: two of them control its direction.
 
     Attributes:
         frame: Name of the frame.
@@ -96,7 +96,7 @@ class AxisCoordinates(PositionOutput):
 @checked(ModelError)
 @dataclass(frozen=True)
 class SurfaceCoordinates(PositionOutput):
-    """The coordinates along a constraint; the constraint tells what they are.
+    """The coordinates along a constraint, as defined by the constraint.
 
     Attributes:
         contact: A constraint with coordinates, as a `PointOnSurface`.
@@ -121,18 +121,18 @@ class SurfaceCoordinates(PositionOutput):
 @checked(ModelError)
 @dataclass(frozen=True)
 class TiltFromNormal(PositionOutput):
-    """How far an axis of the frame that touches a surface is off the surface's normal there:
+    """The tilt of an axis of the frame in contact from the surface's normal there:
 
         h_1(q) = R_WF^T n(p_W(q)),    of which the rows across the axis,
 
-    the unit normal n in the axes of the frame. Both rows are zero where the axis is along the
-    normal, whichever way, and the sines of small angles around; on a curved surface the axis
-    follows the normal as the point moves.
+    the unit normal n in the axes of the frame. Both rows are zero if the axis is parallel to the
+    normal, and the sines of the angles otherwise. On a curved surface the axis follows the normal
+    as the point moves.
 
     Attributes:
-        contact: A constraint that touches what has a free side, as a `PointOnSurface`.
+        contact: A contact constraint, such as a `PointOnSurface`.
         axis: The axis of its frame, "x", "y" or "z".
-        components: Which of the two other axes are rows, "xy" for example; both if empty.
+        components: The rows, a choice of the two other axes, "xy" for example; both if empty.
     """
 
     contact: Constraint

@@ -1,4 +1,4 @@
-"""Where a robot can stand (58), and what holds it there: two problems for Newton's method."""
+"""Configurations (58) and static balance: two problems for Newton's method."""
 
 import casadi as ca
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
 
 class Placing:
@@ -29,7 +29,7 @@ class Placing:
     def solve(
         self, outputs: FloatArray, guess: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """A solution near a guess, and what is left of the equations.
+        """A solution near a guess, and the remaining residual.
 
         Args:
             outputs: The first components of z_1; the others are free.
@@ -40,9 +40,9 @@ class Placing:
 
         def residual(q: FloatArray) -> FloatArray:
             phi, h_1, _, _ = self._function(q, parameters)
-            return np.concatenate([phi, h_1[:count] - outputs])
+            return np.concatenate([phi, h_1[:count] - outputs])  # (58)
 
-        def linearize(q: FloatArray) -> Linearization | None:
+        def linearize(q: FloatArray) -> NewtonModel | None:
             _, _, J, P = self._function(q, parameters)
             gradients = np.vstack([J.reshape(-1, q.size), P.reshape(-1, q.size)[:count]])
             return shortest_steps(gradients, residual)
@@ -54,13 +54,13 @@ class Placing:
 class Balance:
     """The equations 0 = f + g lambda + h u at v = 0, S lambda = z_2, for the stages' s, u, lambda.
 
-    Entries of lambda that are outputs as they are, as told by a row of the identity, are no
-    unknowns.
+    Entries of lambda that are outputs themselves (a row of the identity) are not unknowns.
 
     Args:
         dae: The robot's system, with the state (q, v, s).
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
-        S: What of lambda is given, shape (k, m); of redundant constraints those that stay.
+        S: The matrix of the given combinations of lambda, shape (k, m); without redundant
+            constraints.
     """
 
     def __init__(self, dae: DaeSystem, q: ca.SX, v: ca.SX, S: ca.SX) -> None:
@@ -97,7 +97,7 @@ class Balance:
     def rest(
         self, q: FloatArray, forces: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """The state at rest, lambda, and the largest entry of the equations that is left.
+        """The state at rest, lambda, and the largest remaining residual.
 
         Args:
             q: Positions, shape (nq,).
@@ -108,7 +108,7 @@ class Balance:
         def residual(unknown: FloatArray) -> FloatArray:
             return self._function(q, forces, unknown, parameters)[0]
 
-        def linearize(unknown: FloatArray) -> Linearization | None:
+        def linearize(unknown: FloatArray) -> NewtonModel | None:
             balance, gradient, _ = self._function(q, forces, unknown, parameters)
             gradient = gradient.reshape(balance.size, -1)
             # Currents and forces differ by orders of magnitude.
@@ -116,7 +116,7 @@ class Balance:
             steps = shortest_steps(gradient / scale, residual)
             if steps is None:
                 return None
-            return Linearization(lambda x: steps.step(x) / scale, steps.is_regular)
+            return NewtonModel(lambda x: steps.step(x) / scale, steps.is_regular)
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
         left, _, constraint_force = self._function(q, forces, solution, parameters)
@@ -125,7 +125,7 @@ class Balance:
 
 
 def _unit_row(row: ca.SX) -> int | None:
-    """Where a row of the identity has its one; None of any other row."""
+    """The index of the 1 in a row of the identity; None for any other row."""
     row = ca.sparsify(row)
     place = row.sparsity().get_triplet()[1]
     return place[0] if len(place) == 1 and row[place[0]].is_one() else None

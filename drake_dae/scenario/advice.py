@@ -1,4 +1,4 @@
-"""What a scenario with Drake's own contact uses where it does not say how the law is tuned."""
+"""Default gains of a scenario with Drake's own contact."""
 
 from dataclasses import replace
 
@@ -14,21 +14,21 @@ from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 _FORCE = 10.0
-"""The force in N at which a patch has the stiffness that is meant."""
+"""The force in N at which the stiffness of a hydroelastic patch is evaluated."""
 
 _NOISE = 1e-3
-"""The deviation of velocities in rad/s that is expected where no encoders tell it."""
+"""The default standard deviation of velocity noise in rad/s, without encoders."""
 
 _DIGITS = 3
-"""To so many digits numbers are advised."""
+"""The number of digits of recommended gains."""
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """A scenario whose law is tuned by `contact_gains`, as far as it says nothing of its own.
+    """The scenario with gains by `contact_gains` where they are left out.
 
-    That is where `gains` are left out and the plant is Drake's own contact: then gains, the
-    integrals of forces and of points along them, damping of the constraint, an observer of what the
-    model lacks and of friction, and measured force, as far as each is left out.
+    Applies if `gains` are left out and the plant is Drake's own contact: gains, integrals of forces
+    and of points, constraint damping, an observer of disturbance and friction, and measured force
+    are set, each if it is left out.
 
     Args:
         scenario: The scenario, with all of its outputs.
@@ -36,10 +36,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         structure: The structure of the model's system.
 
     Returns:
-        The scenario, the same where nothing is advised, and what was chosen in words.
+        The scenario, unchanged if nothing is left out, and the choices in words.
 
     Raises:
-        ScenarioError: Nothing is known to advise, since there is a task, or stages of actuation.
+        ScenarioError: There are no default gains with a task, or with stages of actuation.
     """
     material = scenario.plant.material
     if material is None or not scenario.is_advised:
@@ -69,10 +69,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     integral = scenario.integral
     if integral is None:
         integral = [name for name in positions if name in points] + forces.tolist()
-    force = scenario.force
+    force = scenario.force_feedback
     if not force.is_measured:
         force = parts.MeasuredForce(sample_period=period)
-    # A force of degree 0 has a gain where it is integrated, and none otherwise.
+    # A force of degree 0 has a gain only if it is integrated.
     of_forces = {name: [_rounded(found.force_gain)] for name in forces.tolist() if name in integral}
     of_positions = {
         name: [_rounded(gain) for gain in found.position_gains(3 if name in integral else 2)]
@@ -84,12 +84,12 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         damping = parts.Poles(all=[-_rounded(found.constraint_damping)])
     observer = scenario.observer
     if observer is None:
-        rubbing = [c.name for c in model.constraints if c.friction_parameter]
+        frictional = [c.name for c in model.constraints if c.friction_parameter]
         observer = parts.Observer(
             rate=_rounded(found.observer_rate),
             force_rate=_rounded(found.observer_force_rate),
             friction_rate=_rounded(found.friction_rate),
-            friction=rubbing,
+            identify_friction=frictional,
         )
     chosen = replace(
         scenario,
@@ -97,9 +97,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         integral=integral,
         constraint_damping=damping,
         observer=observer,
-        force=force,
+        force_feedback=force,
     )
-    known = ", ".join(observer.friction) or "none"
+    known = ", ".join(observer.identify_friction) or "none"
     note = (
         f"advised for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and velocities within {noise:.2g} rad/s: "
@@ -127,10 +127,10 @@ def _moved(model: RobotModel) -> list[str]:
 
 
 def _stiffness(material: ContactMaterial) -> float:
-    """How stiff a contact is, in N/m.
+    """The stiffness of a contact, in N/m.
 
-    A ball of radius R that is pressed by d into a layer with the pressure E s / h at depth s has a
-    patch of the radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h).
+    A ball of radius R, pressed by d into a layer with the pressure E s / h at depth s, has a patch
+    of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h).
     """
     if material.contact_model == "point":
         return material.stiffness

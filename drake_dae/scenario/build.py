@@ -1,4 +1,4 @@
-"""The closed loop that a scenario describes."""
+"""The closed loop of a scenario."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -26,7 +26,7 @@ from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.forms.keys import at, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.observed import observed_structure
-from drake_dae.scenario.own_model import check_pushes, own_model
+from drake_dae.scenario.own_model import check_disturbances, own_model
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -43,7 +43,7 @@ def build_scenario(
 
     Args:
         scenario: What `load_scenario` returns.
-        meshcat: Where to draw while the run goes on; None draws nothing.
+        meshcat: The Meshcat for a live view; None for no view.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -55,7 +55,7 @@ def build_scenario(
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None
 ) -> tuple[Completed, ClosedLoop]:
-    """A scenario completed, and its loop, which `start_scenario` starts as often as one likes.
+    """The completed scenario and its loop, which `start_scenario` can start repeatedly.
 
     The arguments and errors are those of `build_scenario`.
     """
@@ -83,17 +83,17 @@ def build_loop(
     """The closed loop of a scenario's robot.
 
     Args:
-        scenario: A scenario of which nothing is left open, with gains: by `advised`.
+        scenario: A completed scenario with gains, from `advised`.
         model: The scenario's robot, by `scenario_model`.
         structure: The structure of the model's system.
-        scene_graph: Where the robot's geometry is registered; needed to draw it.
-        meshcat: Where to draw while the run goes on; None draws nothing.
-        plant: What is simulated in place of what the scenario has; None for that.
+        scene_graph: The scene graph of the robot's geometry; needed to draw it.
+        meshcat: The Meshcat for a live view; None for no view.
+        plant: A plant in place of the scenario's; None for the scenario's.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    # The law, and what it knows of what moves.
+    # The law, and its exogenous signals.
     task, sampling = scenario.task, scenario.sampling
     opens = "" if task is None else opening_contact(scenario, model).name
     law = _law(scenario, observed_structure(scenario, model, structure))
@@ -103,7 +103,7 @@ def build_loop(
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
     limits = _limits(scenario, model)
 
-    # The plant, which may know more.
+    # The plant, which may have further exogenous signals.
     feedback = task is None and can_be_fed_back(law, sampling, limits)
     own = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
@@ -113,9 +113,9 @@ def build_loop(
         plant_exogenous = exogenous_references(own.scenario, plant.dae, degrees)
     plant = plant or make_plant(scenario, model, structure, feedback, opens)
 
-    # The parts between them; what does not fit is told with its key.
-    with at("force"):
-        sensor = scenario.force.sensor(model.dae.num_constraints)
+    # The parts between them; problems are reported with their key.
+    with at("force_feedback"):
+        sensor = scenario.force_feedback.sensor(model.dae.num_constraints)
     settings = LoopSettings(
         sensor=sensor,
         encoders=scenario.encoders,
@@ -137,7 +137,7 @@ def build_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
     keys = ["observer"] if scenario.observer is not None else []
-    keys += ["force"] if scenario.force.is_measured or keys else []
+    keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
     with at(" or ".join(keys) or "start.positions"):
         return make_closed_loop(
             plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
@@ -151,11 +151,11 @@ def make_plant(
     feedback: bool = False,
     opens: str = "",
 ) -> Plant:
-    """What is simulated of a scenario.
+    """The plant of a scenario.
 
     Args:
         scenario: The scenario.
-        model: The robot, with what the plant carries where that is not the plant's own affair.
+        model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
         feedback: Whether the plant may take a law itself.
         opens: The contact that a task opens and closes; empty without a task.
@@ -163,17 +163,17 @@ def make_plant(
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
-    check_pushes(scenario.plant_pushes, model.links)
+    check_disturbances(scenario.plant_disturbances, model.links)
     adds = partial(add_robot, scenario.robot, payloads=scenario.plant_payloads)
-    parameters, pushes = scenario.plant_parameters, scenario.plant_pushes
-    robot = RobotToSimulate(model, structure, feedback, opens, adds, parameters, pushes)
+    parameters, disturbances = scenario.plant_parameters, scenario.plant_disturbances
+    robot = RobotToSimulate(model, structure, feedback, opens, adds, parameters, disturbances)
     return scenario.plant.plant(robot)
 
 
 def _law(scenario: Scenario, known: Structure) -> TrackingLaw:
-    """The law of a scenario, for a system of which it knows so much."""
-    force, damping = scenario.force, scenario.constraint_damping
-    keys = [key for key, used in (("force", force.is_measured), ("gains", True)) if used]
+    """The law of a scenario for a system."""
+    force, damping = scenario.force_feedback, scenario.constraint_damping
+    keys = [key for key, used in (("force_feedback", force.is_measured), ("gains", True)) if used]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.
@@ -189,7 +189,7 @@ def _law(scenario: Scenario, known: Structure) -> TrackingLaw:
 
 
 def _check_parts(settings: LoopSettings, plant: Plant) -> None:
-    """Refuses parts that do not fit the plant, by the keys that they have in a scenario."""
+    """Refuses parts that do not fit the plant, with their keys in the scenario."""
     if settings.sampling is not None:
         with at("sampling"):
             hold_before(plant, settings.sampling)
@@ -203,7 +203,7 @@ def _check_parts(settings: LoopSettings, plant: Plant) -> None:
 
 @at("saturation")
 def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
-    """The largest controls, if the scenario wants drives that give no more."""
+    """The limits of the controls, if the scenario has saturation."""
     if not scenario.saturation:
         return None
     if not np.any(np.isfinite(model.control_limits)):
@@ -225,12 +225,12 @@ def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -
 def exogenous_references(
     scenario: Scenario, system: DaeSystem, needed: Sequence[int]
 ) -> list[Reference]:
-    """How each parameter moves that does, in the order of the system, each smooth enough.
+    """The references of the exogenous parameters in the order of the system.
 
     Args:
         scenario: The scenario.
         system: The system of its plant or of its law.
-        needed: How many derivatives of each entry are needed.
+        needed: The number of derivatives of each entry that are needed.
 
     Raises:
         ScenarioError: There are too few or too many, or one is not smooth enough.

@@ -1,4 +1,4 @@
-"""The robot of a scenario, with what it touches and what it shall steer."""
+"""The robot model of a scenario: constraints, outputs and actuation."""
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,9 +21,9 @@ from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import control_choice
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
@@ -34,15 +34,15 @@ from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
 
 _LARGE = 30.0
-"""So many times as long as the robot, a surface from a file seems to be in millimetres."""
+"""A surface from a file that is larger than the robot by this factor is probably in millimetres."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
-    """The robot of a scenario, with what it touches and what it shall steer.
+    """The robot model of a scenario: constraints, outputs and actuation.
 
     Args:
         scenario: What `load_scenario` returns.
-        scene_graph: Where the robot's geometry is registered; needed to draw it.
+        scene_graph: The scene graph of the robot's geometry; needed to draw it.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -52,22 +52,22 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 
 @checked(lambda text: ScenarioError(("", text)))
 def complete_scenario(scenario: Scenario) -> Completed:
-    """A scenario of which nothing is left open: its outputs, and where the robot starts.
+    """The scenario with all outputs and a start.
 
-    Outputs may be left out, or be fewer than the actuators less the force outputs. What completes
-    them, as far as each is independent of those before it: the world coordinates of each point that
-    touches a surface along it; what `tool_axis` holds of the tool's axis; and positions of joints,
-    of which that set is taken that keeps B(x) (16) best conditioned, and joints off their limits,
-    along the reference. Whatever has no reference holds the value that it starts with.
+    Outputs may be left out, or be fewer than the actuators minus the force outputs. They are
+    completed, in this order and only by independent ones, with: the world coordinates along the
+    surface of each contact point; the directions of the tool's axis by `tool_axis`; and positions
+    of joints, chosen such that B(x) (16) is best conditioned and joints are away from their limits
+    along the reference. Outputs without a reference keep their initial value.
 
-    Where start.positions are left out and the robot's default configuration leads to no regular
-    start, that is sought with the first values of the references.
+    If start.positions are left out and the default configuration does not lead to a regular start,
+    a start is searched with the first values of the references.
 
     Args:
         scenario: What `load_scenario` returns.
 
     Returns:
-        The scenario, the same where nothing was left out, and what was chosen in words.
+        The scenario, unchanged if nothing was left out, and the choices in words.
 
     Raises:
         ScenarioError: Something does not fit, the start cannot be reached, or no outputs complete
@@ -81,7 +81,7 @@ def completed_model(
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
 ) -> tuple[Completed, RobotModel]:
-    """What `complete_scenario` and `scenario_model` return, of a robot with these payloads more."""
+    """The results of `complete_scenario` and `scenario_model`, for a robot with these payloads."""
     robot = _read(scenario, scene_graph or SceneGraph(), payloads)
     scenario = robot.completed.scenario
     outputs = _outputs(scenario.outputs, robot.constraints, robot.links)
@@ -95,23 +95,25 @@ def completed_model(
             robot.stages,
             scenario.forces,
             tuple(scenario.exogenous),
-            robot.loads,
+            robot.known_forces,
             scenario.compliances,
             scenario.control_weights or None,
             scenario.compiled,
         )
+    with at("bounds"):
+        model.dae = model.dae.with_bounds(scenario.bounds)
     return robot.completed, model
 
 
 @dataclass(frozen=True, eq=False)
 class _Robot:
-    """A scenario's robot as far as it is checked, and the scenario with nothing left open."""
+    """A scenario's checked robot, and the completed scenario."""
 
     name: str
     links: MultibodyExpressions
     constraints: Sequence[Constraint]
     stages: Sequence[Stage]
-    loads: Sequence[KnownForce]
+    known_forces: Sequence[KnownForce]
     completed: Completed
 
 
@@ -120,7 +122,7 @@ def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payloa
     name = scenario.robot.title
     links, loops = robot_links(scenario.robot, scene_graph, payloads)
 
-    # What it touches or holds.
+    # The constraints.
     constraints = _constraints(scenario.constraints, loops, links)
     actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
     if not actuators:
@@ -131,20 +133,20 @@ def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payloa
         )
         raise ScenarioError(("robot.actuators", text))
 
-    # What it shall steer, from where, and by what.
+    # Outputs, start and actuation.
     _outputs(scenario.outputs, constraints, links)
     guess = start_guess(scenario.start.positions, links)
     stages = _stages(scenario.actuation, links)
     _check_forces(scenario.forces, constraints, links)
     _check_compliances(scenario.compliances, constraints, links)
-    loads = each("loads", scenario.loads, lambda load: _load(load, links))
+    known_forces = each("known_forces", scenario.known_forces, lambda load: _load(load, links))
     with at("control_weights"):
         choice = control_choice(name, scenario.control_weights or None, actuators)
-    _check_exogenous(scenario.exogenous, links, [*constraints, *loads], stages, choice)
+    _check_exogenous(scenario.exogenous, links, [*constraints, *known_forces], stages, choice)
 
-    # What it leaves open.
+    # The completion.
     completed = complete(scenario, links, constraints, plant_constraints(links), guess)
-    return _Robot(name, links, constraints, stages, loads, completed)
+    return _Robot(name, links, constraints, stages, known_forces, completed)
 
 
 def scenario_structure(model: RobotModel) -> Structure:
@@ -152,7 +154,7 @@ def scenario_structure(model: RobotModel) -> Structure:
 
     Raises:
         AssumptionError: The robot violates an assumption of the theory.
-        ScenarioError: The robot starts nowhere near its constraints.
+        ScenarioError: The robot's start is not near its constraints.
     """
     if model.dae.num_outputs == 0:
         actuators = model.dae.num_controls
@@ -186,7 +188,7 @@ def _constraints(
 
 
 def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
-    """Warns of a surface that ends far beyond the robot's reach: its file may be in millimetres."""
+    """Warns of a surface much larger than the robot: its file may be in millimetres."""
     extent = getattr(getattr(constraint, "surface", None), "extent", None)
     if extent is None:
         return
@@ -206,7 +208,7 @@ def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
 
 
 def _try(constraint: Constraint, links: Links) -> None:
-    """Writes a constraint's equations, so that what it names is looked for."""
+    """Evaluates a constraint's equations, so that unknown names are found."""
     if constraint.residual(links).numel() < len(constraint.force_signals):
         constraint.rate(links.kinematics())
 
@@ -246,7 +248,7 @@ def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
         each("actuation", stages, lambda stage: stage.attach(links))
     else:
         with at("actuation"):
-            chain(stages, links)  # It refuses them.
+            chain(stages, links)  # The model refuses them.
     return stages
 
 
@@ -263,7 +265,7 @@ def _check_exogenous(
     stages: Sequence[Stage],
     choice: Sequence[Parameter],
 ) -> None:
-    """Refuses to move what is no parameter."""
+    """Refuses exogenous names that are not parameters."""
     attached = [stage.attach(links).parameters for stage in stages]
     groups = [links.parameters, *(member.parameters for member in members), *attached]
     known = [parameter.name for group in (*groups, choice) for parameter in group]
@@ -276,7 +278,7 @@ def _check_exogenous(
 def start_guess(
     positions: dict[str, float], links: Links, others: FloatArray | None = None
 ) -> FloatArray:
-    """q near which the robot starts.
+    """The guess of q at the start.
 
     Args:
         positions: Joint name -> position.
@@ -297,7 +299,7 @@ def start_guess(
 
 
 def index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
-    """Where a name stands among signals."""
+    """The index of a name among signals."""
     names = [signal.name for signal in signals]
     if name not in names:
         raise ModelError(unknown_name(kind, name, names))

@@ -1,4 +1,4 @@
-"""The system that the law of a scenario with an observer is for."""
+"""The system of the law of a scenario with an observer."""
 
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
@@ -9,7 +9,7 @@ from drake_dae.scenario.scenario import Scenario
 
 
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
-    """The structure of what a scenario's law is for: with a disturbance, where it is observed.
+    """The structure of the system of a scenario's law, with a disturbance if it is observed.
 
     Raises:
         ScenarioError: The observer does not fit; the message names its key.
@@ -20,13 +20,16 @@ def observed_structure(scenario: Scenario, model: RobotModel, structure: Structu
     with at("observer"):
         if scenario.exogenous:
             raise ModelError("not beside exogenous signals, whose port it feeds")
-        rubbing = {c.name: c.friction_parameter for c in model.constraints if c.friction_parameter}
-        for name in observer.friction:
-            if name not in rubbing:
+        frictional = {
+            c.name: c.friction_parameter for c in model.constraints if c.friction_parameter
+        }
+        for name in observer.identify_friction:
+            if name not in frictional:
                 raise ModelError(
-                    f"friction: '{name}' is no constraint with friction; give it friction: 0.0 "
-                    f"where it is not known. With friction: {', '.join(rubbing) or 'none'}"
+                    f"identify_friction: '{name}' is not a constraint with friction; give it "
+                    "friction: 0.0 if it is unknown. With friction: "
+                    f"{', '.join(frictional) or 'none'}"
                 )
         velocities = [signal.name for signal in model.links.velocity_signals]
-        frictions = [rubbing[name] for name in observer.friction]
+        frictions = [frictional[name] for name in observer.identify_friction]
         return find_structure(with_disturbance(model.dae, velocities, frictions))

@@ -1,4 +1,4 @@
-"""What a scenario's plant has and its law does not know: payloads and pushes on an ideal plant."""
+"""Payloads and disturbances of a scenario's ideal plant, unknown to its law."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,23 +8,23 @@ from pydrake.geometry import SceneGraph
 
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
+from drake_dae.robots.known_forces import KnownForce
 from drake_dae.robots.links.links import Links
-from drake_dae.robots.loads import KnownForce
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import each
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.plants.contact.pushes import Push
+from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 
 
 @dataclass(frozen=True, eq=False)
 class OwnModel:
-    """The model of a plant that is not its law's.
+    """The model of a plant that differs from its law's.
 
     Attributes:
-        scenario: The scenario in which the payloads and pushes are known.
+        scenario: The scenario in which the payloads and disturbances are known.
         model, structure: The robot with them.
-        scene_graph: Where its geometry is registered.
+        scene_graph: The scene graph of its geometry.
     """
 
     scenario: Scenario
@@ -34,10 +34,10 @@ class OwnModel:
 
 
 def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
-    """The model of a scenario's ideal plant; None if that of its law will do.
+    """The model of a scenario's ideal plant; None if it is that of its law.
 
-    A payload is another body, and a push is a force like one of `loads` that moves as an exogenous
-    signal: so the plant is a robot like any other.
+    A payload is a further body, and a disturbance is a force like those of `known_forces` as an
+    exogenous signal.
 
     Args:
         scenario: The scenario, completed.
@@ -46,16 +46,23 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    payloads, pushes = scenario.plant_payloads, scenario.plant_pushes
-    if scenario.plant.carries or not (payloads or pushes):
+    payloads, disturbances = scenario.plant_payloads, scenario.plant_disturbances
+    if scenario.plant.carries or not (payloads or disturbances):
         return None
-    check_pushes(pushes, links)
-    named = {f"plant_push_{index}": push for index, push in enumerate(pushes)}
-    loads = [KnownForce(push.frame, push.point, name) for name, push in named.items()]
-    moving: dict[str, Any] = {f"{name}.force": [push.reference] for name, push in named.items()}
+    check_disturbances(disturbances, links)
+    named = {
+        f"plant_disturbance_{index}": disturbance for index, disturbance in enumerate(disturbances)
+    }
+    known_forces = [
+        KnownForce(disturbance.frame, disturbance.point, name)
+        for name, disturbance in named.items()
+    ]
+    moving: dict[str, Any] = {
+        f"{name}.force": [disturbance.reference] for name, disturbance in named.items()
+    }
     own = replace(
         scenario,
-        loads=[*scenario.loads, *loads],
+        known_forces=[*scenario.known_forces, *known_forces],
         exogenous={**scenario.exogenous, **moving},
     )
     scene_graph = SceneGraph()
@@ -63,16 +70,16 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     return OwnModel(own, model, scenario_structure(model), scene_graph)
 
 
-def check_pushes(pushes: Sequence[Push], links: Links) -> None:
-    """Refuses pushes on frames that are not there, or stand still.
+def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:
+    """Refuses disturbances on unknown or fixed frames.
 
     Raises:
         ScenarioError: There is no such frame of the robot.
     """
 
-    def check(push: Push) -> None:
-        links.position(push.frame, push.point)
-        if push.frame == "world":
-            raise ModelError("a push on the world moves nothing; name a frame of the robot")
+    def check(disturbance: DisturbanceForce) -> None:
+        links.position(disturbance.frame, disturbance.point)
+        if disturbance.frame == "world":
+            raise ModelError("a disturbance on the world moves nothing; name a frame of the robot")
 
-    each("plant_pushes", pushes, check)
+    each("plant_disturbances", disturbances, check)

@@ -1,4 +1,4 @@
-"""What a scenario simulates its robot as: a family, each of whose members makes a plant."""
+"""The plants of a scenario: a family whose members each make a plant."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
-from drake_dae.systems.plants.contact.pushes import Push
+from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 from drake_dae.systems.plants.unilateral.contacts import coefficient
@@ -28,15 +28,15 @@ from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
 
 @dataclass(frozen=True, eq=False)
 class RobotToSimulate:
-    """The robot that a plant is made of.
+    """The robot of a plant.
 
     Attributes:
         model, structure: The robot, and the structure of its system.
         feedback: Whether its plant may take a law itself.
         opens: The contact that a task opens and closes; empty without a task.
-        add_robot: Adds the robot with what the plant carries to a MultibodyPlant.
-        parameters: Parameter name -> what the plant has otherwise.
-        pushes: Forces on the plant that its law does not know.
+        add_robot: Adds the robot with its payloads to a MultibodyPlant.
+        parameters: Parameter name -> the plant's changed value.
+        disturbances: Disturbance forces on the plant.
     """
 
     model: RobotModel
@@ -45,24 +45,24 @@ class RobotToSimulate:
     opens: str
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
-    pushes: Sequence[Push]
+    disturbances: Sequence[DisturbanceForce]
 
 
 class ScenarioPlant(ABC):
-    """The contract of what stands under `plant` in a scenario.
+    """The contract of the key `plant` of a scenario.
 
-    1. `plant` makes the plant of a robot, which keeps the contract of `Plant`.
-    2. With `carries` it has payloads, pushes and other parameters in it when it is made. Without,
-       the scenario makes a model with these payloads and pushes, and sets the parameters in the
-       context.
-    3. `material` is how its contacts give way; None where they do not.
+    1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
+    2. With `carries` the plant includes payloads, disturbances and changed parameters. Otherwise
+       the scenario makes a model with these payloads and disturbances, and sets the parameters in
+       the context.
+    3. `material` is the material of compliant contacts; None for ideal ones.
     """
 
     carries: ClassVar[bool] = False
 
     @property
     def material(self) -> ContactMaterial | None:
-        """How its contacts give way; None where they do not."""
+        """The material of compliant contacts; None for ideal ones."""
         return None
 
     @abstractmethod
@@ -79,7 +79,7 @@ class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly."""
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        if robot.opens:  # In a task its contact opens, without a bounce.
+        if robot.opens:  # In a task its contact opens, without bouncing.
             return Unilateral({robot.opens: 0.0}).plant(robot)
         return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
 
@@ -87,18 +87,17 @@ class IdealConstraints(ScenarioPlant):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Unilateral(ScenarioPlant):
-    """The plant is a `UnilateralRobotPlant`: its contacts open where they would pull, and impact.
+    """The plant is a `UnilateralRobotPlant`: contacts open instead of pulling, and impact.
 
-    The law is that of closed contacts, and reads the state alone: it goes on as it is. An open
-    contact does to it what a force does that is not there, so that phi'' = -A(x) lambda_d, lambda_d
-    being the force that is wanted: the robot comes back where it shall push, and stays away where
-    it would have to pull.
+    The law is that of closed contacts and continues while a contact is open. Without the contact
+    force phi'' = -A(x) lambda_d, with the desired force lambda_d: the robot returns if lambda_d >
+    0, and stays away if lambda_d < 0.
 
     Attributes:
         restitution: Constraint -> its coefficient of restitution, 0 (no bounce) to 1 (no loss), a
-            pure number. Other constraints stay closed. Left out, all that can only push open, and
-            do not bounce.
-        settling_time: Bouncing that would end within this time, in s, ends at once.
+            pure number. Other constraints stay closed. If left out, all unilateral contacts open,
+            without bouncing.
+        settling_time: Bouncing that would end within this time, in s, ends immediately.
 
     Raises:
         ModelError: A number makes no sense.
@@ -114,7 +113,7 @@ class Unilateral(ScenarioPlant):
 
     def plant(self, robot: RobotToSimulate) -> Plant:
         with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
-            pushing = [one.name for one in robot.model.constraints if any(one.can_only_push)]
+            pushing = [one.name for one in robot.model.constraints if any(one.is_unilateral)]
             if not pushing:
                 raise ModelError(
                     "the robot has no constraint that can only push, so that none opens"
@@ -132,14 +131,14 @@ class Unilateral(ScenarioPlant):
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    The robot touches with a ball, and what it touches is as in its constraints. With points the
-    force is stiffness times depth; with hydroelastic patches the ball is rigid, and what it touches
-    has a pressure of modulus times depth / thickness.
+    The robot touches with a ball; the surfaces are those of its constraints. With point contact the
+    force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
+    the pressure modulus times depth / thickness.
 
-    Where the robot tilts by an angle a from its nominal position, the ball rolls: it touches
-    2 radius sin(a / 2) beside the point of the constraint, and that point is radius (1 - cos a)
-    off the surface. A stiffer contact does not come nearer to the ideal one there, a smaller
-    radius does. A tool that stays normal to its surface does not roll.
+    If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
+    distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
+    a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
+    stiffer contact. A tool that stays normal to its surface does not roll.
     """
 
     carries: ClassVar[bool] = True
@@ -156,24 +155,25 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 self,
                 structure=robot.structure,
                 parameters=robot.parameters,
-                pushes=robot.pushes,
+                disturbances=robot.disturbances,
             )
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class OwnPlant(ScenarioPlant):
-    """The plant is one of your own: a class that keeps the contract of `drake_dae.Plant`.
+    """The plant is your own class that follows the contract of `drake_dae.Plant`.
 
     It is called with the robot and its structure, as `maker(model, structure)`. Reading such a
-    scenario imports that module, which Python finds by PYTHONPATH, in the processes of a
-    sweep as well: take such files from people whose code you would run.
+    scenario imports and runs that module, found by PYTHONPATH, also in the processes of a sweep:
+    use only files from people whose code you trust.
 
     Attributes:
         maker: The module and the class in it, as "my_plants:SpringyPlant".
 
     Raises:
-        ModelError: The text names no module and class; or, when the plant is made, no such class.
+        ModelError: The text is not a module and class; or, when the plant is made, there is no such
+            class.
     """
 
     maker: str
@@ -201,10 +201,10 @@ class OwnPlant(ScenarioPlant):
 
 
 def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
-    """The member that plain data choose; the first one where they choose none of the family.
+    """The member chosen by plain data; the first one by default.
 
     Args:
-        data: What stands under `plant`.
+        data: The value of the key `plant`.
     """
     kinds = {f"!{kind.__name__}": kind for kind in ScenarioPlant.__subclasses__()}
     return kinds.get(data.get(TAG, ""), IdealConstraints)

@@ -1,5 +1,6 @@
-"""The run of a scenario by `rollout`, as the command and studies make it."""
+"""The run of a scenario by `rollout`, for the command and for studies."""
 
+import time
 from collections.abc import Callable
 from math import ceil
 
@@ -9,20 +10,25 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.state_feedback import encoder_seed
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.simulation.divergence import RecordWatch
+from drake_dae.simulation.records.record import Record, RecordAfter
 
 ROWS = 1000
-"""So many rows has the record of a rollout under error control, after the first."""
+"""The number of rows of a record of a rollout under error control, after the first."""
+
+PERIOD = 0.2
+"""So often what a rollout has recorded is looked at for divergence while it goes on, in s."""
 
 MOST_ROWS = 1e7
-"""Of more rows, each a fixed step, the record takes gigabytes."""
+"""The largest number of rows of fixed steps; a larger record takes gigabytes."""
 
 
 def rollout_times(scenario: Scenario) -> FloatArray:
-    """When the record of a scenario's rollout has rows, in s: even ones, or the fixed steps."""
+    """The times of the rows of a rollout's record, in s: equidistant, or the fixed steps."""
     config, rows = scenario.integrator, ROWS
     if not config.use_error_control:
         steps = scenario.duration / config.max_step_size
@@ -41,26 +47,29 @@ def roll_scenario(
     loop: ClosedLoop,
     context: Context,
     lasting: float | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    look: Callable[[RecordAfter], bool] = lambda record: False,
 ) -> Rollout:
-    """Runs a scenario by `rollout`.
+    """Runs a scenario by `rollout`; what diverges ends, as by `simulate`.
 
     Args:
         scenario: The scenario.
         loop: Its closed loop.
         context: The start, by `start_scenario`.
-        lasting: How long this loop will be run altogether, in s, which decides on machine code
-            alone; None if this run is all, and what is in the cache is welcome.
-        stop: Whether to stop where the run is, looked at now and then.
+        lasting: The expected total duration of runs of this loop, in s, for the decision on machine
+            code; None for a single run, which uses the cache.
+        look: As of `run_loop`.
 
     Raises:
-        ModelError: The loop has what no rollout has.
+        ModelError: The loop cannot be rolled out.
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    seeds = {"force_noise": scenario.force.seed} if scenario.force.is_measured else {}
+    seeds = (
+        {"force_noise": scenario.force_feedback.seed} if scenario.force_feedback.is_measured else {}
+    )
     if scenario.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(scenario.encoders.seed)
+    watched = _Watched(scenario, loop, look)
     (found,) = run_loop(
         loop,
         start,
@@ -69,6 +78,39 @@ def roll_scenario(
         config=scenario.integrator,
         seeds=[seeds],
         lasting=lasting,
-        stop=stop,
+        look=watched,
     )
-    return found
+    return watched.judged(found)
+
+
+class _Watched:
+    """Ends a rollout that diverges."""
+
+    def __init__(
+        self, scenario: Scenario, loop: ClosedLoop, look: Callable[[RecordAfter], bool]
+    ) -> None:
+        self._watch = RecordWatch(loop.plant, scenario.duration)
+        self._look, self._may_diverge = look, scenario.may_diverge
+        self._time: float | None = None
+        self._next = time.perf_counter() + PERIOD
+        self._failure: SimulationError | None = None
+
+    def __call__(self, record: RecordAfter) -> bool:
+        if time.perf_counter() >= self._next:
+            self._see(record(self._time))
+            self._next = time.perf_counter() + PERIOD
+        return self._failure is not None or self._look(record)
+
+    def _see(self, rows: Record) -> None:
+        if self._may_diverge or self._failure is not None or not rows.time.size:
+            return
+        self._time = float(rows.time[-1])
+        try:
+            self._watch.look(rows)
+        except SimulationError as error:
+            self._failure = error
+
+    def judged(self, found: Rollout) -> Rollout:
+        """A rollout up to where it diverges."""
+        self._see(found.record.after(self._time))
+        return found if self._failure is None else found.ended(self._failure)

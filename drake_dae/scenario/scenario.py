@@ -1,7 +1,7 @@
-"""The form of a scenario: a robot in contact, what it shall do, and how to simulate it.
+"""The form of a scenario: a robot in contact, its task, and its simulation.
 
-A scenario is YAML. What the library has as a dataclass is written with the keys of that dataclass;
-a choice between several is written with the name as a tag, for example `surface: !Sphere`.
+A scenario is YAML. The library's dataclasses are written with their fields as keys; a choice
+between several classes is written with the name as a tag, for example `surface: !Sphere`.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,9 +18,11 @@ from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
 from drake_dae.scenario.forms.reader import Reader
+from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
+    DisturbanceForce,
     Encoders,
     Force,
     ForceOutput,
@@ -30,7 +32,6 @@ from drake_dae.scenario.parts.families import (
     Output,
     Payload,
     Plant,
-    Push,
     Reference,
     Sampling,
     Stage,
@@ -71,69 +72,70 @@ _INTEGRATOR_TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scenario:
-    """A robot in contact, what it shall do, and how to simulate it.
+    """A robot in contact, its references or task, and its simulation.
 
     Attributes:
         description: One line for `drake-dae list`.
-        robot: The file that the robot is read from, and what the file leaves open: what is welded,
-            free, locked, and driven.
-        constraints: What it touches or holds; a form without a tag is a PointOnSurface. Those that
-            the robot's file has, as mimic joints, follow them.
-        outputs: Position outputs; the constraint forces follow them. Where they are fewer than
-            actuators less force outputs, they are completed: see `complete_scenario`.
-        tool_axis: What completed outputs hold of the tool's axis: normal to the surface, fixed in
-            the world, or nothing (free).
+        robot: The robot's file, with additions: which frames are welded or free, which joints are
+            locked or driven.
+        constraints: The constraints; without a tag it is a PointOnSurface. Those of the robot's
+            file, such as mimic joints, are appended.
+        outputs: Position outputs; the force outputs follow them. If there are fewer than actuators
+            minus force outputs, they are completed: see `complete_scenario`.
+        tool_axis: The direction of the tool's axis in completed outputs: normal to the surface,
+            fixed in the world, or free.
         forces: The force outputs: names of constraint forces, and combinations of forces by tags;
-            all constraint forces where left out. Forces that nobody can or shall steer, as those of
-            wheels and of mimic joints, stay out: [] is none.
-        control_weights: One for each actuator, where they are more than the outputs: the law then
-            takes the control with the least sum of weight * (u - free_control)^2. The parameter
-            "free_control" is zero where `exogenous` has it not.
-        actuation: Stages from the joints toward the motor; none is rigid joints.
-        force: Whether the law uses its model's force or a measured one.
-        plant_parameters: Parameter name -> what the plant has and the law's model does not; one
-            number for all entries, or a list. A surface that may be tilted has `rpy`.
-        plant_payloads: Masses that the plant carries and the law's model does not.
-        plant_pushes: Forces on the plant for some time, which the law does not know.
-        loads: Known forces on frames; "<name>.force" is zero where neither `exogenous` nor
-            `plant_parameters` has it.
-        exogenous: Parameter name -> how its entries move, known to plant and law; "wall.position"
-            for example.
-        compliances: Constraint force -> its compliance relative to the others, where constraints
-            are redundant: their forces are shared by least squares. {} is all alike; left out, no
-            constraint may be redundant.
-        gains: The gains of the tracking law (28). Where left out: poles at -4 1/s with ideal
-            constraints; in Drake's own contact they are advised, with what is left out of
-            `integral`, `constraint_damping` and `observer`, and with measured force; see
-            `contact_gains`. The scenario as run has them all. With `actuation` nothing is advised
-            there.
-        integral: Names of outputs whose errors are integrated as well, which take a pole more:
-            positions, and forces where `force` is measured; none where left out beside `gains`.
-        constraint_damping: What the law's model demands of constraints that give way, written as
-            gains are, for r_i - 1 poles per constraint; none where left out beside `gains`.
-        observer: How the law observes what its model lacks, a disturbance and coefficients of
-            friction, where `force` is measured and the law is sampled; not at all where left out
-            beside `gains`.
-        plant: Whether constraints are ideal; or open and close; or Drake's own contact is in their
-            place: a discrete MultibodyPlant, with the surfaces as geometry.
-        sampling: The period and the delay of the law, in s; left out, it acts continuously.
-        encoders: How positions and velocities are measured for the law, with `sampling`; left out,
-            it gets them as they are.
-        saturation: Whether the drives give no more than the effort limits of the robot's file.
-        tolerances: How large errors may be; a run that leaves them ends there, with the reason.
-        may_diverge: Whether a run goes on whose errors or states leave all measure; otherwise it
-            ends there, with what grew.
-        references: Name -> reference, where a number is a constant. A name is that of an output,
-            tool.y; of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list of these,
-            "tool.y, elbow". Outputs that complete others may be without; they hold what they start
-            with.
-        task: What the robot does phase by phase, touching and letting go, in place of references.
-        start: Where the robot starts; without positions that is found, but not for a task.
-        duration: How long the run lasts, in s.
-        integrator: Drake's SimulatorConfig; the run begins at its start_time.
-        write: What the run leaves in its folder.
-        compiled: Whether functions become machine code, where a C compiler is found: true, false
-            or auto, which takes what the cache has and compiles what pays within the run.
+            all constraint forces if left out. Leave out forces that are not to be controlled, such
+            as those of wheels and mimic joints; [] is none.
+        control_weights: One for each actuator, if there are more actuators than outputs: the law
+            then takes the control with the least sum of weight * (u - free_control)^2. The
+            parameter "free_control" is zero unless it is in `exogenous`.
+        actuation: Stages from the joints toward the motor; none for rigid joints.
+        force_feedback: Whether the law uses its model's force or a measured one.
+        plant_parameters: Parameter name -> the plant's value, unknown to the law's model; one
+            number for all entries, or a list. To tilt a surface give it `rpy`.
+        plant_payloads: Additional masses on the plant, unknown to the law's model.
+        plant_disturbances: Disturbance forces on the plant, unknown to the law.
+        known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
+            `plant_parameters`.
+        exogenous: Parameter name -> references of its entries, known to plant and law;
+            "wall.position" for example.
+        bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; each
+            a number or one for each entry. Relative degrees are checked for all such values; bounds
+            of one value fix it. They do not restrict a run.
+        compliances: Constraint force -> its relative compliance, for redundant constraints: their
+            forces are shared by least squares. {} is equal compliances; if left out, constraints
+            must not be redundant.
+        gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
+            constraints; with Drake's own contact they are computed by `contact_gains`, together
+            with `integral`, `constraint_damping`, `observer` and measured force if these are left
+            out. The scenario as run has them all. This is not available with `actuation`.
+        integral: Names of outputs whose errors are integrated as well, with one more pole:
+            positions, and forces if `force_feedback` is measured; none if left out while `gains`
+            are given.
+        constraint_damping: Damping of compliant constraints by the law, written as gains, with r_i
+            - 1 poles per constraint; none if left out while `gains` are given.
+        observer: The observer of a disturbance and of coefficients of friction, for a sampled law
+            with measured `force_feedback`; none if left out while `gains` are given.
+        plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
+            MultibodyPlant with the surfaces as geometry.
+        sampling: The period and the delay of the law, in s; continuous if left out.
+        encoders: The measurement of positions and velocities for the law, with `sampling`; exact if
+            left out.
+        saturation: Whether controls are limited to the effort limits of the robot's file.
+        tolerances: The tolerated errors; a run that exceeds them ends with the reason.
+        may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
+            with the reason.
+        references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
+            of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list, "tool.y, elbow".
+            Completed outputs without a reference keep their initial value.
+        task: A sequence of phases with opening and closing contact, in place of references.
+        start: The start; without positions it is computed (not for a task).
+        duration: The duration of the run, in s.
+        integrator: Drake's SimulatorConfig; the run starts at its start_time.
+        write: The files that the run writes into its folder.
+        compiled: Whether functions are compiled to machine code, if there is a C compiler: true,
+            false or auto, which uses the cache and compiles functions for which it pays.
     """
 
     description: str = field(default="", kw_only=True)
@@ -144,12 +146,13 @@ class Scenario:
     forces: list[ForceOutput] | None = None
     control_weights: list[float] = field(default_factory=list)
     actuation: list[Stage] = field(default_factory=list)
-    force: Force = field(default_factory=parts.ModelForce)
+    force_feedback: Force = field(default_factory=parts.ModelForce)
     plant_parameters: dict[str, float | list[float]] = field(default_factory=dict)
     plant_payloads: list[Payload] = field(default_factory=list)
-    plant_pushes: list[Push] = field(default_factory=list)
-    loads: list[Load] = field(default_factory=list)
+    plant_disturbances: list[DisturbanceForce] = field(default_factory=list)
+    known_forces: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
+    bounds: dict[str, Interval] = field(default_factory=dict)
     compliances: dict[str, float] | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
@@ -183,7 +186,7 @@ class Scenario:
 
     @property
     def is_advised(self) -> bool:
-        """Whether the gains are left to be advised."""
+        """Whether the gains are left out and will be computed."""
         return self.gains is None and self.plant.material is not None
 
     def __repr__(self) -> str:
@@ -195,7 +198,7 @@ class Scenario:
         )
 
     def __eq__(self, other: object) -> bool:
-        # Arrays, and Drake's SimulatorConfig, do not compare as a whole.
+        # Arrays and Drake's SimulatorConfig cannot be compared directly.
         return isinstance(other, Scenario) and scenario_reader().write(
             self
         ) == scenario_reader().write(other)
@@ -203,7 +206,7 @@ class Scenario:
 
 @cache
 def scenario_reader() -> Reader[Scenario]:
-    """What reads scenarios from plain data, and writes them as such."""
+    """The reader and writer of scenarios as plain data."""
     return Reader(Scenario)
 
 
@@ -211,27 +214,28 @@ def scenario_schema(tags: bool = True) -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data.
 
     Args:
-        tags: Whether the data have tags as entries "_tag", as those of `read_scenario` do. Without,
-            it is for data that have none, as a plain reader of YAML or an editor gives them: any
-            form fits where a tag chooses.
+        tags: Whether the data have tags as entries "_tag", as for `read_scenario`. Otherwise it is
+            for data without tags, from a plain reader of YAML or an editor: any form fits where a
+            tag would choose.
     """
     schema = scenario_reader().schema
     return schema if tags else dict(without_tags(schema))
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:
-    """A scenario as plain data, of which `read_scenario` makes the same."""
+    """A scenario as plain data, the inverse of `read_scenario`."""
     return dict(scenario_reader().write(scenario))
 
 
 def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
-    """The scenario that plain data describe, the paths of its robot as they are.
+    """The scenario of plain data, with the paths of its robot unchanged.
 
     Args:
         data: Plain data.
-        folder: Where the names of other files start; None for the working directory.
+        folder: The folder of relative file names; None for the working directory.
 
     Raises:
-        ScenarioError: Keys are unknown or missing, or values cannot be used; all are told at once.
+        ScenarioError: Keys are unknown or missing, or values are not valid; all problems are
+            listed.
     """
     return scenario_reader().read(data, folder)

@@ -1,4 +1,4 @@
-"""Where the runs of a scenario start."""
+"""The start of the runs of a scenario."""
 
 from contextlib import suppress
 
@@ -15,17 +15,18 @@ from drake_dae.scenario.model import index_of, start_guess
 from drake_dae.scenario.scenario import Scenario
 
 _SLACK = 1e-6
-"""How far beyond a limit a joint may start, rad or m: references may begin at the limit."""
+"""The allowed excess over a joint limit at the start, rad or m: references may start at the
+limit."""
 
 _NEAREST = np.array([0.0, -1.0, 1.0])
-"""The turns that are tried beside that which is nearest to a guess."""
+"""The numbers of turns that are tried besides the nearest to a guess."""
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     """A new context of a closed loop at a scenario's start.
 
-    It is at rest, or, where something moves, in motion with the references. A law begins where its
-    references begin, plus the errors; a task at start.positions, on what its first phase touches.
+    The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
+    references plus the errors; a task at start.positions, in contact if its first phase needs it.
 
     Args:
         scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
@@ -48,27 +49,28 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
             plant.set_state(own, _standing(scenario, loop, plant.current_parameters(own)))
     else:
         _begin_with_references(scenario, loop, context)
-    loop.set_seed(context, scenario.force.seed)
+    loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
     return context
 
 
 def _standing(scenario: Scenario, loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
-    """The state at rest at start.positions, or next to them where constraints hold."""
+    """The state at rest at start.positions, or next to them on the constraints."""
     model = loop.plant.robot("a scenario")
     guess = start_guess(scenario.start.positions, model.links)
     forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
     near = model.rest_state(guess, forces, parameters)
     q = loop.controller.start_structure.manifold.settle(near, parameters)[: guess.size]
+    _check_limits(model, q, "Give")
     return model.rest_state(q, forces, parameters)
 
 
 def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
-    """Puts plant and sensor where the references begin, plus the errors."""
+    """Starts plant and sensor at the references plus the errors."""
     plant, controller = loop.plant, loop.controller
     model = plant.robot("a scenario")
-    if scenario.gains is not None:  # Those that were advised are in the law.
+    if scenario.gains is not None:  # Recommended gains are in the law.
         with at("gains"):
             of_law = controller.GetMyMutableContextFromRoot(context)
             controller.set_gains(of_law, scenario.gains.design())
@@ -77,7 +79,7 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
     wanted = _wanted(scenario.start.errors, loop, context.get_time())
     positions, forces = np.split(wanted, [len(model.position_signals)])
     with at("start"):
-        # Where nothing is said, near what the robot was completed with: that is told nowhere else.
+        # By default near the start of the completion, which is not reported elsewhere.
         guess = start_guess(scenario.start.positions, model.links, model.nominal_positions)
         q = _configuration(model, positions, guess, parameters)
         state = model.rest_state(q, forces, parameters)
@@ -92,9 +94,9 @@ def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Contex
 def _in_motion(
     loop: ClosedLoop, context: Context, wanted: FloatArray, guess: FloatArray
 ) -> FloatArray:
-    """The state whose outputs move as their references do, but for their errors.
+    """The state whose outputs move with their references, plus the errors.
 
-    Where something moves, nothing that touches it is at rest.
+    With exogenous motion the parts in contact are not at rest.
     """
     law, controller = loop.controller.law, loop.controller
     goal = loop.reference.reference(context.get_time())
@@ -134,6 +136,12 @@ def _configuration(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
+    _check_limits(model, q, "Change the first values of the references, or give")
+    return q
+
+
+def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
+    """Refuses a configuration with joints outside of their limits."""
     low, high = model.links.position_limits
     outside = [
         f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
@@ -145,10 +153,8 @@ def _configuration(
     if outside:
         raise ModelError(
             f"the robot cannot start outside of its limits, and the start near start.positions has "
-            f"{'; '.join(outside)}. Change the first values of the references, or give "
-            "start.positions of all joints near where they shall be"
+            f"{'; '.join(outside)}. {remedy} start.positions of all joints near where they shall be"
         )
-    return q
 
 
 def _unwound(
@@ -160,14 +166,16 @@ def _unwound(
 ) -> FloatArray:
     """A configuration whose joints are whole turns nearer to a guess, or within their limits.
 
-    Newton's method may turn a joint often. A turn stays where an output, a constraint or a limit
-    asks for it.
+    Newton's method may add whole turns to a joint. A turn is kept if an output, a constraint or a
+    limit needs it.
     """
     q, turn = found, 2 * np.pi
-    for index, signal in enumerate(model.links.position_signals):
-        if signal.unit != "rad":
+    limits = model.links.position_limits
+    is_inside = (limits[0] - _SLACK <= q) & (q <= limits[1] + _SLACK)
+    for index in np.flatnonzero(~is_inside | (np.abs(q - guess) >= np.pi)):
+        if model.links.position_signals[index].unit != "rad":
             continue
-        low, high = (limits[index] for limits in model.links.position_limits)
+        low, high = limits[0][index], limits[1][index]
         turns = q[index] - turn * np.round((q[index] - guess[index]) / turn) + turn * _NEAREST
         inside = [value for value in turns if low - _SLACK <= value <= high + _SLACK]
         nearest = min(inside, key=lambda value: abs(value - guess[index]), default=q[index])

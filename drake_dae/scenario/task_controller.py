@@ -1,4 +1,4 @@
-"""The controller of a scenario with a task, and what such a scenario cannot have."""
+"""The controller of a scenario with a task, and the keys that it excludes."""
 
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ScenarioError
@@ -16,13 +16,13 @@ _SETTINGS = {
     "encoders": "encoders",
     "tolerances": "tolerances",
     "plant_payloads": "plant_exogenous",
-    "plant_pushes": "plant_exogenous",
+    "plant_disturbances": "plant_exogenous",
 }
-"""Key of a scenario -> what it becomes among the settings of a loop."""
+"""Key of a scenario -> the setting of the loop."""
 
 
 def check_task(scenario: Scenario) -> None:
-    """Refuses what a task has no use for.
+    """Refuses keys that a task does not support.
 
     Raises:
         ScenarioError: A key does not fit a task, or start.positions are missing.
@@ -67,7 +67,7 @@ def task_controller(
 def opening_contact(scenario: Scenario, model: RobotModel) -> Constraint:
     """The constraint that opens and closes."""
     assert scenario.task is not None
-    fitting = {one.name: one for one in model.constraints if one.can_only_push == (True,)}
+    fitting = {one.name: one for one in model.constraints if one.is_unilateral == (True,)}
     name = scenario.task.contact
     with at("task.contact"):
         if name:

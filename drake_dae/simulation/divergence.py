@@ -1,14 +1,16 @@
 """Runs that end where they diverge, with what grew and since when."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import SimulationError
-from drake_dae.systems.control.contract import Controller
+from drake_dae.simulation.records.record import Record
+from drake_dae.systems.control.contract import Compared, Controller
 from drake_dae.systems.plants.contract import Plant
 
 LASTING = 100.0
@@ -42,139 +44,243 @@ class DivergenceWatch:
 
     Args:
         diagram: What runs: each `Plant` in it is watched, and the errors of a `Controller` that
-            reads references, where one plant is there.
+            knows what they are, where one plant is there.
         context: Its context at the start of the run.
         duration: How long the run lasts, in s.
     """
 
     def __init__(self, diagram: System, context: Context, duration: float) -> None:
         blocks = list(_blocks(diagram))
-        plants = [block for block in blocks if isinstance(block, Plant)]
-        self._states = [_States(plant, context) for plant in plants]
-        self._errors = [
-            _Errors(plants[0], block, context, WINDOW * duration)
-            for block in blocks
-            if isinstance(block, Controller)
-            and len(plants) == 1
-            and block.law.system.num_outputs == plants[0].dae.num_outputs > 0
-            and _reference(block, diagram, context) is not None
+        self._plants = [block for block in blocks if isinstance(block, Plant)]
+        self._controllers = [block for block in blocks if isinstance(block, Controller)]
+        self._controllers *= len(self._plants) == 1
+        self._diagram, self._steps, time = diagram, 0, context.get_time()
+        self._states = [
+            _States(plant.dae, time, plant.state(plant.GetMyContextFromRoot(context)))
+            for plant in self._plants
         ]
-        self._diagram, self._steps = diagram, 0
+        self._errors: list[tuple[Controller, _Errors]] = []
+        for controller in self._controllers:
+            if (now := self._compared(controller, context)) is None:
+                continue
+            plant = self._plants[0]
+            start = _sizes(plant, _shown(plant, context))
+            sizes, window = _with(start, now[2], now[0]), WINDOW * duration
+            errors = _Errors(now[2], time, window, sizes, _least(plant))
+            self._errors.append((controller, errors))
 
     @property
     def sees(self) -> bool:
         """Whether there is anything to watch."""
         return bool(self._states)
 
-    def look(self, context: Context) -> None:
+    def look(self, context: Context, *, always: bool = False) -> None:
         """Looks at an accepted step, at some of them.
 
         Args:
             context: The context of the diagram.
+            always: Whether to look at this one, as at the last.
 
         Raises:
             SimulationError: The run diverges.
         """
         self._steps += 1
-        if self._steps % EVERY:
+        if self._steps % EVERY and not always:
             return
-        for states in self._states:
-            states.look(context)
-        for errors in self._errors:
-            errors.look(context, self._diagram)
+        self.look_at_states(context)
+        for controller, errors in self._errors:
+            now = self._compared(controller, context)
+            if now is not None:
+                state = _shown(self._plants[0], context)("state")
+                rows = (each[None] for each in (*now[:2], state))
+                _raise_first([errors.look(np.array([context.get_time()]), *rows)])
+
+    def look_at_states(self, context: Context) -> None:
+        """Looks at the states alone: where a run has failed, outputs may have no values.
+
+        Raises:
+            SimulationError: They diverge.
+        """
+        times = np.array([context.get_time()])
+        pairs = zip(self._plants, self._states, strict=True)
+        _raise_first(
+            [each.look(times, _shown(plant, context)("state")[None]) for plant, each in pairs]
+        )
+
+    def _compared(self, controller: Controller, context: Context) -> Compared | None:
+        """The outputs of a controller and what they should be; None if nobody says."""
+        shown = _shown(self._plants[0], context)
+        return controller.compared(controller.GetMyContextFromRoot(context), shown)
+
+
+class RecordWatch:
+    """`DivergenceWatch` for a run of which only rows of its record are seen, in their order.
+
+    Args:
+        plant: The plant.
+        duration: How long the run lasts, in s.
+    """
+
+    def __init__(self, plant: Plant, duration: float) -> None:
+        self._plant, self._duration = plant, duration
+        self._watched: tuple[_States, _Errors] | None = None
+
+    def look(self, record: Record) -> None:
+        """Looks at rows that follow those that were looked at.
+
+        Raises:
+            SimulationError: The run diverges; the time is that of the first row that says so.
+        """
+        if not record.time.size:
+            return
+        states, outputs = record["state"], record["controlled_output"]
+        if self._watched is None:
+            signals, time = record.signals["controlled_output"].signals, float(record.time[0])
+            start = _sizes(self._plant, lambda name: record[name][0])
+            window = WINDOW * self._duration
+            self._watched = (
+                _States(self._plant.dae, time, states[0]),
+                _Errors(signals, time, window, start, _least(self._plant)),
+            )
+        of_states, of_errors = self._watched
+        found = [
+            of_errors.look(record.time, outputs, record["desired_output"], states),
+            of_states.look(record.time, states),
+        ]
+        _raise_first(found)
+
+
+Sizes = dict[str, float]
+"""Unit -> the largest number in it."""
+
+
+def _shown(plant: Plant, context: Context) -> Callable[[str], FloatArray]:
+    """What a plant shows now, by the names that a record has."""
+    own = plant.GetMyContextFromRoot(context)
+
+    def value(name: str) -> FloatArray:
+        if name == "state":
+            return plant.state(own)
+        if name != "control":
+            return np.array(plant.GetOutputPort(name).Eval(own))
+        port = plant.GetInputPort("control")
+        return np.array(port.Eval(own)) if port.HasValue(own) else np.zeros(0)
+
+    return value
+
+
+def _sizes(plant: Plant, shown: Callable[[str], FloatArray]) -> Sizes:
+    """The largest numbers in each unit of a plant's signals."""
+    found: Sizes = {}
+    dae = plant.dae
+    for name, signals in (
+        ("state", dae.state_signals),
+        ("controlled_output", dae.output_signals),
+        ("constraint_force", dae.force_signals),
+        ("control", dae.control_signals),
+    ):
+        found = _with(found, signals, shown(name))
+    return found
+
+
+def _least(plant: Plant) -> Sizes:
+    """Sizes of their own: a turn of one radian, the axis of a robot's frame."""
+    return {"rad": 1.0} if plant.model is None else {"rad": 1.0, "": 1.0}
+
+
+def _with(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> Sizes:
+    found = dict(sizes)
+    for signal, value in zip(signals, values, strict=False):
+        if np.isfinite(value):
+            found[signal.unit] = max(found.get(signal.unit, 0.0), abs(float(value)))
+    return found
 
 
 class _States:
     """The states of a plant beside their sizes."""
 
-    def __init__(self, plant: Plant, context: Context) -> None:
-        self._plant, self._since = plant, context.get_time()
-        self._size = np.maximum(plant.dae.scale, np.abs(self._value(context)))
+    def __init__(self, dae: DaeSystem, time: float, start: FloatArray) -> None:
+        self._signals, self._since = dae.state_signals, time
+        self._size = np.maximum(dae.scale, np.abs(start))
 
-    def _value(self, context: Context) -> FloatArray:
-        return self._plant.state(self._plant.GetMyContextFromRoot(context))
-
-    def look(self, context: Context) -> None:
-        state = self._value(context)
-        shares = np.abs(state) / self._size
-        largest = shares.max(initial=0.0)
-        if largest <= 10.0:
-            self._since = context.get_time()
-        if not largest > BEYOND:
-            return
-        worst = int(np.argmax(shares))
-        signal = self._plant.dae.state_signals[worst]
-        raise _diverged(
-            f"{_amount(signal, state[worst])}, {shares[worst]:.2g} times the "
+    def look(self, times: FloatArray, states: FloatArray) -> SimulationError | None:
+        """What diverges first in rows of a run; None if nothing does."""
+        shares = np.abs(states) / self._size
+        largest = shares.max(axis=1, initial=0.0)
+        if largest[-1] <= 10.0 and not largest.max() > BEYOND:
+            self._since = times[-1]
+            return None
+        beyond = np.flatnonzero(largest > BEYOND)
+        row = int(beyond[0]) if beyond.size else len(times) - 1
+        small = np.flatnonzero(largest[: row + 1] <= 10.0)
+        self._since = float(times[small[-1]]) if small.size else self._since
+        if not beyond.size:
+            return None
+        worst = int(np.argmax(shares[row]))
+        signal, state = self._signals[worst], states[row]
+        return _diverged(
+            f"{_amount(signal, state[worst])}, {shares[row, worst]:.2g} times the "
             f"{_quantity(self._size[worst], signal)} that it is large in use",
-            (self._since, context.get_time()),
+            (self._since, float(times[row])),
             state,
         )
 
 
 class _Errors:
-    """The errors of the outputs of a plant beside their sizes."""
+    """The errors of outputs beside their sizes."""
 
     def __init__(
-        self, plant: Plant, controller: Controller, context: Context, window: float
+        self, signals: Sequence[Signal], time: float, window: float, sizes: Sizes, least: Sizes
     ) -> None:
-        dae, at_plant = plant.dae, plant.GetMyContextFromRoot(context)
-        self._plant, self._controller, self._window = plant, controller, window
-        self._output, self._signals = plant.GetOutputPort("controlled_output"), dae.output_signals
-        self._lowest = controller.law.layout.lowest
-        self._sizes: dict[str, float] = {}
-        control = plant.GetInputPort("control")
-        starts = [
-            (dae.state_signals, plant.state(at_plant)),
-            (dae.output_signals, self._output.Eval(at_plant)),
-            (dae.force_signals, plant.GetOutputPort("constraint_force").Eval(at_plant)),
-        ]
-        if control.HasValue(at_plant):
-            starts.append((dae.control_signals, control.Eval(at_plant)))
-        for signals, values in starts:
-            self._note(signals, values)
-        self._largest = max(self._sizes.values(), default=0.0)
-        # A turn of one radian is a size of its own.
-        self._sizes["rad"] = max(1.0, self._sizes.get("rad", 0.0))
-        self._time = context.get_time()
-        self._mean = np.zeros(dae.num_outputs)
-        self._since = np.full(dae.num_outputs, self._time)
+        self._signals, self._time, self._window = signals, time, window
+        self._largest = max(sizes.values(), default=0.0)
+        self._sizes = sizes | {
+            unit: max(size, sizes.get(unit, 0.0)) for unit, size in least.items()
+        }
+        self._mean, self._since = np.zeros(len(signals)), np.full(len(signals), time)
 
-    def _note(self, signals: Sequence[Signal], values: FloatArray) -> None:
-        for signal, value in zip(signals, values, strict=True):
-            if np.isfinite(value):
-                self._sizes[signal.unit] = max(self._sizes.get(signal.unit, 0.0), abs(value))
+    def look(
+        self, times: FloatArray, outputs: FloatArray, desired: FloatArray, states: FloatArray
+    ) -> SimulationError | None:
+        """What diverges first in rows of a run; None if nothing does."""
+        sizes = self._along(desired)
+        errors = np.abs(outputs - desired)
+        least = KNOWN * np.maximum(self._largest, sizes.max(axis=1, initial=0.0, keepdims=True))
+        shares = np.divide(errors, sizes, out=np.zeros_like(errors), where=sizes > least)
+        if (shares <= 1.0).all():
+            self._mean *= np.exp((self._time - times[-1]) / self._window)
+            self._since[:] = self._time = times[-1]
+            return None
+        held = -np.expm1(-np.diff(times, prepend=self._time) / self._window)
+        logs = np.log(np.maximum(shares, 1.0))
+        for row, time in enumerate(times.tolist()):
+            self._mean += held[row] * (logs[row] - self._mean)
+            self._since[shares[row] <= 1.0] = self._time = time
+            beyond = (self._mean > np.log(LASTING)) | (shares[row] > ENORMOUS)
+            if not beyond.any():
+                continue
+            worst = int(np.argmax(np.where(beyond, shares[row], 0.0)))
+            signal, size = self._signals[worst], sizes[row, worst]
+            error = outputs[row, worst] - desired[row, worst]
+            return _diverged(
+                f"the error of {_amount(signal, error)}, {shares[row, worst]:.2g} times the "
+                f"{_quantity(size, signal)} that was asked for or was there at the start",
+                (float(self._since[worst]), time),
+                states[row],
+            )
 
-    def look(self, context: Context, diagram: System) -> None:
-        wanted = _reference(self._controller, diagram, context)
-        if wanted is None:
-            return
-        desired, at_plant = wanted[self._lowest], self._plant.GetMyContextFromRoot(context)
-        self._note(self._signals, desired)
-        error = self._output.Eval(at_plant) - desired
-        sizes = np.array([self._sizes[signal.unit] for signal in self._signals])
-        known = sizes > KNOWN * max(self._largest, float(np.max(sizes)))
-        shares = np.abs(error[known]) / sizes[known]
-        time = context.get_time()
-        held = -np.expm1((self._time - time) / self._window)
-        self._time = time
-        mean = self._mean[known]
-        mean += held * (np.log(np.maximum(shares, 1.0)) - mean)
-        self._mean[known] = mean
-        since = self._since[known]
-        since[shares <= 1.0] = time
-        self._since[known] = since
-        beyond = (mean > np.log(LASTING)) | (shares > ENORMOUS)
-        if not beyond.any():
-            return
-        worst = int(np.flatnonzero(known)[np.argmax(np.where(beyond, shares, 0.0))])
-        signal, size = self._signals[worst], sizes[worst]
-        raise _diverged(
-            f"the error of {_amount(signal, error[worst])}, {abs(error[worst]) / size:.2g} times "
-            f"the {_quantity(size, signal)} that was asked for or was there at the start",
-            (float(self._since[worst]), time),
-            self._plant.state(at_plant),
-        )
+        return None
+
+    def _along(self, desired: FloatArray) -> FloatArray:
+        """The sizes of all outputs at each time, from what was desired up to then."""
+        units, found = [signal.unit for signal in self._signals], np.zeros_like(desired)
+        for unit in dict.fromkeys(units):
+            own = np.array([each == unit for each in units])
+            largest = np.nan_to_num(np.abs(desired[:, own]), nan=0.0, posinf=0.0).max(axis=1)
+            grown = np.maximum.accumulate(np.maximum(largest, self._sizes.get(unit, 0.0)))
+            self._sizes[unit] = float(grown[-1])
+            found[:, own] = grown[:, None]
+        return found
 
 
 def _blocks(system: System) -> Iterator[System]:
@@ -186,17 +292,9 @@ def _blocks(system: System) -> Iterator[System]:
         yield system
 
 
-def _reference(controller: Controller, diagram: System, context: Context) -> FloatArray | None:
-    """R of a controller; None where nobody tells it."""
-    own = controller.GetMyContextFromRoot(context)
-    if controller.HasInputPort("reference"):
-        port = controller.GetInputPort("reference")
-        if port.HasValue(own):
-            return np.array(port.Eval(own))
-    if diagram.HasOutputPort("reference"):
-        found = np.array(diagram.GetOutputPort("reference").Eval(context))
-        return found if found.size == controller.law.layout.reference_size else None
-    return None
+def _raise_first(found: Sequence[SimulationError | None]) -> None:
+    if errors := [error for error in found if error is not None]:
+        raise min(errors, key=lambda error: error.time)
 
 
 def _quantity(value: float, signal: Signal) -> str:

@@ -28,9 +28,9 @@ from tqdm import tqdm
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import show_state
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.divergence import DivergenceWatch
-from drake_dae.simulation.records.interruption import Ending, ending_signals
+from drake_dae.simulation.records.interruption import Interruption, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines where it has no terminal, in s."""
@@ -112,7 +112,7 @@ def simulate(
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
-    ending = Ending()
+    ending = Interruption()
     began: float | None = None
     watch: DivergenceWatch | None = None
 
@@ -148,9 +148,15 @@ def simulate(
             elapsed = time.perf_counter() - began
             steps = simulator.get_num_steps_taken()
             simulator.AdvancePendingEvents()
-        except (InconsistentStateError, RuntimeError) as error:
+            if watch is not None:
+                watch.look(context, always=True)
+        except (DrakeDaeError, RuntimeError) as error:
             if began is None and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
+            if watch is not None:
+                watch.look_at_states(context)  # Those of a few steps may have grown so fast.
+            if not isinstance(error, InconsistentStateError | RuntimeError):
+                raise
             state = context.get_continuous_state_vector().CopyToVector()
             raise SimulationError(
                 f"the simulation cannot go on at t = {context.get_time():.6g} s, state "

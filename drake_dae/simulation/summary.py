@@ -12,6 +12,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.clearances import LinkBehind
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.shapes import Collision
 from drake_dae.simulation.open_contacts import contact_notes
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
@@ -56,7 +57,7 @@ class Limits:
             signal.name
             for constraint in model.constraints
             for signal, pushes in zip(
-                constraint.force_signals, constraint.can_only_push, strict=True
+                constraint.force_signals, constraint.is_unilateral, strict=True
             )
             if pushes
         )
@@ -72,7 +73,7 @@ def summary(
     failure: str = "",
     accuracy: float | None = None,
     reasons: Sequence[str] = (),
-    behind: Sequence[LinkBehind] = (),
+    behind: Sequence[LinkBehind | Collision] = (),
 ) -> str:
     """What a run did, in plain text, and whether that is as theory predicts.
 
@@ -87,7 +88,7 @@ def summary(
         failure: Why it failed.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
         reasons: Why a run may be off its prediction, such as "the law is sampled".
-        behind: Links that went behind a surface.
+        behind: Links that went behind a surface, or collided.
     """
     limits = limits or Limits()
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]

@@ -32,7 +32,7 @@ class Tracking(Enum):
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RunVerdict:
     """How a run compares with theory.
 
     Attributes:
@@ -91,7 +91,7 @@ def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
     return np.array([found[signal.unit] for signal in signals])
 
 
-def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> Verdict:
+def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) -> RunVerdict:
     """How a run compares with theory.
 
     Args:
@@ -101,7 +101,7 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
     """
     error = record["tracking_error"]
     if not error.size:
-        return Verdict(Tracking.AS_PREDICTED)
+        return RunVerdict(Tracking.AS_PREDICTED)
     signals = record.signals["tracking_error"].signals
     shares = np.abs(error - predicted) / output_sizes(record, predicted)
     row, column = map(int, np.unravel_index(np.argmax(shares), shares.shape))
@@ -114,10 +114,10 @@ def judge(record: Record, predicted: FloatArray, accuracy: float | None = None) 
         tracking, row = Tracking.OFF, int(np.argmax(shares[:, column] > NEAR))
     off = float(np.max(np.abs(error - predicted)[:, column]))
     settled = float(np.max(shares[len(shares) // 2 :]))
-    return Verdict(tracking, signals[column], off, float(record.time[row]), share, settled)
+    return RunVerdict(tracking, signals[column], off, float(record.time[row]), share, settled)
 
 
-def is_missed(verdict: Verdict, reasons: Sequence[str] = ()) -> bool:
+def is_missed(verdict: RunVerdict, reasons: Sequence[str] = ()) -> bool:
     """Whether a run missed its task: it is off, and stays so or has no reason to be.
 
     Args:
@@ -128,7 +128,7 @@ def is_missed(verdict: Verdict, reasons: Sequence[str] = ()) -> bool:
     return is_off and not (reasons and verdict.settled <= NEAR)
 
 
-def as_data(verdict: Verdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
+def as_data(verdict: RunVerdict, reasons: Sequence[str] = ()) -> dict[str, Any]:
     """A verdict as plain data, where a number that is not finite is None.
 
     Args:
@@ -153,7 +153,7 @@ def _finite(value: float) -> float | None:
 
 
 def in_words(
-    verdict: Verdict,
+    verdict: RunVerdict,
     accuracy: float | None = None,
     reasons: Sequence[str] = (),
     ended: str = "",

@@ -137,8 +137,8 @@ def _built(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
         tag = own["gains"].get(TAG, "!Poles")
         if tag == base["gains"][TAG] != "!Matrices":
             own["gains"] = base["gains"]
-    if "seed" in own["force"]:
-        own["force"] = {**own["force"], "seed": 0}
+    if "seed" in own["force_feedback"]:
+        own["force_feedback"] = {**own["force_feedback"], "seed": 0}
     if own["encoders"]:
         own["encoders"] = {**own["encoders"], "seed": 0}
     return own

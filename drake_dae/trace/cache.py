@@ -1,8 +1,8 @@
-"""Where compiled code is kept: a folder of this user's, which nobody else can write.
+"""The cache of compiled code: a folder that only this user can write.
 
-What stands there is loaded into the process, so it is trusted only where nobody else could have put
-it. A file's name ends in the digest of its bytes: files appear whole, by one `os.replace`, never
-change, and one that was damaged is known. So processes share the folder without locks.
+Its files are loaded into the process, so the folder is trusted only if nobody else can write it.
+The name of a file ends in the digest of its bytes. Files are put in place by one `os.replace` and
+never change, and damaged ones are detected. So processes share the folder without locks.
 """
 
 import hashlib
@@ -20,15 +20,15 @@ from pathlib import Path
 from drake_dae.errors import MachineCodeError, MachineCodeWarning
 
 SUFFIX = ".so"
-"""Of compiled code; on macOS too, where a library may bear any."""
+"""The suffix of compiled code, also on macOS, where a library may have any."""
 
 _OURS = re.compile(rf"[0-9a-f]{{32}}-[0-9a-f]{{32}}{re.escape(SUFFIX)}|new-\w+")
 
 
 def cache_folder() -> Path:
-    """The folder, whether it exists or not: what DRAKE_DAE_CACHE names, if it is set.
+    """The folder, whether it exists or not: DRAKE_DAE_CACHE if it is set.
 
-    Else it is drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
+    Otherwise drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
     macOS and ~/.cache elsewhere.
 
     Raises:
@@ -37,7 +37,7 @@ def cache_folder() -> Path:
     if os.environ.get("DRAKE_DAE_CACHE"):
         return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if given.is_absolute():  # Others are to be ignored, says its specification.
+    if given.is_absolute():  # Its specification says to ignore other paths.
         return given / "drake_dae"
     try:
         home = Path.home()
@@ -84,7 +84,7 @@ def open_cache(create: bool = False) -> Path | None:
 
 
 def find(key: str) -> Path | None:
-    """The code that was stored under a key; None if there is none.
+    """The code stored under a key; None if there is none.
 
     Warns:
         MachineCodeWarning: The file is damaged, and was removed.
@@ -110,7 +110,7 @@ def find(key: str) -> Path | None:
 
 @contextmanager
 def workplace() -> Iterator[Path]:
-    """A folder in the cache for files on their way, which is removed in the end.
+    """A temporary folder in the cache, removed at the end.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or written.
@@ -129,7 +129,7 @@ def workplace() -> Iterator[Path]:
 
 
 def store(key: str, file: Path) -> Path:
-    """Moves a file from the `workplace` to where `find` finds it by a key."""
+    """Moves a file from the `workplace` to its place, under a key for `find`."""
     path = file.parents[1] / _name(key, file.read_bytes())
     file.chmod(0o700)
     os.replace(file, path)
@@ -137,7 +137,7 @@ def store(key: str, file: Path) -> Path:
 
 
 def contents() -> list[Path]:
-    """The files of the cache, and folders that processes left which were killed; nothing else.
+    """The files of the cache, and temporary folders of killed processes; nothing else.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or read.
@@ -151,7 +151,7 @@ def contents() -> list[Path]:
 
 
 def clear() -> None:
-    """Removes everything from the cache; processes that run keep what they have loaded.
+    """Removes everything from the cache; running processes keep the code that they loaded.
 
     Raises:
         MachineCodeError: The cache cannot be trusted or written.

@@ -1,4 +1,4 @@
-"""The C compiler at hand: which one it is, what options it takes, and how it is run."""
+"""The available C compiler: which one, its options, and how it is run."""
 
 import os
 import platform
@@ -30,25 +30,25 @@ FLAGS = (
 cent with rigid joints, 12 with flexible ones, and 20 to 25 for two arms or a hand."""
 
 NATIVE = "-march=native"
-"""All that the processor at hand can do, where the compiler takes this option for it: not each one
-does for each processor. On x86-64, where older instructions meet the newer ones of libm and memcpy,
-a call takes a tenth longer without, at times twice as long. The bits are the same."""
+"""Uses all instructions of this processor, if the compiler accepts the option. Without it a call on
+x86-64 takes 10 % longer, sometimes twice as long, because older instructions mix with newer ones of
+libm and memcpy. The results are the same to the bit."""
 
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
-"""Options of Python that make it a C compiler, where ziglang is installed. Code for any processor:
-a home may be shared by machines; and without Zig's own checks of what C leaves undefined."""
+"""Options that make Python a C compiler, if ziglang is installed: code for any processor, since
+machines may share a home, and without Zig's checks for undefined behavior."""
 
 ANSWERS = 10.0
-"""A compiler that takes longer to say what it is hangs, in s."""
+"""A compiler that takes longer than this to report its version counts as hanging, in s."""
 
 
 class CompilerHangs(MachineCodeError):
-    """A compiler that does not come to an end."""
+    """A compiler that does not finish."""
 
 
 _HANGING: dict[str, str] = {}
-"""Compilers that hung in this process, by their identity, with what is said of each: to wait for
-one once is enough."""
+"""Compilers that hung in this process, by identity, with the message: each is waited for only
+once."""
 
 
 class Compiler(NamedTuple):
@@ -56,9 +56,8 @@ class Compiler(NamedTuple):
 
     Attributes:
         command: How it is called.
-        identity: What tells it from others: its own words on its version, and for what machine it
-            works.
-        target: Its options that choose the processor.
+        identity: Its identity: its version text and its target machine.
+        target: The options that choose the processor.
     """
 
     command: tuple[str, ...]
@@ -87,7 +86,7 @@ class Compiler(NamedTuple):
 
 
 def find_compiler() -> Compiler:
-    """The C compiler that CC names, with options if it has any; else `cc`; else what pip brought.
+    """The C compiler named by CC, with its options; else `cc`; else the one installed by pip.
 
     The last is `python -m ziglang cc`, the optional group "compiler".
 
@@ -103,13 +102,13 @@ def find_compiler() -> Compiler:
 
 
 def give_up(compiler: Compiler, error: MachineCodeError) -> None:
-    """Waits no more in this process for a compiler that hung."""
+    """Marks a compiler that hung, so that this process does not wait for it again."""
     _HANGING[compiler.identity] = str(error)
 
 
 @cache
 def _find_compiler(named: str, path: str) -> Compiler | str:
-    """The compiler, or why there is none: one that hangs is waited for once."""
+    """The compiler, or the reason why there is none; one that hangs is waited for once."""
     try:
         return _looked_up(named)
     except MachineCodeError as error:
@@ -139,10 +138,10 @@ def _looked_up(named: str) -> Compiler:
 
 
 def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
-    """The option for the processor at hand, and what a compiler takes it for.
+    """The option for this processor, and the target that the compiler derives from it.
 
-    None where the command chooses a processor, or where the compiler does not know this one. A
-    cache that several machines share has code for each of them, by what the compiler says.
+    None if the command chooses a processor, or if the compiler does not know this one. The target
+    is part of the identity, so that machines with a shared cache each have their own code.
     """
     if any(word.startswith(("-march", "-mcpu")) for word in command):
         return (), ""
@@ -151,7 +150,7 @@ def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
 
 
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":
-    """Runs a command to its end; where that is not awaited, what it started ends with it."""
+    """Runs a command to its end; after a timeout its child processes are ended as well."""
     try:
         with subprocess.Popen(
             command,

@@ -156,8 +156,7 @@ def smallest_sine(rows: ca.SX, usual: Sequence[float]) -> ca.SX:
 
     Args:
         rows: The matrix, shape (k, n).
-        usual: How long rows usually are; one that is shorter counts as if it made that much
-            smaller an angle.
+        usual: The usual lengths of rows; for a shorter row the sine is reduced in proportion.
     """
     smallest = ca.SX(1)
     basis: list[ca.SX] = []

@@ -1,4 +1,4 @@
-"""Formulas that a user writes as text: parsed, never run as Python."""
+"""Formulas given as text: parsed, never executed as Python."""
 
 import ast
 import operator
@@ -31,7 +31,7 @@ _FUNCTIONS: dict[str, tuple[int, Callable[..., ca.SX]]] = {
     },
     "atan2": (2, ca.atan2),
 }
-"""Name -> how many arguments it takes, and the function."""
+"""Name -> number of arguments, and the function."""
 
 _ROUGH = ("abs", "fabs", "min", "max", "fmin", "fmax", "floor", "ceil", "round", "sign", "mod")
 _SMOOTH_INSTEAD = (
@@ -43,17 +43,17 @@ CONSTANTS = {"pi": ca.pi}
 
 
 def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
-    """The expression that a text such as "z - 0.1*sin(x)**2" describes.
+    """The expression of a text such as "z - 0.1*sin(x)**2".
 
     It may have numbers, the symbols, pi, + - * / **, brackets, and sin, cos, tan, asin, acos, atan,
     atan2, sinh, cosh, tanh, asinh, acosh, atanh, exp, log, sqrt, erf.
 
     Args:
         text: The formula.
-        symbols: Name -> what stands for it, a scalar.
+        symbols: Name -> its symbol or expression, a scalar.
 
     Raises:
-        ModelError: The text is no formula; the message tells where.
+        ModelError: The text is not a formula; the message has the place.
     """
     if len(text) > MOST_LETTERS:
         raise ModelError(f"a formula has at most {MOST_LETTERS} letters, this one {len(text)}")
@@ -78,7 +78,7 @@ def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
     """Refuses names of parameters that a formula could not use.
 
     Raises:
-        ModelError: A name is no word, or means something else.
+        ModelError: A name is not an identifier, or is reserved.
     """
     for name in names:
         if not name.isidentifier():
@@ -88,7 +88,7 @@ def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
 
 
 class _Formula:
-    """A text on one line, and what its names stand for."""
+    """A text on one line, with the expressions of its names."""
 
     def __init__(self, text: str, symbols: Mapping[str, ca.SX]) -> None:
         self.text = text
@@ -99,7 +99,7 @@ class _Formula:
         return ModelError(f"formula '{_short(self.text)}', column {place + 1}: {what}")
 
     def value(self, node: ast.expr) -> ca.SX:
-        """What a part of the text stands for."""
+        """The expression of a part of the text."""
         if isinstance(node, ast.Constant) and type(node.value) in (int, float):
             return self._number(node)
         if isinstance(node, ast.Name):
@@ -115,7 +115,7 @@ class _Formula:
         raise self._wrong(node, f"'{self._piece(node)}' {self._remedy(node)}")
 
     def _number(self, node: ast.Constant) -> ca.SX:
-        # Python also has 1_000 and 0x10; and what is too large it makes infinite.
+        # Python also accepts 1_000 and 0x10, and makes numbers that are too large infinite.
         number = number_in(ast.get_source_segment(self.text, node) or "")
         if number is None:
             raise self._wrong(node, f"{self._piece(node)} is no number, or is too large a number")

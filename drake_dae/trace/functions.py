@@ -1,4 +1,4 @@
-"""Traced expressions as fast functions of NumPy arrays, and what can be wrong with their values."""
+"""Traced expressions as fast functions of NumPy arrays, with checks of their values."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -15,15 +15,15 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled, attempts, machine_code
 
 HUGE = 1e30
-"""A number above this, in whatever unit, says that something grew without bound. Its powers cancel
-and overflow, so that what it does to a pivot means nothing."""
+"""A number above this, in any unit, means that something grew without bound. Its powers cancel and
+overflow, so that pivots have no meaning."""
 
 SINGULAR_PIVOT = 1e-12
 """A matrix whose `pivot` is below this counts as singular; see `trace.factorization`."""
 
 
 class Fault(Enum):
-    """What is wrong with the values of a function."""
+    """The kind of failure of a function."""
 
     INPUT = "an input is not finite"
     OVERFLOW = "an input is beyond all measure"
@@ -33,11 +33,11 @@ class Fault(Enum):
 
 @dataclass(frozen=True)
 class Failure:
-    """Why the last values of a function are of no use.
+    """The reason why the last values of a function are not valid.
 
     Attributes:
         function: The function's name.
-        fault: What is wrong.
+        fault: The kind of failure.
         inputs: Name of an input -> its entries that are not finite, or beyond `HUGE`; empty unless
             `fault` is INPUT or OVERFLOW.
         singular: The matrix that must be regular, which is singular if `fault` is SINGULAR.
@@ -52,31 +52,30 @@ class Failure:
 class TracedFunction:
     """CasADi expressions, evaluated on preallocated NumPy arrays.
 
-    A call goes through CasADi's buffer interface and allocates nothing. Whether its values are of
-    use, `is_valid`, is one number that the call computes as well. Whether it is interpreted or
-    machine code is decided here and nowhere else, by a choice that is handed down.
+    A call goes through CasADi's buffer interface and allocates nothing. It also computes one number
+    that says whether its values are valid, see `is_valid`. Only here it is decided whether a
+    function is interpreted or compiled, by the choice `compiled` of the caller.
 
     Args:
-        name: What messages call the function.
+        name: The name of the function in messages.
         inputs: Name -> symbol column, in the order of the call's arguments.
         outputs: Name -> expression; a column becomes an array of shape (k,), anything else an
             array of its own shape.
         pivot: A scalar that is 0 where a matrix that must be regular is singular, such as
             `Factorization.pivot`; None if there is no such matrix.
-        regular: What messages call that matrix.
-        often: Whether it is called often enough for common subexpressions to be worth removing, and
-            for machine code.
+        regular: The name of that matrix in messages.
+        often: Whether it is called so often that removing common subexpressions and compiling pay.
         lean: Whether common subexpressions have been removed already.
         compiled: Whether a function that is called often becomes machine code; see
             `trace.compiled`.
         doubt: A scalar that is negative where the values are not valid though the pivot is large
-            enough, for a caller that may know better ones; see `is_regular`.
+            enough; the caller may have other values there, see `is_regular`.
 
     Attributes:
         arguments: The arrays that a call reads, for `run`.
         outputs: The arrays that a call writes.
-        num_operations: How many scalar operations one call takes.
-        is_machine_code: Whether calls run machine code by now.
+        num_operations: The number of scalar operations of one call.
+        is_machine_code: Whether calls currently run machine code.
     """
 
     def __init__(
@@ -96,8 +95,8 @@ class TracedFunction:
         self.input_names = tuple(inputs)
         self.output_names = tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
-        # Two numbers tell at once whether the values are of use: the first is finite exactly if all
-        # outputs are, the last if the pivot is large enough as well, and there is no doubt.
+        # Two numbers show whether the values are valid: the first is finite exactly if all outputs
+        # are, the last if also the pivot is large enough and the doubt is not negative.
         finite = sum((ca.sum1(ca.vec(e)) for e in dense if e.numel()), ca.SX(0))
         checks, regularity = [finite], ca.SX(1)
         if pivot is not None:
@@ -127,7 +126,7 @@ class TracedFunction:
         self._bind(self._function)
 
     def _bind(self, function: ca.Function) -> None:
-        """Makes a function the one that is called, on the same arrays."""
+        """Binds a function to the arrays, to be called from now on."""
         self.is_machine_code = function is not self._function
         self._buffer, self._evaluate = function.buffer()
         for index, array in enumerate(self.arguments):
@@ -138,7 +137,7 @@ class TracedFunction:
             vars(self)["run"] = _run(self._evaluate, self._valid)
 
     def _seek(self) -> None:
-        """Seeks machine code, after as many calls as the choice says."""
+        """Tries to get machine code, after the number of calls of the next attempt."""
         attempt = self._attempts.pop(0)
         code = machine_code(self._function, self._compiled, attempt.make)
         if code is None and self._attempts:
@@ -153,7 +152,7 @@ class TracedFunction:
             arguments: Arrays of the sizes of the inputs, in their order.
 
         Returns:
-            The outputs. The arrays are overwritten by the next call: copy what must last.
+            The outputs. The arrays are overwritten by the next call; copy values to keep them.
 
         Raises:
             TypeError: The number of arguments is wrong.
@@ -169,10 +168,10 @@ class TracedFunction:
         return self.outputs
 
     def run(self) -> bool:
-        """Calls the function on its `arguments`; returns whether its `outputs` are of use.
+        """Calls the function on its `arguments`; returns whether its `outputs` are valid.
 
-        That is the call with the least around it, for who writes the arguments in place. Once no
-        machine code is sought any more, `_run` stands in its place.
+        This is the fastest call, for callers that write the arguments in place. It is replaced by
+        `_run` when there are no more attempts to compile.
         """
         self._calls_left -= 1
         if not self._calls_left:
@@ -181,25 +180,25 @@ class TracedFunction:
         return isfinite(self._valid[0])
 
     def nowhere(self) -> tuple[FloatArray, ...]:
-        """What stands for the outputs where the function has no value: fresh arrays of nan."""
+        """New arrays of nan in the shapes of the outputs, for points without a value."""
         return tuple(np.full_like(output, np.nan) for output in self.outputs)
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many entries each input has."""
+        """The number of entries of each input."""
         return tuple(array.size for array in self.arguments)
 
     @property
     def function(self) -> ca.Function:
-        """The function as CasADi has it: outputs, the pivot, and what is finite if all outputs are.
+        """The CasADi function: outputs, pivot, and a number that is finite if all outputs are.
 
-        With a pivot follows what is finite if it is large enough, too.
+        With a pivot, a last number is finite if the pivot is large enough as well.
         """
         return self._function
 
     @property
     def is_valid(self) -> bool:
-        """Whether the last values are of use: all finite, and what must be regular is."""
+        """Whether the last values are valid: all finite, and the matrix regular."""
         return isfinite(self._valid[0])
 
     @property
@@ -209,7 +208,7 @@ class TracedFunction:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the last values are of use where nobody knows better ones."""
+        """Whether the last values are valid apart from the doubt."""
         return self.is_finite and bool(self._pivot[0] >= SINGULAR_PIVOT)
 
     @property
@@ -218,7 +217,7 @@ class TracedFunction:
         return float(self._pivot[0])
 
     def failure(self) -> Failure:
-        """What was wrong with the last call, if it was not valid."""
+        """The failure of the last call, if it was not valid."""
         for fault, limit in ((Fault.INPUT, np.inf), (Fault.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(given) < limit)))
@@ -227,7 +226,7 @@ class TracedFunction:
             }
             if bad:
                 return Failure(self.name, fault, bad)
-        # What is not finite may be so because of the matrix.
+        # A value may not be finite because the matrix is singular.
         is_singular = self.is_finite or self._pivot[0] < SINGULAR_PIVOT
         fault = Fault.SINGULAR if is_singular else Fault.VALUE
         return Failure(self.name, fault, {}, self._regular)
@@ -250,7 +249,8 @@ class TracedFunction:
         """Calls the function and returns fresh arrays.
 
         Raises:
-            ModelError: The number of arguments is wrong, or one has a wrong shape or no numbers.
+            ModelError: The number of arguments is wrong, or one has a wrong shape or is not
+                numeric.
         """
         if len(arguments) != len(self.arguments):
             raise ModelError(
@@ -271,7 +271,7 @@ class TracedFunction:
 
 
 def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
-    """A call that looks up nothing of its function."""
+    """A call without attribute lookups."""
 
     def run() -> bool:
         evaluate()
@@ -281,5 +281,5 @@ def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
 
 
 def _identifier(name: str) -> str:
-    """A name that CasADi takes: no other characters, no two underscores in a row."""
+    """A name that CasADi accepts: no other characters, no two underscores in a row."""
     return re.sub("[^A-Za-z0-9]+", "_", f"f_{name}")

@@ -1,4 +1,4 @@
-"""Functions that somebody gave: what goes wrong in them is told of the one who gave them."""
+"""Functions from users: their failures are reported as errors of the argument."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -16,12 +16,12 @@ def result_of(
     *arguments: Any,
     error: Callable[[str], Exception] = ModelError,
 ) -> Any:
-    """What a function that was given returns; if it fails, that is an error of the argument.
+    """The result of a user's function; a failure is an error of the argument.
 
     Args:
-        what: How a message calls the function.
+        what: The name of the function in messages.
         function: The function, with its arguments.
-        error: Makes what is raised of a text. Errors of the library pass.
+        error: Makes the exception from a text. Errors of the library are not changed.
     """
     try:
         return function(*arguments)
@@ -34,10 +34,10 @@ def result_of(
 
 @contextmanager
 def numpy_told(what: str) -> Iterator[None]:
-    """Tells in one line, once, that a function calls NumPy on symbols: CasADi takes twenty lines.
+    """Warns in one line, once, that a function calls NumPy on symbols; CasADi's warning has twenty.
 
     Args:
-        what: How the warning calls the function.
+        what: The name of the function in the warning.
     """
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")

@@ -17,14 +17,6 @@ def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
     return ca.jtimes(expression, state, ca.densify(field))
 
 
-def lie_derivatives(expression: ca.SX, field: ca.SX, state: ca.SX, order: int) -> list[ca.SX]:
-    """[k, L_f k, ..., L_f^order k], with L_f^k k = L_f (L_f^(k-1) k)."""
-    result = [expression]
-    for _ in range(order):
-        result.append(lie_derivative(result[-1], field, state))
-    return result
-
-
 def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.SX:
     """[L_g1 k, ..., L_gm k], structurally zero where it must be zero.
 
@@ -37,8 +29,3 @@ def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.S
         The derivatives, shape (a, m), sparse.
     """
     return ca.sparsify(ca.mtimes(ca.jacobian(expression, state), fields))
-
-
-def lie_bracket(first: ca.SX, second: ca.SX, state: ca.SX) -> ca.SX:
-    """[f, g] = (dg/dx) f - (df/dx) g, shape (n, 1)."""
-    return lie_derivative(second, first, state) - lie_derivative(first, second, state)

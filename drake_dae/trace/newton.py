@@ -1,4 +1,4 @@
-"""Newton's method from a guess, damped: the only one of the library."""
+"""Damped Newton's method from a guess, used everywhere in the library."""
 
 from collections.abc import Callable
 from math import sqrt
@@ -6,40 +6,41 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+from scipy.linalg.lapack import dpotrs, dtrtrs
 
 from drake_dae.arrays import FloatArray
 
 ROUND_OFF = 1e-12
-"""A Newton step of this size, relative to the state, is lost in the round-off of the residual."""
+"""A Newton step below this, relative to the state, is within the round-off of the residual."""
 
 DEPENDENT = 1e-9
-"""Gradients of length one whose smallest singular value is below this depend on each other."""
+"""Gradients of length one with a smallest singular value below this are dependent."""
 
 CONVERGED = 1e-8
-"""A Newton step of this size, relative to the state, that does not get smaller is round-off."""
+"""A Newton step below this, relative to the state, that stops decreasing is round-off."""
 
 PRECISION = 1e-16
-"""The error, relative to the state, that a search leaves."""
+"""The accuracy of a search, relative to the state."""
 
 ROUNDING = 1e-15
-"""After a Newton step of this size, relative to the state, only rounding is left."""
+"""After a Newton step below this, relative to the state, the error is round-off."""
 
 ITERATIONS = 200
-"""After so many steps a search ends; quadratic convergence takes a handful."""
+"""The largest number of steps; quadratic convergence takes a handful."""
 
 LENGTHS = tuple(0.5**k for k in range(30))
-"""The parts of a Newton step that are tried."""
+"""The fractions of a Newton step that are tried."""
 
 
-class Linearization(NamedTuple):
+class NewtonModel(NamedTuple):
     """Equations linearized at an iterate.
 
     Attributes:
         step: x -> the Newton step from x by the matrix of the iterate, shape (n,).
-        is_regular: Whether that matrix has full rank, so that near a solution there are no others
-            but those that the number of equations leaves.
-        measure: What a step must make smaller, x -> a number that is not negative; if None the
-            length of the next step.
+        is_regular: Whether that matrix has full rank, so that solutions are isolated up to the
+            number of free variables.
+        measure: The function x -> nonnegative number that a step must decrease; if None, the length
+            of the next step.
     """
 
     step: Callable[[FloatArray], FloatArray]
@@ -47,22 +48,22 @@ class Linearization(NamedTuple):
     measure: Callable[[FloatArray], float] | None = None
 
 
-@np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
+@np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
 def newton(
     start: FloatArray,
-    linearize: Callable[[FloatArray], Linearization | None],
+    linearize: Callable[[FloatArray], NewtonModel | None],
     iterations: int = ITERATIONS,
 ) -> tuple[FloatArray, bool]:
     """Damped Newton's method; a step must make the next one, by the same matrix, shorter.
 
     That test does not depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
-    are measured relative to the start, or to 1 where that is larger; what that calls a solution is
-    polished as long as steps get shorter, which depends on no units.
+    are measured relative to the start, or to 1 if that is larger. A solution is then improved as
+    long as steps decrease, which does not depend on units.
 
     Args:
         start: The first iterate, shape (n,).
         linearize: The linearization at an iterate, None if it is not finite, or has no steps.
-        iterations: After so many steps it ends; few where there are other guesses.
+        iterations: The largest number of steps; few if there are other guesses.
 
     Returns:
         The last iterate, and whether it is a regular solution up to round-off.
@@ -89,7 +90,7 @@ def newton(
                 following = step_from(trial)
                 left = length_of(following)
                 if left * left <= PRECISION * size:
-                    # The step after that would be left / size times as long.
+                    # The next step would be left / size times as long.
                     return _polished(trial, following, step_from), regular
             else:
                 left = measure(trial)
@@ -98,14 +99,14 @@ def newton(
         else:
             return x, regular and bool(size <= CONVERGED)
         x = trial
-    # Steps that go round in what is round-off do not get smaller either.
+    # Steps within round-off do not decrease either.
     return x, regular and bool(size <= CONVERGED)
 
 
 def _polished(
     state: FloatArray, step: FloatArray, step_from: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """Where a state comes by a step and by all that follow it, until they are round-off."""
+    """The state after a step and all following ones, until they are round-off."""
     length = norm(step)
     while length > 0.0:
         state = state + step
@@ -124,11 +125,11 @@ def norm(vector: FloatArray) -> float:
 
 def shortest_steps(
     gradients: FloatArray, residual: Callable[[FloatArray], FloatArray]
-) -> Linearization | None:
+) -> NewtonModel | None:
     """The shortest dx with C dx = -residual(x); regular if the rows of C are independent.
 
-    The rows are scaled to length one. Where they depend on each other, which may be where a search
-    starts, dx is that of least squares.
+    The rows are scaled to length one. If they are dependent, for example at the start of a search,
+    dx is the least-squares solution.
 
     Args:
         gradients: C, shape (k, n).
@@ -136,25 +137,25 @@ def shortest_steps(
     """
     if not np.all(np.isfinite(gradients)):
         return None
+    if not len(gradients):
+        return NewtonModel(np.zeros_like, True)
     length = np.linalg.norm(gradients, axis=1)
     length[length == 0.0] = 1.0
     rows = gradients / length[:, None]
     q, r = scipy.linalg.qr(rows.T, mode="economic", check_finite=False)
     if len(rows) > len(q) or np.min(np.abs(np.diag(r)), initial=1.0) <= DEPENDENT:
         inverse = np.linalg.pinv(rows, DEPENDENT)
-        return Linearization(lambda x: -inverse @ (residual(x) / length), False)
-    solve = scipy.linalg.solve_triangular
-    return Linearization(
-        lambda x: -q @ solve(r, residual(x) / length, trans="T", check_finite=False), True
-    )
+        return NewtonModel(lambda x: -inverse @ (residual(x) / length), False)
+    # LAPACK itself: SciPy's solve_triangular takes ten times as long around the same call.
+    return NewtonModel(lambda x: -q @ dtrtrs(r.T, residual(x) / length, lower=1)[0], True)
 
 
 def steps_along(
     gradients: FloatArray,
     directions: FloatArray,
     residual: Callable[[FloatArray], FloatArray],
-) -> Linearization | None:
-    """The steps D mu with C D mu = -residual(x); none where that leaves mu open.
+) -> NewtonModel | None:
+    """The steps D mu with C D mu = -residual(x); None if mu is not determined.
 
     Args:
         gradients: C, shape (k, n).
@@ -172,9 +173,8 @@ def steps_along(
     if np.min(np.diag(factors[0])) <= DEPENDENT:
         return None
     along = directions / size
-    return Linearization(
-        lambda x: -along @ scipy.linalg.cho_solve(factors, residual(x) / size, check_finite=False),
-        True,
+    return NewtonModel(
+        lambda x: -along @ dpotrs(factors[0], residual(x) / size, lower=factors[1])[0], True
     )
 
 

@@ -1,4 +1,4 @@
-"""Products of numbers in which what is nothing but round-off is zero."""
+"""Products of numbers in which entries that are only round-off are zero."""
 
 import numpy as np
 
@@ -16,18 +16,18 @@ SINGULAR = 1e-6
 
 
 Sized = tuple[FloatArray, FloatArray]
-"""A matrix without its round-off, and how large its entries were before terms cancelled."""
+"""A matrix without its round-off, and the sizes of its entries before cancellation."""
 
 
 def multiply(
     left: FloatArray, right: Sized, scale: FloatArray, negligible: float = NEGLIGIBLE
 ) -> Sized:
-    """A product in which entries that are nothing but round-off are zero.
+    """A product in which entries that are only round-off are zero.
 
     Args:
         left: The left factor, shape (a, k).
         right: The right factor, shape (k, b).
-        scale: Units in which the columns of `left` and the rows of `right` compare, shape (k,).
+        scale: The scales of the columns of `left` and the rows of `right`, shape (k,).
         negligible: A factor below this, relative to the others in its row or column, is zero.
     """
     value, size = right
@@ -41,7 +41,7 @@ def multiply(
 
 
 def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
-    """A sum of products in which entries that are nothing but round-off are zero.
+    """A sum of products in which entries that are only round-off are zero.
 
     Args:
         value: The sum, shape (a, b).

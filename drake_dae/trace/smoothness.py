@@ -1,4 +1,4 @@
-"""Whether an expression may be differentiated as often as the theory does."""
+"""Checks that an expression is smooth, since the theory differentiates repeatedly."""
 
 from dataclasses import dataclass
 
@@ -24,8 +24,8 @@ _KINKS = {
 def length_of(vector: ca.SX) -> ca.SX:
     """The length of a column, with derivatives of all orders wherever it is not zero.
 
-    Of a column with one entry e CasADi makes sqrt(e^2) = fabs(e), which it differentiates but once.
-    That entry is here turned into a plane: e^2 = (0.6 e)^2 + (0.8 e)^2.
+    For a column with one entry e CasADi forms sqrt(e^2) = fabs(e), whose higher derivatives it
+    loses. Here that entry is split in two: e^2 = (0.6 e)^2 + (0.8 e)^2.
     """
     entries = [entry for entry in ca.vertsplit(vector) if not entry.is_zero()]
     if len(entries) == 1:
@@ -35,21 +35,21 @@ def length_of(vector: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Flaw:
-    """What keeps an expression from being differentiated.
+    """The reason why an expression cannot be differentiated.
 
     Attributes:
-        operation: One that is not smooth in the variable; empty if a constant is to blame.
-        constant: A constant that is not finite; 0 if the operation is to blame.
+        operation: The operation that is not smooth; empty if the reason is a constant.
+        constant: A constant that is not finite; 0 if the reason is an operation.
     """
 
     operation: str
     constant: float = 0.0
 
     def describe(self, variable: str) -> str:
-        """What to say of the expression, and what to write instead.
+        """The text on the expression for a message, and the remedy.
 
         Args:
-            variable: How a message calls what the expression must be smooth in.
+            variable: The name of the variable in messages.
         """
         if self.operation:
             return (
@@ -62,18 +62,18 @@ class Flaw:
 
 
 def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> Flaw | None:
-    """Finds a constant that is not finite, or an operation on a variable that is not smooth.
+    """Finds a constant that is not finite, or an operation that is not smooth.
 
     Args:
         expression: A function of the variable and of others.
-        variable: Symbols, in which it shall be smooth.
+        variable: The symbols in which it must be smooth.
         other: All other symbols, below each other.
 
     Returns:
         The first flaw; None if there is none.
     """
     function = ca.Function("f", [variable, other], [expression])
-    moving: dict[int, bool] = {}  # Whether what stands in a place of the work vector varies.
+    moving: dict[int, bool] = {}  # Whether an entry of the work vector depends on the variable.
     for i in range(function.n_instructions()):
         operation = function.instruction_id(i)
         if operation == ca.OP_OUTPUT:

@@ -175,7 +175,7 @@ def run_law(
         law(robot, goals, gains, start),
         ReferenceGenerator(reference.references, reference.degrees),
         ControlHold(7, setup.scenario.sampling),
-        setup.scenario.force.sensor(1),
+        setup.scenario.force_feedback.sensor(1),
     )
     context = diagram.CreateDefaultContext()
     plant.set_consistent_state(plant.GetMyMutableContextFromRoot(context), begin.state)

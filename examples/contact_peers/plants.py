@@ -75,7 +75,7 @@ def task(condition: Condition, friction: float, *settings: str) -> Scenario:
         [
             f"plant.friction={FRICTION}",
             f"constraints.0.friction={friction}",
-            f"force=!MeasuredForce {{sample_period: {PERIOD}, noise_deviation: {noise}}}",
+            f"force_feedback=!MeasuredForce {{sample_period: {PERIOD}, noise_deviation: {noise}}}",
             f"duration={DURATION}",
             *condition.settings,
             *settings,

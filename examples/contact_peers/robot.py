@@ -148,13 +148,13 @@ class Goals:
         rates = np.concatenate([acceleration - drift, rows[4:, 2]])
 
         along = np.array([0.0, *velocity[1:3]])
-        rubbing = self._friction * along / np.hypot(np.linalg.norm(along), SLOW)
+        frictional = self._friction * along / np.hypot(np.linalg.norm(along), SLOW)
         return Goal(
             position,
             velocity,
             acceleration,
             force,
-            force * (NORMAL - rubbing),
+            force * (NORMAL - frictional),
             self._q.copy(),
             v,
             np.linalg.solve(whole, rates),

@@ -20,7 +20,7 @@ WITHOUT = (
     "gains=!Poles {all: [-8.0]}",
     "constraint_damping=null",
     "integral=[]",
-    "force=!ModelForce {}",
+    "force_feedback=!ModelForce {}",
 )
 """What makes our law that of version 0.1, which knew no friction either."""
 

@@ -168,7 +168,7 @@ def closed_loop(condition: Condition) -> tuple[Scenario, dd.ClosedLoop]:
     settings = [*condition.settings]
     if condition.noise:
         noise = f"sample_period: 0.001, noise_deviation: {FORCE_NOISE}"
-        settings.append(f"force=!MeasuredForce {{{noise}}}")
+        settings.append(f"force_feedback=!MeasuredForce {{{noise}}}")
     completed, loop = build_completed(dd.load_scenario(file, settings))
     scenario = completed.scenario
     if condition.is_ideal:
@@ -190,7 +190,7 @@ def closed_loop(condition: Condition) -> tuple[Scenario, dd.ClosedLoop]:
         law,
         dict(scenario.references),
         dd.LoopSettings(
-            sensor=scenario.force.sensor(plant.dae.num_constraints),
+            sensor=scenario.force_feedback.sensor(plant.dae.num_constraints),
             sampling=scenario.sampling,
             observer=scenario.observer,
         ),

@@ -82,7 +82,8 @@ class BadInput:
 def bad_input(seed: int, folder: Path) -> BadInput:
     """Writes a scenario, and its robot if the mistake is there, into a folder."""
     choice = random.Random(seed)
-    kind = choice.choices((_bad_value, _bad_structure, _bad_text, _bad_robot), (5, 3, 2, 4))[0]
+    kinds = _bad_value, _bad_structure, _bad_text, _bad_robot, _bad_values
+    kind = choice.choices(kinds, (5, 3, 2, 4, 3))[0]
     return kind(choice, folder)
 
 
@@ -107,7 +108,7 @@ def attempt(seed: int, folder: Path) -> Outcome:
 
 def _is_exact(scenario: Scenario) -> bool:
     """Whether the plant is what the law's model says, so that (30) and (31) hold."""
-    return not (scenario.plant_parameters or scenario.force.is_measured)
+    return not (scenario.plant_parameters or scenario.force_feedback.is_measured)
 
 
 # One mistake each, and why what it makes may run.
@@ -124,6 +125,17 @@ def _bad_value(choice: random.Random, folder: Path) -> BadInput:
     return BadInput(
         f"{path}: {name}", _written(data, folder), _excuse_of_value(path, before, after)
     )
+
+
+def _bad_values(choice: random.Random, folder: Path) -> BadInput:
+    """Other values at two or three random places: what is wrong with one hides another."""
+    data, told = _shipped(choice), []
+    for _ in range(choice.randint(2, 3)):
+        place, key = choice.choice(list(_places(data)))
+        name = choice.choice(list(VALUES))
+        told.append(f"{_path_of(data, place, key)}: {name}")
+        place[key] = deepcopy(VALUES[name])
+    return BadInput("; ".join(told), _written(data, folder), LOST)
 
 
 def _excuse_of_value(path: str, before: Any, after: Any) -> str:

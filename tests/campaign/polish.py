@@ -18,7 +18,7 @@ from runs import run_scenario, scenario
 
 SAMPLED = (
     "sampling={period: 0.001, delay: 0.001}",
-    "force=!MeasuredForce {sample_period: 0.001}",
+    "force_feedback=!MeasuredForce {sample_period: 0.001}",
     "integral=[tool.y, tool.z, wall.force]",
 )
 DRAKE = "plant=!MultibodyPlant"

@@ -64,6 +64,7 @@ def test_the_command_prints_counts():
             "--files=5",
             "--several=2",
             "--robots=2",
+            "--measured=2",
             "--drops=1",
             "--seed=100",
         ],

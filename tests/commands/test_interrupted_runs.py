@@ -16,6 +16,8 @@ from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands.run_folder import FILES, PART
 from drake_dae.running.rollout.course import Course
+from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS
 
 SECONDS = 2.5
@@ -34,7 +36,7 @@ BARE = ("write.plots=false", "write.animation=false")
 WITHOUT_PICTURES = ("scenario.yaml", "summary.txt", "record.npz")
 
 
-def command(folder, extra):
+def command(folder, extra, flags=()):
     """In a process of its own."""
     output = os.open(folder.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT)
     for descriptor in (1, 2):
@@ -44,7 +46,7 @@ def command(folder, extra):
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
     settings = [word for setting in SETTINGS + extra for word in ("--set", setting)]
-    sys.exit(main(["simulate", "two_link_wall", "--out", str(folder), *settings]))
+    sys.exit(main(["simulate", "two_link_wall", "--out", str(folder), *flags, *settings]))
 
 
 def interrupted(moments, parent, settings=()):
@@ -141,6 +143,36 @@ def test_at_random_moments_of_run_and_plots(undisturbed, tmp_path):
     chosen = [(sent, moments.uniform(0.1, 2.2 * SECONDS)) for sent in 3 * signals]
     counts = [check(*found, undisturbed) for found in interrupted(chosen, tmp_path)]
     assert len(set(counts)) > 3
+
+
+@pytest.mark.usefixtures("signals_of_a_shell")
+@pytest.mark.slow
+@pytest.mark.filterwarnings("always")
+@pytest.mark.parametrize("compiled", ["true", "false"])
+def test_a_killed_rollout_leaves_its_record_so_far(tmp_path, compiled):
+    """Fixed steps of 10 us: seconds of machine code, and longer without."""
+    fixed = ("integrator.use_error_control=false", "integrator.max_step_size=1e-5")
+    chosen = ("duration=60", f"compiled={compiled}", *fixed, *BARE)
+    processes, folder = multiprocessing.get_context("forkserver"), tmp_path / "killed"
+    process = processes.Process(target=command, args=(folder, chosen, ["--rollout"]))
+    process.start()
+    part, limit = folder / PART, time.monotonic() + 60
+    while not (part.exists() and part.stat().st_size > 10_000):
+        assert time.monotonic() < limit
+        assert process.is_alive(), folder.with_suffix(".txt").read_text()
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL
+    assert sorted(path.name for path in folder.iterdir()) == [PART, "scenario.yaml"]
+    record = Record.load(part)
+    assert 0.0 < record.time[-1] < 60.0
+    short = scenario("two_link_wall", f"duration={record.time[-1]:.17g}", *chosen[1:])
+    loop, context = build_scenario(short)
+    whole = roll_scenario(short, loop, context).record
+    count = record.time.size - 1  # The end of a run is projected.
+    for name in whole.signals:
+        np.testing.assert_allclose(record[name][:count], whole[name][:count], 1e-9, 1e-9)
 
 
 @pytest.mark.usefixtures("signals_of_a_shell")

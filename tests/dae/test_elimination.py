@@ -1,10 +1,11 @@
 import casadi as ca
 import numpy as np
+import pytest
 from problems import PROBLEMS, Problem
 
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative, lie_derivative_along, lie_derivatives
+from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 
 
 def states(problem: Problem) -> list[np.ndarray]:
@@ -21,6 +22,7 @@ def evaluated(problem: Problem, **expressions: ca.SX) -> TracedFunction:
     return TracedFunction("values", {"x": system.state, "p": system.parameter_symbol}, expressions)
 
 
+@pytest.mark.equation(2, 13, 14, 16)
 def test_a_alpha_beta_drift_and_b_are_those_found_by_hand(problem):
     structure = find_structure(problem.system)
     elimination = structure.elimination
@@ -43,6 +45,7 @@ def test_a_alpha_beta_drift_and_b_are_those_found_by_hand(problem):
             )
 
 
+@pytest.mark.equation(3, 9, 10, 11, 12, 46, 47, 48, 49)
 def test_the_rest_follows_from_the_definitions(problem):
     """(9)-(12) with alpha and beta by hand."""
     system = problem.system
@@ -67,6 +70,15 @@ def test_the_rest_follows_from_the_definitions(problem):
             np.testing.assert_allclose(one.reshape(shape), two, rtol=1e-11, atol=1e-12)
 
 
+def lie_derivatives(expression, field, state, order):
+    """[k, L_f k, ..., L_f^order k]."""
+    chain = [expression]
+    for _ in range(order):
+        chain.append(lie_derivative(chain[-1], field, state))
+    return chain
+
+
+@pytest.mark.equation(17, 18, 19)
 def test_equations_17_to_19(problem):
     """L_f*^k k_i = L_f^k k_i below r_i, L_f*^k k_i = 0 from r_i on, L_h* L_f*^k k_i = 0 always."""
     structure = find_structure(problem.system)
@@ -96,6 +108,7 @@ def test_equations_17_to_19(problem):
             np.testing.assert_allclose(value, 0.0, atol=1e-11)
 
 
+@pytest.mark.equation(25)
 def test_constraint_inputs_keep_the_constraint(problem):
     """With v = alpha + beta u the r_i-th derivatives of the constraints vanish for every u (25)."""
     structure = find_structure(problem.system)

@@ -8,7 +8,7 @@ from drake_dae import analyze
 from drake_dae.analysis.findings import Finding
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, ModelError, NegligibleWarning
@@ -127,7 +127,7 @@ def test_an_escape_within_a_finite_time_is_no_jump_of_the_reference(name):
         return np.array([np.sin(t), np.cos(t)])
 
     motion = dynamics.motion(reference, np.linspace(0.0, 5.0, 21))
-    assert motion.ending.cause is Cause.UNBOUNDED
+    assert motion.ending.cause is EndCause.UNBOUNDED
     assert motion.ending.time == pytest.approx(when, rel=1e-5)
     assert "grow without bound" in str(motion.ending)
     assert dynamics.stability_along(reference, motion).verdict is Verdict.UNSTABLE
@@ -140,5 +140,5 @@ def test_an_escape_within_a_finite_time_is_no_jump_of_the_reference(name):
 def test_a_jump_and_the_end_of_the_domain_are_no_escape(rate, start, jump):
     dynamics = ZeroDynamics(beside(rate, start))
     motion = dynamics.motion(lambda t: np.array([float(t > jump), 0.0]), np.linspace(0.0, 5.0, 21))
-    assert motion.ending.cause is Cause.NO_WAY_ON
+    assert motion.ending.cause is EndCause.NO_WAY_ON
     assert motion.ending.time == pytest.approx(1.0, abs=1e-3)

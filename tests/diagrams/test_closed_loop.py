@@ -69,6 +69,7 @@ def test_a_system_that_needs_more_than_the_time_is_told_where_it_goes():
     ("scenario", "position", "force", "residual"),
     [("two_link_wall", 1e-12, 1e-11, 1e-12), ("seven_joint_wall", 1e-9, 1e-8, 1e-12)],
 )
+@pytest.mark.equation(62, 63)
 def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
     """Both poles at -4: e(t) = (e(0) + (e'(0) + 4 e(0)) t) exp(-4 t).
 
@@ -130,6 +131,7 @@ def test_error_with_full_matrices_is_the_matrix_exponential():
 
 
 @pytest.mark.parametrize("name", ARMS)
+@pytest.mark.equation(1, 37, 54, 55, 56, 57)
 def test_dynamics_are_those_of_multibody_plant(name):
     """The index-1 form [[M, -J'], [J, 0]] (v', lambda) = (B u - H, -Jdot v), solved densely."""
     found, random = arm(name), np.random.default_rng(2)
@@ -156,6 +158,7 @@ def test_dynamics_are_those_of_multibody_plant(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
+@pytest.mark.equation(59)
 def test_law_is_the_explicit_law_59(name):
     """(59) with Gbar = 0, from MultibodyPlant's M, H, J, P and Q = [J; P]^-1 [0; 1].
 

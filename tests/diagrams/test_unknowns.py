@@ -7,7 +7,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
-from drake_dae import Push, build_scenario, rollout, start_values
+from drake_dae import DisturbanceForce, build_scenario, rollout, start_values
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.model import scenario_model
 
@@ -59,7 +59,7 @@ def test_push_leaves_the_error_of_statics(plant):
 
     It is smooth over 10 ms, and 0.5 s later the poles at -25 1/s have left 5e-5 of it.
     """
-    push = "plant_pushes=[{frame: tool, force: [0, 0, 5], start_time: 0.1}]"
+    push = "plant_disturbances=[{frame: tool, force: [0, 0, 5], start_time: 0.1}]"
     _, _, record = run_scenario(two_link(push, *plant))
     expected = left_behind([0.0, 5.0])
     assert 1e-3 < expected < 2e-2
@@ -117,19 +117,22 @@ def test_surface_may_be_tilted():
 
 
 def test_push_grows_and_fades_smoothly():
-    push = Push("tool", (0.0, 0.0, 10.0), 1.0, 2.0, 0.2)
+    push = DisturbanceForce("tool", (0.0, 0.0, 10.0), 1.0, 2.0, 0.2)
     rows = push.reference.derivatives([0, 0, 0])
     for time, share in ((0.0, 0.0), (1.05, 3 / 16 - 2 / 64), (1.1, 0.5), (1.5, 1.0), (2.1, 0.5)):
         assert_allclose(rows(time), [0.0, 0.0, 10.0 * share], atol=1e-12)
     assert rows(9.0)[2] == 0.0
-    assert Push("tool", (1.0, 0.0, 0.0)).reference.derivatives([0, 0, 0])(1e6)[0] == 1.0
+    assert DisturbanceForce("tool", (1.0, 0.0, 0.0)).reference.derivatives([0, 0, 0])(1e6)[0] == 1.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ("plant_pushes=[{frame: tol, force: [0, 0, 1]}]", "plant_pushes.0: no frame 'tol'.*'tool'"),
+        (
+            "plant_disturbances=[{frame: tol, force: [0, 0, 1]}]",
+            "plant_disturbances.0: no frame 'tol'.*'tool'",
+        ),
         (
             "plant_payloads=[{frame: tol, mass: 1}]",
             "plant_payloads.0: no frame 'tol'.*'tool'",
@@ -143,7 +146,10 @@ def test_push_grows_and_fades_smoothly():
             "plant_payloads=[{frame: world, mass: 1}]",
             "plant_payloads.0: 'world' is a frame of the world",
         ),
-        ("plant_pushes=[{frame: world, force: [0, 0, 1]}]", "plant_pushes.0: a push on the world"),
+        (
+            "plant_disturbances=[{frame: world, force: [0, 0, 1]}]",
+            "plant_disturbances.0: a disturbance on the world",
+        ),
         ("plant_parameters={wall.rpy: [0, 0, 0]}", "no parameter 'wall.rpy'"),
         ("sampling={period: 0.001}", r"sampling: the plant steps by 0\.001 s .* got 0 s"),
     ],
@@ -158,7 +164,7 @@ def test_what_is_not_there_is_refused(settings, message):
     "unknown",
     [
         "plant_payloads=[{frame: tool, mass: 0.5}]",
-        "plant_pushes=[{frame: tool, force: [0, 0, 10], start_time: 0.05, end_time: 0.15}]",
+        "plant_disturbances=[{frame: tool, force: [0, 0, 10], start_time: 0.05, end_time: 0.15}]",
     ],
 )
 def test_rollouts_have_what_the_law_does_not_know(unknown):
@@ -172,4 +178,4 @@ def test_rollouts_have_what_the_law_does_not_know(unknown):
 
 def test_push_that_ends_before_it_begins_is_refused():
     with pytest.raises(ModelError, match="must end after it begins"):
-        Push("tool", (1.0, 0.0, 0.0), 2.0, 1.0)
+        DisturbanceForce("tool", (1.0, 0.0, 0.0), 2.0, 1.0)

@@ -99,14 +99,16 @@ def test_a_scenario_with_another_mass_in_the_plant():
     """Feedback shrinks the force error to 1 / (1 + 4) of what it is without, within 5 %."""
     quiet = (
         "duration=2",
-        "force.noise_deviation=[0]",
-        "force.time_constant=0.002",
+        "force_feedback.noise_deviation=[0]",
+        "force_feedback.time_constant=0.002",
         "references.wall.force.frequencies=[0.5]",
     )
     loop, _, record = run_scenario(scenario("two_link_measured_force", *quiet))
     plant = loop.plant.GetMyContextFromRoot(loop.diagram.CreateDefaultContext())
     assert loop.plant.get_parameter(plant, "link2.mass") == pytest.approx([6.0])
-    *_, without = run_scenario(scenario("two_link_measured_force", *quiet, "force=!ModelForce {}"))
+    *_, without = run_scenario(
+        scenario("two_link_measured_force", *quiet, "force_feedback=!ModelForce {}")
+    )
     errors = [np.max(np.abs(r["tracking_error"][r.time > 0.5, 1])) for r in (record, without)]
     assert errors[1] > 1.0
     assert errors[0] / errors[1] == pytest.approx(0.2, rel=0.05)
@@ -137,13 +139,21 @@ def test_scenarios_of_actuation_follow_their_prediction(name):
         ("two_link_wall", "actuation=[!FlexibleJoints {stiffness: [8e3]}]", "no rotor inertia"),
         ("two_link_motors", "actuation.0.torque_constant=[0]", "must not be zero"),
         ("two_link_motors", "actuation=[!Motor {}]", "expected one of !FlexibleJoints, !DcMotors"),
-        ("two_link_wall", "force=!MeasuredForce {gain: 1}", "time_constant or a sample_period"),
         (
             "two_link_wall",
-            "force=!MeasuredForce {sample_period: 0.01, gain: 2}",
-            r"force: the sampled force loop diverges",
+            "force_feedback=!MeasuredForce {gain: 1}",
+            "time_constant or a sample_period",
         ),
-        ("two_link_wall", "force=!MeasuredForce {time_constant: 0.01, gain: -1}", "semidefinite"),
+        (
+            "two_link_wall",
+            "force_feedback=!MeasuredForce {sample_period: 0.01, gain: 2}",
+            r"force_feedback: the sampled force loop diverges",
+        ),
+        (
+            "two_link_wall",
+            "force_feedback=!MeasuredForce {time_constant: 0.01, gain: -1}",
+            "semidefinite",
+        ),
         ("two_link_wall", "plant_parameters={link3.mass: [1]}", "no parameter 'link3.mass'"),
         ("two_link_wall", "start.errors={wall.force: 1}", "has degree 0"),
     ],
@@ -176,9 +186,13 @@ def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
 
 
 def test_a_gain_without_effect_is_refused():
-    with pytest.raises(ScenarioError, match=r"force or gains: .*degree 2 and takes the measured"):
+    with pytest.raises(
+        ScenarioError, match=r"force_feedback or gains: .*degree 2 and takes the measured"
+    ):
         build_scenario(
-            scenario("two_link_flexible", "force=!MeasuredForce {time_constant: 0.01, gain: 2}")
+            scenario(
+                "two_link_flexible", "force_feedback=!MeasuredForce {time_constant: 0.01, gain: 2}"
+            )
         )
 
 

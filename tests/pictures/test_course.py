@@ -29,10 +29,10 @@ def test_a_path_around_a_sphere_is_seen_from_a_side(turns):
     states = np.hstack([places, np.zeros_like(places)])
     parameters = np.tile(model.dae.parameter_values, (len(places), 1))
     acting = ConstraintWrenches(model, model.dae.parameter_values)
-    loads = [acting(x, np.array([10.0]), p) for x, p in zip(states, parameters, strict=True)]
+    wrenches = [acting(x, np.array([10.0]), p) for x, p in zip(states, parameters, strict=True)]
     times, nothing = np.arange(len(places)) * 0.1, np.zeros((0, 6))
     flashes = np.zeros((len(places), 1))
-    course = Course(None, model, times, 0.0, states, parameters, loads, nothing, acting, flashes)
+    course = Course(None, model, times, 0.0, states, parameters, wrenches, nothing, acting, flashes)
     (path,) = contact_paths(course)
     assert path.name == "ball"
     assert path.desired.shape == (0, 2)

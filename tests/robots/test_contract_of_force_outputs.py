@@ -75,6 +75,7 @@ def test_rows_are_functions_of_positions_alone(output):
     assert not ca.depends_on(S, robot().links.v)
 
 
+@pytest.mark.equation(40)
 def test_rows_of_names_and_combinations_are_their_weights():
     q = np.zeros(robot().links.q.numel())
     expected = np.zeros((1, bound().size))

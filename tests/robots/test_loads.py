@@ -37,7 +37,7 @@ def pushed(exogenous=(), frame="tool", actuation=()):
         [1.2, -1.6],
         actuation=actuation,
         exogenous=exogenous,
-        loads=[load],
+        known_forces=[load],
     )
 
 
@@ -45,7 +45,11 @@ def test_a_force_acts_as_drake_applies_it():
     """v' of a free arm with the same force as an ExternallyAppliedSpatialForce: round-off."""
     known = arm("two_link").model
     model = RobotModel.from_multibody(
-        parse("two_link_arm"), [], known.positions[:0], [1.2, -1.6], loads=pushed().loads
+        parse("two_link_arm"),
+        [],
+        known.positions[:0],
+        [1.2, -1.6],
+        known_forces=pushed().known_forces,
     )
     plant, drake = RobotPlant(model), parse("two_link_arm")
     force, state = np.array([3.0, -2.0, 7.0]), np.array([0.3, -1.1, 0.4, 0.7])
@@ -99,14 +103,14 @@ def test_a_law_that_knows_a_push_is_not_moved_by_it(actuation):
 def test_frames_that_are_not_there_are_named():
     with pytest.raises(ModelError, match="no frame 'tol'; did you mean 'tool'"):
         pushed(frame="tol")
-    settings = ["loads=[{frame: tol}]"]
-    with pytest.raises(ScenarioError, match=r"loads.0: no frame 'tol'; did you mean 'tool'"):
+    settings = ["known_forces=[{frame: tol}]"]
+    with pytest.raises(ScenarioError, match=r"known_forces.0: no frame 'tol'; did you mean 'tool'"):
         build_scenario(load_scenario(find_scenario("two_link_wall"), settings))
 
 
 def test_a_scenario_has_loads():
     settings = [
-        "loads=[{frame: tool, name: push}]",
+        "known_forces=[{frame: tool, name: push}]",
         "plant_parameters={push.force: [0.0, 0.0, -5.0]}",
     ]
     loop, context = build_scenario(load_scenario(find_scenario("two_link_wall"), settings))

@@ -47,6 +47,7 @@ def textbook(outputs=None, constraints=(WALL,), **changes):
     return RobotModel(textbook_links(**changes), constraints, outputs, [1.2, -1.6])
 
 
+@pytest.mark.equation(43, 44, 45)
 def test_textbook_arm_is_the_urdf_arm():
     """f, g, h, k, l of (43)-(45) from two sources; round-off of about 30 operations each."""
     ours, theirs = textbook().dae, arm("two_link").model.dae

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from arms import arm, consistent_states, fixed_step, numbers, parse
-from members import RubbingPoint, Saddle, TorqueLag
+from members import FrictionalPoint, Saddle, TorqueLag
 
 from drake_dae import (
     AxisCoordinates,
@@ -119,9 +119,9 @@ def test_an_arm_on_a_rod_tracks_motion_and_thrust():
 # A reaction of its own: friction.
 
 
-def rubbing(friction=0.3, speed=0.05):
+def frictional(friction=0.3, speed=0.05):
     wall = Plane((1.2, 0.0, 0.0), (-1.0, 0.0, 0.0))
-    contact = RubbingPoint("tool", wall, name="wall", coefficient=friction, speed=speed)
+    contact = FrictionalPoint("tool", wall, name="wall", coefficient=friction, speed=speed)
     outputs = [PointCoordinates("tool", "z")]
     return RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
 
@@ -129,7 +129,7 @@ def rubbing(friction=0.3, speed=0.05):
 def test_a_block_that_slides_is_braked_by_its_weight():
     """g(x) = (0, 0, -mu s, 1) / m with s = 0.3 / 0.5, and x'' = g (sin a - mu s cos a)."""
     slope, mass = 0.5, 2.0
-    floor = RubbingPoint("bob", Plane((0, 0, 0), (0, 0, 1)), coefficient=0.25, speed=0.4)
+    floor = FrictionalPoint("bob", Plane((0, 0, 0), (0, 0, 1)), coefficient=0.25, speed=0.4)
     model = RobotModel(particle(mass, slope), [floor], [JointPositions(["q0"])], [0.0, 0.0])
     x = np.array([0.7, 0.0, 0.3, 0.0])
     explicit = model.dae.explicit
@@ -151,7 +151,7 @@ def test_a_block_that_slides_is_braked_by_its_weight():
 def test_friction_enters_as_the_reaction_says():
     """g = M^-1 (J_n - mu s J_t)^T, with M and the Jacobians of MultibodyPlant."""
     friction, speed = 0.3, 0.05
-    explicit = rubbing(friction, speed).dae.explicit
+    explicit = frictional(friction, speed).dae.explicit
     function = TracedFunction(
         "g", {"x": explicit.state, "p": explicit.parameter_symbol}, {"g": explicit.g}
     )
@@ -168,7 +168,7 @@ def test_friction_enters_as_the_reaction_says():
 
 def test_a_law_that_knows_the_friction_cancels_it():
     """Errors as without friction; the controls are not those without it."""
-    model = rubbing()
+    model = frictional()
     structure = find_structure(model.dae)
     assert structure.constraint_degrees == (2,)
     assert structure.output_degrees == (2, 0)

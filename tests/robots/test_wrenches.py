@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from arms import arm, parse
 from grippers import gripper, parsed
-from members import RubbingPoint
+from members import FrictionalPoint
 from numpy.testing import assert_allclose
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
@@ -87,7 +87,7 @@ def wall():
 
 
 def rubbing_arm():
-    contact = RubbingPoint("tool", wall().surface, name="wall", coefficient=0.3, speed=0.05)
+    contact = FrictionalPoint("tool", wall().surface, name="wall", coefficient=0.3, speed=0.05)
     plant = parse("two_link_arm")
     outputs = [PointCoordinates("tool", "z")]
     return RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])

@@ -51,7 +51,7 @@ def test_what_is_left_out_is_advised_and_told():
     assert run.constraint_damping.all == [pytest.approx(-wanted.constraint_damping, rel=1e-2)]
     assert run.observer.rate == pytest.approx(wanted.observer_rate, rel=1e-2)
     assert run.observer.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
-    assert run.force == parts.MeasuredForce(sample_period=1e-3)
+    assert run.force_feedback == parts.MeasuredForce(sample_period=1e-3)
     assert loop.observer is not None
     assert loop.observer.friction_signals[0].name == "wall.friction"
 
@@ -82,7 +82,7 @@ def test_run_tells_its_advice_and_what_it_identified(tmp_path, capsys):
     told = (out / "summary.txt").read_text()
     assert "advised for a contact of 1e+05 N/m" in told
     assert "identified           wall.friction = " in told
-    assert load_scenario(out / "scenario.yaml").observer.friction == ["wall"]
+    assert load_scenario(out / "scenario.yaml").observer.identify_friction == ["wall"]
 
 
 def test_what_is_said_stays():
@@ -152,8 +152,11 @@ def parameters(loop, wall):
     ("settings", "message"),
     [
         (["observer={rate: -1}"], "rate must be positive"),
-        (["observer={rate: 5, friction: [wal]}"], "'wal' is no constraint with friction"),
-        (["observer={rate: 5, friction: [wall]}"], "give it friction: 0.0"),
+        (
+            ["observer={rate: 5, identify_friction: [wal]}"],
+            "'wal' is not a constraint with friction",
+        ),
+        (["observer={rate: 5, identify_friction: [wall]}"], "give it friction: 0.0"),
         (["observer={rate: 5}", "gains={all: [-9]}"], "needs the measured force"),
         (
             ["observer={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],

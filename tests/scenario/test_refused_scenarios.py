@@ -256,9 +256,18 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         (f"{SPRINGS} [[1, 2], [3, 9]]}}]", ["actuation.0: ", "stiffness must be symmetric"]),
         (f"{SPRINGS} [[1, 2], [2, 1]]}}]", ["actuation.0: ", "positive definite", "-1"]),
         (f"{SPRINGS} [[1, 0, 0], [0, 1, 0]]}}]", ["actuation.0: ", "(2,) or (2, 2)"]),
-        ("force=!ModelForce", ["force: ", "!ModelForce must be followed by keys, or by {}"]),
-        ("force={gain: 1}", ["force: !ModelForce has no key 'gain'; keys: none", "!MeasuredForce"]),
-        ("force=!MeasuredForce {time_constant: 1, seed: -1}", ["force: seed: ", "got -1"]),
+        (
+            "force_feedback=!ModelForce",
+            ["force_feedback: ", "!ModelForce must be followed by keys, or by {}"],
+        ),
+        (
+            "force_feedback={gain: 1}",
+            ["force_feedback: !ModelForce has no key 'gain'; keys: none", "!MeasuredForce"],
+        ),
+        (
+            "force_feedback=!MeasuredForce {time_constant: 1, seed: -1}",
+            ["force_feedback: seed: ", "got -1"],
+        ),
         ("plant_parameters={link9.mass: [1]}", ["plant_parameters: ", "link9.mass", "link2.mass"]),
         # The start.
         ("start.positions.joint9=1", ["start.positions: ", "'joint9'", "there are joint1, joint2"]),

@@ -114,7 +114,7 @@ def test_every_form_reads_back_equal(tmp_path):
             DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
             ElectrohydraulicServos(1e6, np.diag([1e-6, 2e-6]), np.eye(2)),
         ],
-        force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0], gain=np.eye(2)),
+        force_feedback=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0], gain=np.eye(2)),
         gains=forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
         references={
             "a": ConstantReference([1.0]),
@@ -136,9 +136,9 @@ def test_every_form_reads_back_equal(tmp_path):
     assert copy.forces == scenario.forces
     assert copy.references == scenario.references
     assert copy.gains == scenario.gains
-    assert copy.force.sensor(2).sample_period == 0.001
+    assert copy.force_feedback.sensor(2).sample_period == 0.001
     pairs = list(zip(copy.actuation, scenario.actuation, strict=True))
-    for one, other in [*pairs, (copy.force, scenario.force)]:
+    for one, other in [*pairs, (copy.force_feedback, scenario.force_feedback)]:
         assert type(one) is type(other)
         for item in fields(one):
             np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
@@ -429,6 +429,6 @@ def test_stages(form, stage):
     ],
 )
 def test_force_gain(gain, matrix):
-    force = f"force=!MeasuredForce {{time_constant: 0.01, gain: {gain}}}"
+    force = f"force_feedback=!MeasuredForce {{time_constant: 0.01, gain: {gain}}}"
     loop, _ = build_scenario(load_scenario(find_scenario("five_bar"), [force]))
     np.testing.assert_array_equal(loop.controller.law.measured_force.gain, matrix)

@@ -1,11 +1,13 @@
 """Tasks in scenario files: the shipped one, its pictures, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from runs import run_scenario, scenario
 
-from drake_dae import Record, build_scenario, load_scenario, simulate, start_meshcat
+from drake_dae import Record, build_scenario, load_scenario, shipped_model, simulate, start_meshcat
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
@@ -148,10 +150,10 @@ def test_a_task_that_begins_in_contact_starts_on_it(file):
 
 
 def test_a_task_has_the_noise_of_its_seed(file):
-    noisy = "force=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
+    noisy = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
     found = []
     for seed in (1, 2, 1):
-        loop, context = build_scenario(load_scenario(file, [noisy, f"force.seed={seed}"]))
+        loop, context = build_scenario(load_scenario(file, [noisy, f"force_feedback.seed={seed}"]))
         own = loop.noise.GetMyContextFromRoot(context)
         found.append(loop.noise.get_output_port().Eval(own).item())
     assert found[0] == found[2] != found[1]
@@ -187,3 +189,18 @@ def test_a_summary_tells_that_a_task_stops_its_run(file, tmp_path, capsys):
     assert "\nThe task stops the run there, 0.9 s early.\n" in told
     assert main(["simulate", str(file), *words, "--set", "duration=0.05"]) == 0
     assert "early" not in capsys.readouterr().out
+
+
+def test_a_task_does_not_start_outside_of_limits(tmp_path):
+    """A joint stands at 0 where nothing is said of it."""
+    urdf = Path(shipped_model("two_link_arm.urdf")).read_text()
+    limits = 'lower="-3.1416" upper="3.1416"'
+    assert limits in urdf
+    (tmp_path / "bent.urdf").write_text(urdf.replace(limits, 'lower="0.5" upper="3.1416"'))
+    words = SHORT.replace("package://drake_dae_models/two_link_arm.urdf", "bent.urdf")
+    file = tmp_path / "bent.yaml"
+    file.write_text(words)
+    build_scenario(load_scenario(file))
+    file.write_text(words.replace("joint1: 1.1653, ", ""))
+    with pytest.raises(ScenarioError, match=r"start: .*cannot start outside.*joint1 = 0 rad"):
+        build_scenario(load_scenario(file))

@@ -10,6 +10,7 @@ from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.arrays import show_state
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
 
@@ -66,6 +67,42 @@ def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings,
     # Far before numbers end: what is told can be read.
     assert np.isfinite(caught.value.state).all()
     assert caught.value.time < 1.0
+
+
+FIXED = (
+    "integrator.use_error_control=false",
+    "integrator.integration_scheme=runge_kutta3",
+    "integrator.max_step_size=1e-4",
+)
+
+
+@pytest.mark.parametrize("fixed", [(), FIXED])
+@pytest.mark.parametrize("compiled", ["true", "false"])
+def test_rollouts_diverge_as_simulations_do(fixed, compiled):
+    settings = ("gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001), *fixed)
+    case = scenario("two_link_wall", *settings, f"compiled={compiled}")
+    loop, context = build_scenario(case)
+    found = roll_scenario(case, loop, context)
+    assert found.failure is not None
+    assert "the run diverges: at t" in str(found.failure)
+    assert "the error of wall.force" in str(found.failure)
+    # What was recorded is kept, up to where it says so.
+    assert found.record.time[-1] == found.failure.time < 0.1
+    assert found.record.time.size > 1
+    errors = np.abs(found.record["tracking_error"][:, -1])
+    assert errors[-1] > 1e3 * 20.0
+    if fixed:  # Under error control what may diverge takes shorter and shorter steps.
+        may = scenario("two_link_wall", *settings, f"compiled={compiled}", "may_diverge=true")
+        later = roll_scenario(may, *build_scenario(may)).failure  # Numbers end.
+        assert "the run diverges" not in str(later)
+        assert later.time > found.failure.time
+
+
+@pytest.mark.slow
+def test_tasks_diverge_by_their_own_outputs():
+    with pytest.raises(SimulationError, match=r"the error of wall.force .* has grown") as caught:
+        run("wall_polish", "gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004))
+    assert 3.0 < caught.value.time < 4.0
 
 
 @pytest.mark.slow

@@ -75,10 +75,12 @@ def test_seeds_of_the_sensor():
     base = scenario_data(scenario("two_link_measured_force", "duration=0.05", "compiled=false"))
     runner = Runner(base)
     seeds = [1, 2, 1]
-    found = list(runner.run_all([(i, {"force.seed": seed}) for i, seed in enumerate(seeds)]))
+    found = list(
+        runner.run_all([(i, {"force_feedback.seed": seed}) for i, seed in enumerate(seeds)])
+    )
     assert runner.builds == 1
     for seed, result in zip(seeds, found, strict=True):
-        check(base, {"force.seed": seed}, result)
+        check(base, {"force_feedback.seed": seed}, result)
     assert found[0].figures == found[2].figures != found[1].figures
 
 

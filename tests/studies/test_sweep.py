@@ -237,8 +237,8 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
             "duration: expected a number, got nan",
         ),
         (
-            [{"force.seed": 0.0}, {"force.seed": 1}],
-            "force: !ModelForce has no key 'seed'",
+            [{"force_feedback.seed": 0.0}, {"force_feedback.seed": 1}],
+            "force_feedback: !ModelForce has no key 'seed'",
         ),
         ([{"duration": -1.0}], "duration: a duration must be positive, got -1.0"),
         ([{"outputs.3.axes": "z"}], "outputs: no entry '3'; entries: 0"),

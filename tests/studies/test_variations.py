@@ -84,7 +84,7 @@ def parsed(*texts, count=None, seed=0, together=False):
         ("duration=1..2:3", [1, 1.5, 2]),
         ("duration=[1, 2.5]", [1, 2.5]),
         ("duration=1.5", [1.5]),
-        ("force.seed=1..3:3", [1, 2, 3]),
+        ("force_feedback.seed=1..3:3", [1, 2, 3]),
         ("start.errors.tool.z=-1e-2..1e-2:2", [-0.01, 0.01]),
         ("gains.all=[[-4], [-8]]", [[-4], [-8]]),
         ("gains=[!Poles {all: [-4]}]", [{"_tag": "!Poles", "all": [-4]}]),
@@ -96,20 +96,22 @@ def test_values_of_an_option(text, values):
 
 
 def test_options_make_a_grid_or_go_together():
-    options = ("duration=[1, 2]", "force.seed=5..6:2")
+    options = ("duration=[1, 2]", "force_feedback.seed=5..6:2")
     assert len(parsed(*options)) == 4
     assert parsed(*options, together=True) == [
-        {"duration": 1, "force.seed": 5},
-        {"duration": 2, "force.seed": 6},
+        {"duration": 1, "force_feedback.seed": 5},
+        {"duration": 2, "force_feedback.seed": 6},
     ]
 
 
 def test_a_random_range_is_whole_where_the_key_is():
-    found = parsed("force.seed=1..9", "duration=1..9", "start.errors.tool.z=[0, 1]", count=30)
-    assert {type(v["force.seed"]) for v in found} == {int}
+    found = parsed(
+        "force_feedback.seed=1..9", "duration=1..9", "start.errors.tool.z=[0, 1]", count=30
+    )
+    assert {type(v["force_feedback.seed"]) for v in found} == {int}
     assert {type(v["duration"]) for v in found} == {float}
     assert {v["start.errors.tool.z"] for v in found} == {0, 1}
-    assert max(v["force.seed"] for v in found) <= 9
+    assert max(v["force_feedback.seed"] for v in found) <= 9
 
 
 def test_ranges_within_a_value_are_drawn_each_on_its_own():
@@ -139,10 +141,18 @@ def test_ranges_within_a_value_are_drawn_each_on_its_own():
         (["start.errors=[{tool.z: 2..1}]"], {"count": 3}, "2..1 is an empty range"),
         (["duration=[1"], {}, "duration: line 1"),
         (["duration=1", "duration=2"], {}, "duration: the key varies twice"),
-        (["duration=[1, 2]", "force.seed=1"], {"together": True}, "duration has 2, force.seed has"),
+        (
+            ["duration=[1, 2]", "force_feedback.seed=1"],
+            {"together": True},
+            "duration has 2, force_feedback.seed has",
+        ),
         (["duration=1..2"], {"count": 0}, "count must be a whole number from 1, got 0"),
         (["duration=1..2"], {"count": 1, "seed": -1}, "seed must be a whole number from 0, got -1"),
-        (["duration=1..2:900000", "force.seed=1..9:9"], {}, "at most 1000000 runs, got 8100000"),
+        (
+            ["duration=1..2:900000", "force_feedback.seed=1..9:9"],
+            {},
+            "at most 1000000 runs, got 8100000",
+        ),
         (["duration=1..2:900000000"], {}, "at most 1000000 runs"),
     ],
 )

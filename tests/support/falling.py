@@ -76,7 +76,7 @@ class StickingCorner(Constraint):
     """A corner of the box stays on the floor and does not slide: z = 0, x' = 0."""
 
     name: str
-    can_only_push: ClassVar = (True, False)
+    is_unilateral: ClassVar = (True, False)
 
     @property
     def force_signals(self):

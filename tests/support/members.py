@@ -19,7 +19,7 @@ from drake_dae.robots.surfaces.surface import Surface
 
 
 @dataclass(frozen=True)
-class RubbingPoint(PointOnSurface):
+class FrictionalPoint(PointOnSurface):
     """A point on a surface with friction whose numbers are no parameters."""
 
     coefficient: float = 0.3
@@ -34,14 +34,14 @@ class RubbingPoint(PointOnSurface):
         return across / ca.sqrt(ca.sumsqr(across) + self.speed**2)
 
     def reaction(self, kinematics, constraint_force):
-        rubbing = -self.coefficient * constraint_force * self._sliding(kinematics)
+        frictional = -self.coefficient * constraint_force * self._sliding(kinematics)
         pushed = super().reaction(kinematics, constraint_force)
-        return pushed + kinematics.push(self.frame, rubbing, self.point)
+        return pushed + kinematics.push(self.frame, frictional, self.point)
 
     def applications(self, kinematics):
         (own,) = super().applications(kinematics)
-        rubbing = -self.coefficient * self._sliding(kinematics)
-        return (Application(own.point, own.force_axes + rubbing, own.moment_axes, self.frame),)
+        frictional = -self.coefficient * self._sliding(kinematics)
+        return (Application(own.point, own.force_axes + frictional, own.moment_axes, self.frame),)
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def polisher() -> RobotModel:
         known.positions,
         [1.2, -1.6],
         "two_link",
-        loads=[KnownForce("tool", name="push")],
+        known_forces=[KnownForce("tool", name="push")],
     )
 
 

@@ -82,8 +82,8 @@ def moved_by(x, mode):
     holds = np.vstack([ACROSS[i], ALONG[i]]) if way == 0 else ACROSS[[i]]
     push = holds.T if way == 0 else (ACROSS[i] - FRICTION * way * ALONG[i])[:, None]
     force = np.linalg.solve(holds @ INVERSE @ push, -holds @ INVERSE @ free)
-    rubbing = force[1] if way == 0 else -FRICTION * way * force[0]
-    return INVERSE @ (free + push @ force), (force[0], rubbing)
+    frictional = force[1] if way == 0 else -FRICTION * way * force[0]
+    return INVERSE @ (free + push @ force), (force[0], frictional)
 
 
 def struck(v, touching):
@@ -125,8 +125,8 @@ def chosen(x, touching):
         slides = ALONG[i] @ x[3:]
         ways = (0, 1, -1) if abs(slides) < 1e-9 else (int(np.sign(slides)),)
         for way in ways:
-            rate, (normal, rubbing) = moved_by(x, (i, way))
-            holds = abs(rubbing) <= FRICTION * normal * (1.0 + 1e-9)
+            rate, (normal, frictional) = moved_by(x, (i, way))
+            holds = abs(frictional) <= FRICTION * normal * (1.0 + 1e-9)
             starts = way == 0 or abs(slides) > 1e-9 or way * (ALONG[i] @ rate) >= 0.0
             if normal > 1e-9 and holds and starts:
                 return i, way
@@ -152,8 +152,8 @@ def by_hand(end):
                 return [*open_, 1.0, 1.0]
             i, way = mode
             open_[i] = 1.0
-            normal, rubbing = moved_by(x, mode)[1]
-            edge = FRICTION * normal - abs(rubbing) if way == 0 else way * (ALONG[i] @ x[3:])
+            normal, frictional = moved_by(x, mode)[1]
+            edge = FRICTION * normal - abs(frictional) if way == 0 else way * (ALONG[i] @ x[3:])
             return [*open_, normal, edge if t > began + 1e-9 else 1.0]
 
         events = []

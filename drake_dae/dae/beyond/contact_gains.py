@@ -1,4 +1,4 @@
-"""Gains for a contact that gives way: one advice for all numbers of a law."""
+"""Recommended gains of a law for compliant contact."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from drake_dae.dae.tracking.constraint_damping import best_damping, unstable_fro
 from drake_dae.errors import ModelError
 
 _PHASE = 0.15
-"""The phase in rad that a law may lose by sampling and delay where it crosses over."""
+"""The allowed loss of phase by sampling and delay at the crossover frequency, in rad."""
 
 _JITTER = 0.04
-"""The deviation of acceleration in rad/s^2 that noise of velocities may make, sample by sample:
-0.04 N m at a body of 1 kg m^2."""
+"""The allowed standard deviation of accelerations from velocity noise, from sample to sample, in
+rad/s^2: 0.04 N m for a body of 1 kg m^2."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class ContactGains:
-    """The numbers of a law that presses and moves on a contact that gives way, in 1/s.
+    """The gains of a law for motion and force on a compliant contact, in 1/s.
 
     Attributes:
         position_rate: p, the distance of the poles of position outputs from 0.
@@ -26,7 +26,7 @@ class ContactGains:
         constraint_damping: The poles of the constraint's rate; 0 for none.
         observer_rate: k_o of the `DisturbanceObserver`.
         observer_force_rate: Its k_n, in the directions of the constraint's reaction.
-        friction_rate: At which that identifies friction.
+        friction_rate: The rate at which the observer identifies friction.
     """
 
     position_rate: float
@@ -54,49 +54,48 @@ def contact_gains(
     delay: int = 1,
     velocity_noise: float = 1e-3,
 ) -> ContactGains:
-    """The gains of a law with integrals, damping and observer, for a contact of some stiffness.
+    """The gains of a law with integrals, damping and observer for a contact of given stiffness.
 
-    One rate w stands for all. Positions have Butterworth's poles at the distance p = 1.5 w, so that
-    3 w is the gain of the velocity where they are integrated: a triple pole at -w has that too, but
-    slow errors of a model are left as their rate / p^3, 3.4 times less, and a swing of the complex
-    pair is damped by 1/2.
+    All gains follow from one rate w. Positions have Butterworth's poles at the distance p = 1.5 w,
+    so that 3 w is the gain of the velocity where they are integrated: a triple pole at -w has the
+    same gain, but here slow model errors leave rate / p^3, which is 3.4 times less, and the complex
+    pair has a damping ratio of 1/2.
 
-    w is the smaller of two. What is late by tau = (delay + 1/2) sample_time loses the
-    phase 3 w tau where the loop crosses over, of which 0.15 rad are allowed. And noise n of the
-    velocities, independent from sample to sample, makes accelerations jump: by 3 w n_k of the law,
-    and k_o n_(k-1) of the observer, one sample later, so together from sample to sample by
+    w is the smaller of two. First, a delay tau = (delay + 1/2) sample_time costs the phase 3 w tau
+    at the crossover frequency, of which 0.15 rad are allowed. Second, white velocity noise n makes
+    the acceleration jump by 3 w n_k through the law, and by k_o n_(k-1) through the observer, one
+    sample later. From sample to sample the standard deviation is
 
         n sqrt((3 w)^2 + (k_o - 3 w)^2 + k_o^2),
 
-    which is sqrt(14) w n for k_o = w and for k_o = 2 w: that is the faster one for nothing. Of it
-    0.04 rad/s^2 are allowed; so that 1 kHz, one sample of delay and 1e-3 rad/s make w = 10.7 1/s.
-    What the observer finds moving, it finds with k_o = 2 w. Friction is identified by k_o / 4, so
-    that what r has is the observer's before it is friction's.
+    which is sqrt(14) w n for both k_o = w and k_o = 2 w, so k_o = 2 w is taken. 0.04 rad/s^2 are
+    allowed. At 1 kHz, one sample of delay and 1e-3 rad/s this gives w = 10.7 1/s. Friction is
+    identified at the rate k_o / 4, so that the observer reacts to a change first.
 
-    The force hears of noise by the damping c and by the observer's rate k_n in its own direction,
-    both of which brake phi', and the contact rings with what damping the integral K_i leaves,
-    s^3 + c s^2 + A k s + A k K_i = (s + K_i) (s^2 + (c - K_i) s + A k) nearly, so that
+    Noise reaches the force through the damping c and the observer's rate k_n in the normal
+    direction, since both act on phi'. The integral K_i reduces the damping of the contact, s^3 + c
+    s^2 + A k s + A k K_i = (s + K_i) (s^2 + (c - K_i) s + A k) nearly, so that
 
-        deviation of the force = (c + k_n) n_phi sqrt(k T / (2 A (c - K_i))),
+        standard deviation of the force = (c + k_n) n_phi sqrt(k T / (2 A (c - K_i))),
 
-    with the noise n_phi of phi'. What the model lacks, delta N, is left as delta'' / (k_n K_i), and
-    a force that changes as c lambda' / (A k). For a given k_n K_i the noise is least where
-    k_n = K_i = c / 3; a lower c serves the contact that is soft. So k_n = w, c = 2.3 w, or what
-    `contact_damping` bears where that is less, and K_i = 0.4 c, which is stable (Routh: K_i < c).
+    with the noise n_phi of phi'. A model error delta in N leaves the error delta'' / (k_n K_i), and
+    a changing reference leaves c lambda' / (A k). For a given k_n K_i the noise is least at k_n =
+    K_i = c / 3; soft contacts need a smaller c. So k_n = w, c = 2.3 w or the value of
+    `contact_damping` if that is smaller, and K_i = 0.4 c, which is stable (Routh: K_i < c).
 
     Args:
         stiffness: k of the contact in N/m, positive.
         mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive; the largest on the way.
         sample_time: T in s, positive.
-        delay: How many samples a control is late.
+        delay: The delay of the control in samples.
         velocity_noise: The deviation of measured velocities in rad/s; 0 for none.
 
-    The advice is right, and nothing is said, where the contact comes to rest with the damping and
-    the integral also if it is softer, or stiffer by a factor of two: with one sample of delay up to
-    w T = 0.6 at least, for the w = sqrt(A k) of the contact, see `contact_damping`.
+    The gains are valid if the contact is stable for all lower stiffnesses and up to twice the given
+    one. With one sample of delay this holds at least up to sqrt(A k) T = 0.6, see
+    `contact_damping`.
 
     Warns:
-        AdviceWarning: The contact is outside of the range in which the advice is right.
+        AdviceWarning: The contact is outside the range in which the gains are valid.
 
     Raises:
         ModelError: A number is not positive, or is negative.
@@ -111,7 +110,8 @@ def contact_gains(
     if velocity_noise:
         rate = min(rate, _JITTER / (14.0**0.5 * velocity_noise))
     damping = min(2.3 * rate, best)
-    # Where samples cannot damp, the contact itself must: then the force is changed slowly.
+    # Where the sampled law cannot damp the contact, its own damping must suffice and the force is
+    # changed slowly.
     force_gain = 0.4 * (damping or rate / 2.0)
     frequency = (stiffness * mobility) ** 0.5
     lost = unstable_from(frequency, sample_time, delay, damping, force_gain)

@@ -1,4 +1,4 @@
-"""What a model lacks, as an exogenous signal of its law, and how it is observed."""
+"""Model errors as a disturbance: an exogenous signal of a law, and its observation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,34 +20,34 @@ DISTURBANCE = "disturbance"
 """The name of the parameter."""
 
 _TINY = 1e-200
-"""What is divided by where nothing slides or pushes, and the quotient is of no use."""
+"""The denominator where nothing slides or presses; the quotient is then not used."""
 
 _FLAT = 1e-9
-"""Directions are one where the least of their squares is this part of the largest."""
+"""Directions count as equal if the ratio of their smallest to largest square is below this."""
 
 
 @checked(ModelError)
 def with_disturbance(
     system: DaeSystem, states: Sequence[str], frictions: Sequence[str] = ()
 ) -> DaeSystem:
-    """The same system with what its model lacks, d(t), as an exogenous signal:
+    """The same system with a disturbance d(t) as an exogenous signal:
 
         E x' = f + S d + g v + h u,
 
     where S holds the rows of some states: for a robot its velocities, so that d is a generalized
-    force. A law for this system cancels d, and the coefficients of friction that are named, as
-    they come through the port `exogenous` of its controller; see `DisturbanceObserver`. Where d is
-    zero, it is the law of the system.
+    force. A law for this system compensates d and the named coefficients of friction, which come
+    through the port `exogenous` of its controller; see `DisturbanceObserver`. With d = 0 it is the
+    law of the original system.
 
     Args:
         system: The system, as a robot's `RobotModel.dae`.
-        states: The names of the states whose rates d enters, for a robot those of v.
-        frictions: The names of parameters that are observed, too, such as "wall.friction": they
+        states: The names of the states whose rates contain d, for a robot those of v.
+        frictions: The names of parameters that are observed as well, such as "wall.friction". They
             become exogenous signals.
 
     Raises:
-        ModelError: A name is that of no state or of no parameter, or stands twice; or the system
-            has a parameter "disturbance".
+        ModelError: A name is not that of a state or parameter, or occurs twice; or the system
+            already has a parameter "disturbance".
     """
     known = [signal.name for signal in system.state_signals]
     for name in states:
@@ -82,33 +82,31 @@ def with_disturbance(
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What an observer of d computes of a system that `with_disturbance` made.
+    """The functions that an observer of d evaluates for a system made by `with_disturbance`.
 
     With the momentum p = S^T E x, whose rate is p' = (S^T E)' x + S^T (f + g v + h u) + d, no
     derivative of a measurement is needed.
 
-    Where a contact slides, friction is S^T dg/dmu v mu. Where it sticks, it is a reaction, any
-    force T y in the directions of sliding, the slopes of S^T dg/dmu v by the velocities at rest;
-    and no momentum tells it from d.
+    Where a contact slides, friction is S^T dg/dmu v mu. Where it sticks, friction is a reaction:
+    any force T y, where the columns of T are the derivatives of S^T dg/dmu v with respect to the
+    velocities at rest. The momentum cannot distinguish it from d.
 
     Attributes:
-        momentum: (x, u, v, parameters) -> p, its rate without inputs and without d, and what the
-            inputs add to that, S^T (h u + g v); shape (k,) each.
-        friction: (x, v, parameters) -> of each coefficient of friction the force that one of 1
-            makes, C = S^T dg/dmu v, shape (k, c), and the speed of sliding by the power of
-            friction, in m/s, shape (c,).
+        momentum: (x, u, v, parameters) -> p, its rate without inputs and d, and the part from the
+            inputs, S^T (h u + g v); shape (k,) each.
+        friction: (x, v, parameters) -> the friction force per unit of each coefficient, C = S^T
+            dg/dmu v, shape (k, c), and the sliding speed from the power of friction, in m/s, shape
+            (c,).
         directions: (x, v, parameters) -> W = Q^T E^-1 Q and Q = 1 + S^T g dalpha/dd, shape (k, k),
-            where Q d is d with what the constraint answers, and d^T W d the square of the
-            acceleration that d makes, in the metric of kinetic energy; and T of each contact, side
-            by side, shape (k, c k).
-        wanted: (x, R, t, parameters) -> x with those velocities with which the outputs move as the
-            reference does t later, r' + t r'', and the constraints stay, shape (n,); None where
-            outputs and constraints do not determine them.
-        moving: (x, parameters) -> R with the rates r' that the outputs have, and zeros: the motion
-            that there is, as if it were wanted.
-        rows: The states whose rates d enters.
-        frictions: The names of the coefficients of friction, and which constraint input each is
-            for.
+            where Q d is d with the reaction of the constraints, and d^T W d the squared
+            acceleration caused by d in the metric of kinetic energy; and T of each contact, side by
+            side, shape (k, c k).
+        wanted: (x, R, t, parameters) -> x with the velocities that the reference has a time t
+            later, r' + t r'', on the constraints, shape (n,). None if outputs and constraints do
+            not determine the velocities.
+        moving: (x, parameters) -> R with the present rates r' of the outputs, and zeros otherwise.
+        rows: The states whose rates contain d.
+        frictions: The names of the coefficients of friction, and the constraint input of each.
     """
 
     momentum: TracedFunction
@@ -121,10 +119,11 @@ class Observation:
 
     @classmethod
     def of(cls, structure: Structure) -> "Observation":
-        """What is observed of a system, by its structure.
+        """The observation of a system, from its structure.
 
         Raises:
-            ModelError: The system has no disturbance, or a mass that depends on what d moves.
+            ModelError: The system has no disturbance, or a mass matrix that depends on the states
+                that d acts on.
         """
         system = structure.system
         named = {p.name: p for p in system.exogenous.moving}
@@ -149,7 +148,7 @@ class Observation:
         given = {"control": u, "constraint_input": v}
         function = system.trace("momentum", outputs, given, often=False)
 
-        # What a coefficient of friction of one does; it takes the power mu lambda |v_t|.
+        # The force of a friction coefficient of 1; its power is -mu lambda |v_t|.
         columns = [ca.jacobian(action[rows], named[name].symbol) for name in frictions]
         forces = ca.horzcat(ca.SX(len(rows), 0), *columns)
         power = ca.mtimes(forces.T, x[rows])
@@ -158,8 +157,8 @@ class Observation:
             for j, i in enumerate(frictions.values())
         ]
         pressed = {"constraint_input": v}
-        rubbing = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
-        friction = system.trace("friction", rubbing, pressed, often=False)
+        frictional = {"forces": forces, "speeds": ca.vertcat(ca.SX(0, 1), *speeds)}
+        friction = system.trace("friction", frictional, pressed, often=False)
 
         reaction = ca.mtimes(system.g[rows, :], ca.jacobian(structure.elimination.alpha, d))
         projector = ca.SX.eye(len(rows)) + reaction
@@ -179,7 +178,7 @@ class Observation:
 
 
 def shares(forces: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """How much of each force c is in d, by the accelerations that they make, shape (c, 1):
+    """The share of each force c in d, in the metric of accelerations, shape (c, 1):
 
         (c^T W d) / (c^T W c).
 
@@ -194,7 +193,7 @@ def shares(forces: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
 
 
 def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
-    """What is left of d beside all T y, by the accelerations that they make, in its shape.
+    """The part of d orthogonal to all T y in the metric of accelerations, in the shape of d.
 
     Args:
         planes: T, shape (k, j), of any rank.
@@ -218,12 +217,9 @@ def beside(planes: ca.SX, metric: ca.SX, d: ca.SX) -> ca.SX:
 def _wanted(
     structure: Structure, rows: Sequence[int]
 ) -> tuple[TracedFunction | None, TracedFunction]:
-    """x with the velocities that the reference wants then, None where it does not tell them; and R.
-
-    R is the reference that wants the velocities which there are.
-    """
+    """`wanted` and `moving` of an `Observation`."""
     system, layout = structure.system, Layout(structure.output_degrees)
-    # Behind springs forces have a degree, too.
+    # With flexible joints forces have a relative degree as well.
     steered = [int(i) for i in layout.dynamic if system.m[int(i), :].is_zero()]
     starts = {i: int(layout.lowest[i]) for i in steered if structure.output_degrees[i] > 1}
     rates = {i: structure.output_chains[i][1] for i in starts}
@@ -249,7 +245,7 @@ def _wanted(
 
 
 def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
-    """The exogenous coefficients of friction, and which constraint input each is for."""
+    """The exogenous coefficients of friction, and the constraint input of each."""
     forces = [signal.name for signal in system.constraint_input_signals]
     found = {c.friction: forces.index(c.force) for c in system.contacts if c.friction in names}
     for name in names:
@@ -262,7 +258,7 @@ def _frictions(system: DaeSystem, names: Sequence[str]) -> dict[str, int]:
 
 
 def _known_rate(system: DaeSystem, mass: ca.SX, rows: Sequence[int]) -> ca.SX:
-    """x' as far as a mass depends on x, which no input and no disturbance must enter."""
+    """x' of the states that a mass matrix depends on; inputs and disturbance must not enter it."""
     rate = ca.SX(system.num_states, 1)
     pattern = ca.DM(ca.jacobian(ca.vec(mass), system.state).sparsity()).full()
     others = ca.horzcat(system.g, system.h)

@@ -1,4 +1,4 @@
-"""A filter that tells the derivatives of what it lets pass."""
+"""A low-pass filter with derivatives of its output."""
 
 from dataclasses import dataclass
 from math import comb
@@ -12,22 +12,22 @@ from drake_dae.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Lags:
-    """n + 1 lags of the rate k, one behind the other, of a signal d that is held between samples:
+    """n + 1 first-order lags of rate k in series, of a signal d that is held between samples:
 
         s_0' = k (d - s_0),    s_j' = k (s_(j-1) - s_j),    r = s_n = (k / (s + k))^(n+1) d.
 
-    So r has n derivatives, r^(j) = k^j sum_i (-1)^(j-i) C(j, i) s_(n-i), which do not change where
-    all s change alike. A constant d is found as
+    So r has n derivatives, r^(j) = k^j sum_i (-1)^(j-i) C(j, i) s_(n-i), which do not change if the
+    same number is added to all s. For a constant d,
 
         r = d (1 - e^(-k t) (1 + k t + ... + (k t)^n / n!)),
 
-    and a ramp (n + 1) / k late.
+    and r follows a ramp with a delay of (n + 1) / k.
 
     Attributes:
         rate: k in 1/s.
         degree: n.
-        step, gain: s of the next sample is step s + gain d, shapes (n + 1, n + 1) and (n + 1,).
-        slopes: Rows that make r', ..., r^(n) of s, shape (n, n + 1).
+        step, gain: The next sample of s is step s + gain d, shapes (n + 1, n + 1) and (n + 1,).
+        slopes: The matrix from s to r', ..., r^(n), shape (n, n + 1).
     """
 
     rate: float
@@ -38,12 +38,12 @@ class Lags:
 
     @classmethod
     def of(cls, rate: float, period: float, degree: int) -> "Lags":
-        """The lags at samples.
+        """The sampled lags.
 
         Args:
             rate: k in 1/s.
             period: The time between samples, s.
-            degree: n, how many derivatives are told.
+            degree: n, the number of derivatives.
         """
         size = degree + 1
         both = np.zeros((size + 1, size + 1))

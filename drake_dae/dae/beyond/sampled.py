@@ -1,4 +1,4 @@
-"""What becomes of the law (28) where a computer runs it: late, and held between samples."""
+"""The law (28) in a sampled controller: with delay, and held between samples."""
 
 from math import floor
 
@@ -14,14 +14,14 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 _SAME = 1e-9
-"""Times that differ by less than this, in periods, are one."""
+"""Times that differ by less than this, in periods, count as equal."""
 
 RESTS = 1e-4
-"""A state is an equilibrium if nothing in it changes by more, relative to its scale, in the time of
-the fastest pole."""
+"""A state counts as an equilibrium if its change within the time constant of the fastest pole is at
+most this, relative to its scale."""
 
 MOST_STATES = 2000
-"""Of more states, late ones included, poles would take minutes."""
+"""The largest number of states, including delayed ones; for more, the poles would take minutes."""
 
 
 @checked(ModelError)
@@ -34,17 +34,17 @@ def sampled_poles(
     state: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
 ) -> ComplexArray:
-    """By what one period multiplies small deviations of a robot under a sampled law, exactly.
+    """The exact poles of a robot under a sampled law, about an equilibrium.
 
-    The law reads at t_k = k T, and what it computes acts from t_k + d until t_(k+1) + d. About an
-    equilibrium a deviation x of the minimal states on N* has x' = A x without the law and
-    x' = (A + G) x with it. With d = n T + c, 0 <= c < T, and Gamma(t) = int_0^t exp(A s) ds,
+    The law samples at t_k = k T; its control acts from t_k + d until t_(k+1) + d. About an
+    equilibrium a deviation x of the minimal states on N* has x' = A x without the law and x' = (A +
+    G) x with it. With d = n T + c, 0 <= c < T, and Gamma(t) = int_0^t exp(A s) ds,
 
         x_(k+1) = exp(A T) x_k + Gamma(T - c) G x_(k-n) + exp(A (T - c)) Gamma(c) G x_(k-n-1).
 
     The loop is stable where all of these poles are within the unit circle, that is
-    abs(sampled_poles(...)).max() < 1; where T and d tend to 0 they tend to exp(p T) for the poles
-    p of the continuous loop, and to 0. A constraint that gives way has poles of its own: see
+    abs(sampled_poles(...)).max() < 1; where T and d tend to 0 they tend to exp(p T) for the poles p
+    of the continuous loop, and to 0. A compliant constraint has further poles: see
     `contact_damping`.
 
     Args:
@@ -108,25 +108,23 @@ def sampling_error(
     *,
     parameters: ArrayLike | None = None,
 ) -> FloatArray:
-    """What sampling adds to the error (30), (31), to first order in period and delay.
+    """The error that sampling adds to (30), (31), to first order in period and delay.
 
-    Whatever the plant and the reference, z_i^(mu_i) = a_i + B_i u gives without approximation
+    For any plant and reference, z_i^(mu_i) = a_i + B_i u gives without approximation
 
         e_i^(mu_i) + sum_j K_ij e_i^(j-1) = (B(x) (u - u_law(x, R)))_i,
 
-    where u_law is what the law would do now, and u what it did d + (t - t_k) before: to first order
-    u - u_law = -(d + t - t_k) u', which is -(d + T / 2) u' on average. That drives the errors of
-    mu_i >= 1 through their gains, from zero at the start. An output of mu_i = 0 follows u at once:
-    its error is a saw, told where it is largest, at a sample before the new control acts,
-    -(d + T) (B u')_i.
+    where u_law is the current output of the law, and u its output a time d + (t - t_k) earlier. To
+    first order u - u_law = -(d + t - t_k) u', on average -(d + T / 2) u'. This drives the errors of
+    outputs with mu_i >= 1, from zero at the start. An output with mu_i = 0 follows u without delay:
+    its error is a sawtooth, given here by its peak before each new control, -(d + T) (B u')_i.
 
-    So a run of the loop without sampling tells the error of a sampled one beforehand. Half the
-    period leaves half of it, and of what the next order adds a quarter. Whether the sampled loop
-    is stable is another question: see `sampled_poles`.
+    So the error of a sampled loop is predicted from a run without sampling. It is proportional to
+    the period; neglected terms are proportional to its square. For stability see `sampled_poles`.
 
     Args:
         law: The law, without integrals, whose control takes no measured force.
-        times: Times in s, shape (k,), increasing, so dense that the control is smooth between.
+        times: Times in s, shape (k,), increasing, and dense enough to resolve the control.
         states: x of a run under the continuous law, shape (k, n).
         controls: u of that run, shape (k, p).
         period: T in s.
@@ -168,9 +166,9 @@ def sampling_error(
 
 
 def _response(matrix: FloatArray, times: FloatArray, push: FloatArray) -> FloatArray:
-    """e' = E e + push from zero, where push is straight between its times, shape (k, N)."""
+    """The solution of e' = E e + input from zero, input linear between times, shape (k, N)."""
     size, lengths = len(matrix), np.diff(times)
-    # e, 1 and the time since the step began are one linear system.
+    # The states e, 1 and the time since the start of the step form one linear system.
     both = np.zeros((lengths.size, size + 2, size + 2))
     both[:, :size, :size] = matrix
     both[:, :size, size] = push[:-1]
@@ -200,7 +198,7 @@ def _delay(delay: float) -> float:
 
 
 def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
-    """Refuses what is about no equilibrium."""
+    """Refuses a state that is not an equilibrium."""
     moves = np.abs(loop.rate) / law.system.scale
     fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
     worst = int(np.argmax(moves))

@@ -1,9 +1,9 @@
 """Dynamic extension: integrators before controls, where B(x) has no inverse without them.
 
-Where B(x) of (16) is singular, some outputs hear of one combination of the controls too early: a
-wheeled robot's drive acts on both coordinates of its position before its steering does. If that
-combination becomes a state and its derivative the control, the outputs wait for the others. The
-law (28) of the extended system is then a dynamic state feedback of the original one.
+If B(x) of (16) is singular, one combination of the controls acts on some outputs before the others
+do: the drive of a wheeled robot acts on both coordinates of its position before its steering does.
+If that combination becomes a state and its derivative the control, all controls act at the same
+order. The law (28) of the extended system is then a dynamic state feedback of the original one.
 
 Descusse and Moog, "Decoupling with dynamic compensation for strong invertible affine non-linear
 systems", International Journal of Control 42(6), 1985; Isidori, Nonlinear Control Systems, 1995,
@@ -48,20 +48,20 @@ def dynamic_extension(
 ) -> Extension:
     """Finds integrators that make B(x) regular, by the dynamic extension algorithm.
 
-    In each round the controls that the dependent rows of B(x) hear of get an integrator. Where such
-    rows of rank q hear of more than q controls, a regular static feedback u = beta(x) w comes
-    first, after which they hear of q controls alone; see `Extension.integrators`. A round takes as
-    many dimensions from the zero dynamics as B(x) lacks in rank, so that few rounds decide: where
-    none are left, the outputs depend on each other. A violation of Assumption (3) is repaired on
-    the way; see `extend`.
+    In each round the controls that act in the dependent rows of B(x) get an integrator. If more
+    than q controls act in rows of rank q, a regular static feedback u = beta(x) w is applied first,
+    after which only q controls act in them; see `Extension.integrators`. A round reduces the zero
+    dynamics by the rank deficiency of B(x), so that few rounds decide: when no zero dynamics are
+    left, the outputs depend on each other. A violation of Assumption (3) is repaired on the way;
+    see `extend`.
 
     Args:
         system: The system (1)-(3).
         nominal_control: Values of the controls at the nominal state, for the integrators that hold
             them; zero where not given.
-        max_integrators: How many may be needed in all; n if None.
-        spread: The standard deviation of the states at which numbers decide, as in
-            `find_structure`. That of a control is 0.1 of its nominal value; 0.1 if that is zero.
+        max_integrators: The largest total number of integrators; n if None.
+        spread: The standard deviation of the random states, as in `find_structure`. That of a
+            control is 0.1 of its nominal value; 0.1 if that is zero.
 
     Returns:
         The extended system; the original one if its B(x) is regular.
@@ -69,8 +69,8 @@ def dynamic_extension(
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
             isolated states only, or more than max_integrators are needed.
-        ModelError, InconsistentStateError: There is no structure to find, see `find_structure`; or
-            the system has a `control_metric`.
+        ModelError, InconsistentStateError: The system has no structure, see `find_structure`, or it
+            has a `control_metric`.
     """
     refuse_metric(system)
     limit = system.num_states if max_integrators is None else max_integrators
@@ -115,7 +115,7 @@ class _Chain:
     Attributes:
         system: The system with the integrators so far.
         spread: The standard deviation of its states, shape (n,).
-        integrators: How many stand before which control.
+        integrators: The number of integrators before each control.
         offset, matrix: u of the original system is offset(x) + matrix(x) w.
     """
 
@@ -130,9 +130,9 @@ class _Chain:
         self._bases = [(signal, 0) for signal in system.control_signals]
 
     def beside_nominal(self) -> DaeSystem:
-        """The system with a nominal state where no sine happens to be zero.
+        """The system with a nominal state at which no sine is accidentally zero.
 
-        Rows of B(x) that vanish there say nothing yet: sin(heading) does at heading 0.
+        Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
         """
         random = np.random.default_rng(0)
         step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
@@ -171,7 +171,7 @@ class _Chain:
             self.matrix[:, others] -= ca.mtimes(self.matrix[:, columns], mixing)
         self.matrix[:, columns] = 0.0
         self._nominal[columns] = 0.0
-        # Away from zero, where B(x) is often singular, it stays away from zero.
+        # B(x) is often singular at zero, so a nonzero value is kept away from zero.
         size = np.where(nominal == 0.0, 1.0, np.abs(nominal))
         self.spread = np.concatenate([self.spread, 0.1 * size])
 
@@ -181,7 +181,7 @@ class _Chain:
 
 
 def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
-    """The controls that the dependent rows of B(x) hear of, and how they must be mixed first.
+    """The controls that act in the dependent rows of B(x), and how they must be mixed first.
 
     Returns:
         Columns and b(x) of `_Chain.integrate`; None if B(x) is regular.
@@ -232,7 +232,7 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     candidates: list[list[int]] = [list(columns) for columns in combinations(heard, q)]
     columns = max(candidates, key=distance)
     others = [j for j in range(p) if j not in columns]
-    # Least squares over all dependent rows, of which some q may be dependent elsewhere. It is
+    # Least squares over all dependent rows, since q of them may be dependent at other states. It is
     # exact: every column lies in the span of the chosen ones.
     part = structure.control_matrix[rows, :] / row_size[rows]
     chosen = part[:, columns]

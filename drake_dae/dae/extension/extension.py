@@ -30,8 +30,8 @@ class Extension:
         original: The system without integrators.
         system: The extended one. The first n states are those of the original.
         structure: The structure of the extended system.
-        integrators: How many integrators stand before which of the original controls. Where others
-            are mixed in first, the new state bears a star: "u1*" is u1 + sum_j b_j(x) u_j.
+        integrators: The number of integrators before each of the original controls. If others are
+            mixed in first, the new state has a star: "u1*" is u1 + sum_j b_j(x) u_j.
         control_offset: offset(x_e) as an expression of `system.state`, shape (p, 1).
         control_matrix: matrix(x_e) likewise, shape (p, p).
     """
@@ -80,17 +80,17 @@ def extend(
 ) -> DaeSystem:
     """Puts integrators before controls: u_i, u_i', ... become states, the next one the control.
 
-    All else stays: constraints, outputs, parameters, mass matrix. Degrees r_i do not change where
-    Assumption (3) holds. Where it fails, since u_i acts on a derivative of a constraint before any
-    constraint input does, integrators repair it: the constraint then binds u_i as a state.
+    Constraints, outputs, parameters and mass matrix do not change, nor do the degrees r_i if
+    Assumption (3) holds. If it is violated, since u_i acts on a derivative of a constraint before
+    any constraint input does, integrators repair it: the constraint then restricts the state u_i.
 
     Args:
         system: The system (1)-(3).
-        integrators: Name of a control -> how many; or names, for one each.
+        integrators: Name of a control -> number of integrators; or names, for one each.
         nominal_control: Values of controls at the nominal state, for the integrators that hold
             them; zero where not given. B(x) is often singular at zero.
 
-    A control must not be named as a state is; rename one where it is.
+    A control must not have the name of a state; rename one of them.
 
     Returns:
         The system with the states (x, u_i, u_j, ..., u_i', ...).
@@ -184,7 +184,7 @@ def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> F
     """Values of the controls at the nominal state by their names, 0 where not given, shape (p,).
 
     Raises:
-        ModelError: A name is that of no control, or a value is not finite.
+        ModelError: A name is not that of a control, or a value is not finite.
     """
     values = values or {}
     _check_names(system, values, "nominal_control")

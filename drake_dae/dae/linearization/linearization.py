@@ -67,8 +67,8 @@ def linearize_loop(
 ) -> Linearization:
     """The linear models of a plant under the law (28), from R to the controlled outputs z.
 
-    All entries of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) are inputs of their own. With
-    r_i^(j) = s^j r_i the transfer matrix is the identity wherever the law meets its own plant.
+    All entries of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) are inputs of their own. With r_i^(j)
+    = s^j r_i the transfer matrix is the identity if the plant is the model of the law.
 
     Args:
         law: The law.
@@ -95,7 +95,7 @@ def linearize_loop(
     moving = tuple(range(2 + len(measured)))
     slope = law.function.derivative(law.function.output_names.index("control"), moving)
     free = plant.at(np.zeros(p))
-    # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the force that it measures.
+    # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the measured force.
     first = law.function(plant.state, R, *measured, own)[0].copy()
     gains = slope(plant.state, R, *measured, own)[0].reshape(p, -1).copy()
     by_force = gains[:, n + R.size :] if measured else np.zeros((p, m))
@@ -115,7 +115,7 @@ def linearize_loop(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """What belongs to a state and a control: x', v and u."""
+    """The motion at a state and a control: x', v and u."""
 
     rate: FloatArray
     constraint_input: FloatArray
@@ -129,8 +129,7 @@ class _Plant:
 
         [[E, -g], [C, 0]] (x', v) = (f + h u, -c_t),    C = dc/dx,
 
-    where c_t is what exogenous signals add to c', and a deviation of it the same with the
-    derivatives of both sides.
+    where c_t is the part of c' from exogenous signals; a deviation solves the linearized equations.
     """
 
     def __init__(
@@ -197,7 +196,7 @@ class _Plant:
 
     @cached_property
     def by_control(self) -> FloatArray:
-        """How x' and v change with u, shape (n + m, p)."""
+        """The derivatives of x' and v by u, shape (n + m, p)."""
         m, p = self.system.num_constraints, self.system.num_controls
         return self._solve(np.vstack([self._h, np.zeros((m, p))]))
 
@@ -239,7 +238,7 @@ class _Plant:
             constraint_input=point.constraint_input,
             control=point.control,
         )
-        # As it stands, in (x, v).
+        # In descriptor form, in (x, v).
         none = np.zeros((m, m))
         E = np.block([[self._mass, np.zeros((n, m))], [np.zeros((m, n + m))]])
         A = np.block([[slope, self._g], [k_slope, none]])

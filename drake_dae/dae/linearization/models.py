@@ -61,13 +61,12 @@ class Linearization:
 
         minimal: (A, B, C, D) of the motion on N* with n - sum r_i states of x as coordinates. Where
             the state is at rest both have the same transfer matrix. Elsewhere each is the
-            linearization of its own equations at that instant, and the hidden constraints, which
-            the descriptor form leaves to be differentiated, change with time.
-        index: The index of the DAE, max r_i + 1; 0 without constraints. With constraints the
-            pencil (E, A) has infinite poles, which tools for (A, B, C, D) do not take: give them
-            the minimal form.
-        coordinates: Which states are those of the minimal form, shape (n - sum r_i,).
-        basis: How all states move with these on N*, shape (n, n - sum r_i).
+            linearization of its own equations at that instant, and the hidden constraints of the
+            descriptor form change with time.
+        index: The index of the DAE, max r_i + 1; 0 without constraints. With constraints the pencil
+            (E, A) has infinite poles; use the minimal form for tools that take (A, B, C, D).
+        coordinates: The states of the minimal form, shape (n - sum r_i,).
+        basis: The derivatives of all states by these on N*, shape (n, n - sum r_i).
         state, rate, control, constraint_input: x, x', u and v at the operating point.
     """
 

@@ -1,4 +1,4 @@
-"""The first Newton steps from a state to N*, as one function: enough in a simulation."""
+"""The first Newton steps from a state to N* as one function. A simulation rarely needs more."""
 
 from collections.abc import Sequence
 
@@ -9,32 +9,34 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import PRECISION, ROUNDING
 from drake_dae.trace.round_off import positive
 
-STEPS = 6
-"""So many Newton steps are one function: one or two to N* from where a step of a simulation ends,
-the others polish; one projection in a thousand takes more."""
+NEWTON_STEPS = 6
+"""The number of Newton steps in the function. One or two lead from the end of a simulation step to
+N*, the others reduce the error to round-off. One projection in a thousand takes more."""
 
 STAYS, FOUND, NOT_FOUND = 0.0, 1.0, 2.0
-"""What a projection's first steps lead to: the state itself, another one, or not yet to one."""
+"""The outcome of the first steps: the state is already consistent, they converged to a consistent
+state, or they did not converge."""
 
 DOUBT = 0.03
-"""Where a gradient, less its part along those before it, is this much shorter than usual it is
-worth while to look whether they are nearly dependent."""
+"""Gradients are checked for near dependence if the part of one that is orthogonal to those before
+it is shorter than usual by this factor."""
 
 
 def trace_first_steps(residual: Residual) -> TracedFunction:
-    """Where the first Newton steps from a state lead, all by the gradients there.
+    """The result of the first Newton steps from a state, all with the gradients at that state.
 
-    First stand what `_followed` says and their lengths, in states over their scale; then where they
-    lead, and the first step. They are doubted where gradients nearly depend on each other.
+    The outputs are the outcome of `_followed` and the lengths of the steps (in states over their
+    scale), the state that they reach, and the first step. The result is not valid where gradients
+    are nearly dependent.
     """
     system, heads = residual.system, residual.layout.heads.tolist()
     usual = positive(residual.lengths)
     state, p, scale = system.state, system.parameter_symbol, ca.SX(residual.scale)
-    # The steps hold them often: what is common goes once, and not from all of it.
+    # The steps hold them often: common subexpressions are removed once here, not from the whole.
     left, gradient = ca.cse([residual.expression, residual.gradient])
     function = ca.Function("residual", [state, p], [left], {"cse": False})
     (step_for, pivots), steps = shortest_step(gradient, scale), []
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         steps.append(scale * step_for(function(state, p)))
         state += steps[-1]
     start = system.state
@@ -43,7 +45,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
     sizes = [ca.norm_2(step / unit) for step in steps[:2]]
     found, outcome = _followed(start, steps, lengths, *sizes)
     outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": found, "step": steps[0]}
-    # For next to nothing, like the sines, which are looked at where this fails.
+    # A cheap test in place of the sines, which are computed only where this one fails.
     doubt = ca.mmin(ca.vertcat(1, *[ca.fabs(pivots[i]) / usual[i] for i in heads])) - DOUBT
     return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
 
@@ -51,7 +53,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
 def _followed(
     start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """What `newton` finds from a start by these first steps, and STAYS, FOUND or NOT_FOUND.
+    """The state that `newton` reaches from a start by these first steps, and the outcome.
 
     Args:
         start: The state, shape (n, 1).
@@ -70,7 +72,7 @@ def _followed(
         goes_on = ca.logic_and(goes_on, lengths[number] > 0)
         found += ca.if_else(goes_on, steps[number], 0)
     ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
-    # What is at the start and has no length may be there, or nowhere.
+    # A first step of length zero does not tell whether the start is consistent.
     moves = ca.logic_or(after_one, lengths[0] > 0)
     outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
     stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)

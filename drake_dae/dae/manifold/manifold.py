@@ -17,7 +17,7 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import norm
 
 FLOOR = 1e-12
-"""A distance from N* that is round-off of states that are zero."""
+"""A distance from N* that is round-off even if all states are zero."""
 
 
 class Manifold:
@@ -63,9 +63,9 @@ class Manifold:
 
     @property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, over its scale, by the gradients at another.
+        """The Newton step of least norm from a state, over its scale.
 
-        A function of state, the other state and parameters.
+        A function of the state, a second state at which the gradients are taken, and parameters.
         """
         return self._residual.newton_step
 
@@ -78,7 +78,7 @@ class Manifold:
         reach = float(self._first_steps.evaluate(x, p)[0][1])
         if isfinite(reach) and reach > 0.0:
             return reach <= CONSISTENT * norm(x / self._residual.scale) + FLOOR
-        # Gradients that depend on each other; or nothing is left, or what no state changes.
+        # Dependent gradients, a residual of zero, or one that no state changes.
         return self._residual.size(x, p) <= CONSISTENT
 
     def project(
@@ -92,8 +92,9 @@ class Manifold:
         Args:
             state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
-            crosses: Whether a system crosses a singular configuration at a state next to one: what
-                it loses there is then left out of the projection; None if it crosses none.
+            crosses: A function that says whether the system passes a singular configuration near a
+                state. The directions that are lost there are then left out of the projection. None
+                if it passes none.
 
         Returns:
             The consistent state, shape (n,).
@@ -118,15 +119,15 @@ class Manifold:
         return found if found is start else found.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
-        """`project` by its first few steps, without checks of its arguments: for a simulation.
+        """The first few Newton steps of `project`, for a simulation; the arguments are not checked.
 
         Args:
             start: The state, shape (n,).
             p: Values of all parameters, shape (k,).
 
         Returns:
-            The consistent state, overwritten by the next call; `start` itself if that is one; None
-            where `searched` finds more.
+            The consistent state, overwritten by the next call; `start` itself if it is consistent;
+            None if the steps do not converge, so that `searched` is needed.
         """
         function = self._first_steps
         state, parameters = function.arguments
@@ -145,7 +146,7 @@ class Manifold:
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` where `first_steps` has found nothing.
+        """`project` where `first_steps` did not converge.
 
         Args:
             start: The state, shape (n,).
@@ -155,12 +156,12 @@ class Manifold:
         return self._search.searched(start, p, crosses)
 
     def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """The consistent state next to a given one, level by level: for a start that someone gave.
+        """The consistent state next to a start that a user gave, found level by level.
 
         The constraints are met first, by the states that they depend on; then their derivatives, by
         the states that are new in them, and so on: positions first, then velocities, so that no
-        velocity moves a position. Where that leads nowhere it is `project`, whose arguments, result
-        and exceptions it has.
+        velocity moves a position. If this does not converge, `project` is used. Arguments, result
+        and exceptions are those of `project`.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
         found = self._settling.settled(start, p)

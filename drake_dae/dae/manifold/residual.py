@@ -1,4 +1,4 @@
-"""What is zero on N*: the constraints and their derivatives, with Newton's step to zero.   (4)"""
+"""The residual of N*: the constraints and their derivatives, with the Newton step to zero.   (4)"""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -29,13 +29,13 @@ class Residual:
         signals: Names and units of the residual.
         function: The residual as a function of state and parameters.
         scale: How large the states are in use, shape (n,).
-        lengths: How long gradients are at the nominal state over the scale of the states, 0 where
-            one has no length there or is not finite, shape (sum r_i,).
+        lengths: The lengths of the gradients at the nominal state, over the scale of the states; 0
+            if they are not finite there. Shape (sum r_i,).
     """
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
         self.system = system
-        self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])
+        self.expression = ca.vertcat(ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains])  # (4)
         self.layout = Layout(tuple(len(chain) for chain in chains))
         self.signals = self.layout.chain_signals(system.constraint_output_signals)
         self.gradient = ca.jacobian(self.expression, system.state)
@@ -55,9 +55,9 @@ class Residual:
 
     @cached_property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, over its scale, by the gradients at another.
+        """The Newton step of least norm from a state, over its scale.
 
-        A function of state, the other state and parameters.
+        A function of the state, a second state at which the gradients are taken, and parameters.
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(ca.jacobian(self.expression, state), state, other)
@@ -66,9 +66,9 @@ class Residual:
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
-    @np.errstate(all="ignore")  # Iterates out of the domain are tried, and refused.
+    @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def size(self, state: FloatArray, parameters: FloatArray) -> float:
-        """The residual relative to how it changes over the scale of the states, if it does."""
+        """The residual divided by its gradient over the scale of the states."""
         residual = self.function.evaluate(state, parameters)[0]
         if not residual.any():
             return 0.0

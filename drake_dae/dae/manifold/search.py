@@ -1,4 +1,4 @@
-"""The consistent state next to one from which the first Newton steps do not lead to N*."""
+"""The consistent state next to one from which the first Newton steps do not converge."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from drake_dae.trace.factorization import smallest_sine
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     ROUND_OFF,
-    Linearization,
+    NewtonModel,
     are_dependent,
     newton,
     norm,
@@ -22,23 +22,23 @@ from drake_dae.trace.newton import (
 from drake_dae.trace.round_off import positive
 
 CONSISTENT = 1e-8
-"""A state is taken as consistent, and mended silently, if it is this near to N*, relative to its
-size; or, where gradients depend on each other, if its residual is at most this."""
+"""A state counts as consistent, and is projected without a message, if its distance from N*
+relative to its size is at most this; where gradients are dependent, if its residual is."""
 
 NEARLY = 3e-3
-"""Gradients of constraints that are this near to dependent, as the sine of an angle, are left out
-of a projection from a state that is all but on N*."""
+"""Gradients whose angle has a sine below this are nearly dependent. They are left out of a
+projection from a state that is almost on N*."""
 
 SMALL = 1e-3
-"""A state is all but on N* if its residual, in lengths of gradients, is at most this, relative to
+"""A state is almost on N* if its residual, in lengths of gradients, is at most this, relative to
 its size."""
 
 ITERATIONS = 10
-"""After so many steps such a projection is given up; quadratic convergence takes three."""
+"""The largest number of steps of such a projection; quadratic convergence takes three."""
 
 
 class Search:
-    """Newton's method, least squares downhill, and across singular configurations.
+    """Newton's method, then least squares; at singular configurations a pseudoinverse.
 
     Args:
         residual: What is zero on N*.
@@ -59,7 +59,7 @@ class Search:
         p: FloatArray,
         crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
-        """`project` where `first_steps` has found nothing.
+        """`project` where `first_steps` did not converge.
 
         Args:
             start: The state, shape (n,).
@@ -81,16 +81,16 @@ class Search:
         return self._searched(start, p) if known is None else known
 
     def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """The consistent state next to one, where the first few steps do not lead to it."""
+        """The consistent state next to one where the first few steps do not converge."""
         scale = self._residual.scale
         z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
         if not converged:
-            # Gradients that depend on each other, or steps that mislead: least squares, downhill.
+            # Gradients are dependent or steps diverge: least squares with decreasing residual.
             z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
         found = scale * z
         if converged and not np.array_equal(found, start):
             return found
-        # Else it is round-off, in units in which that is much, or no state changes what is left.
+        # Otherwise the residual is round-off in coarse units, or no state changes it.
         if self._residual.size(found, p) <= CONSISTENT:
             return found
         residual = self._residual.function.evaluate(found, p)[0].copy()
@@ -98,10 +98,10 @@ class Search:
             return found
         raise InconsistentStateError(self._why(found, p, residual), residual)
 
-    def _linearize(self, state: FloatArray, parameters: FloatArray) -> Linearization:
+    def _linearize(self, state: FloatArray, parameters: FloatArray) -> NewtonModel:
         """Newton steps of least norm by the gradients at a state, in states over their scale."""
         scale = self._residual.scale
-        return Linearization(
+        return NewtonModel(
             lambda z: self._residual.newton_step.evaluate(scale * z, state, parameters)[0].copy(),
             is_regular=True,
         )
@@ -109,14 +109,14 @@ class Search:
     def _is_near(
         self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
     ) -> bool:
-        """Whether a system crosses a singular configuration next to a state."""
+        """Whether the system passes a singular configuration near a state."""
         return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
 
     def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """The state next to one that is all but on N*, where gradients nearly depend on each other.
+        """The consistent state next to one almost on N*, where gradients are nearly dependent.
 
-        Across a singular configuration a regular step would magnify round-off. What gradients that
-        are left out there say of N* is left, which is little so near to it; None if it is more.
+        At a singular configuration a regular step would magnify round-off. Gradients that are left
+        out leave a residual, which is small near N*. None if it is not small.
         """
         x = start / self._residual.scale
         size = max(norm(x), norm(self._residual.system.nominal_state / self._residual.scale))
@@ -135,8 +135,8 @@ class Search:
                 return x * self._residual.scale
         return None
 
-    def _downhill(self, state: FloatArray, parameters: FloatArray) -> Linearization | None:
-        """Steps of least squares that make the residual smaller, its rows scaled to length one."""
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
+        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
         scale = self._residual.scale
         gradients = self._residual.gradients(state, parameters) * scale
         length = positive(np.linalg.norm(gradients, axis=1))

@@ -1,4 +1,4 @@
-"""From a start that someone gave to N* level by level: positions first, then velocities."""
+"""From a user's start to N* level by level: positions first, then velocities."""
 
 from functools import cached_property
 
@@ -11,7 +11,7 @@ from drake_dae.dae.manifold.residual import Residual
 from drake_dae.dae.system.layout import Indices, Layout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
-from drake_dae.trace.newton import Linearization, newton, shortest_steps, steps_along
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps, steps_along
 
 
 class Settling:
@@ -34,7 +34,7 @@ class Settling:
         return KineticMetric(self._system, self._residual.layout)
 
     def settled(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """A state next to one, to round-off on N*; None where that leads nowhere."""
+        """The consistent state next to one, to round-off; None if the method does not converge."""
         kinetic = self._kinetic
         if kinetic.does_no_work(start, parameters, self._residual.gradients(start, parameters)):
             found = start.copy()
@@ -57,7 +57,7 @@ def _settle_level(
     parameters: FloatArray,
     energy: tuple[KineticMetric, int] | None = None,
 ) -> bool:
-    """Moves some states so that some rows of the residual vanish, and says whether they do.
+    """Changes some states so that some rows of the residual vanish; returns whether they do.
 
     Args:
         residual: What is zero on N*.
@@ -77,7 +77,7 @@ def _settle_level(
     def left(z: FloatArray) -> FloatArray:
         return residual.function(filled(z), parameters)[0][rows]
 
-    def linearize(z: FloatArray) -> Linearization | None:
+    def linearize(z: FloatArray) -> NewtonModel | None:
         x = filled(z)
         gradients = residual.gradients(x, parameters)[np.ix_(rows, columns)]
         if energy is None:

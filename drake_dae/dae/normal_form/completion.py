@@ -1,4 +1,4 @@
-"""What completes the constraint chains and the output chains: xi = Psi_2(x).         (22)"""
+"""The completion of the constraint chains and the output chains: xi = Psi_2(x).      (22)"""
 
 from collections.abc import Iterator, Sequence
 
@@ -24,7 +24,7 @@ Completion = tuple[ca.SX, tuple[Signal, ...], Margin]
 def check_completion(
     structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
 ) -> Completion:
-    """The completion that a user chose, with its signals and its margin.
+    """The user's completion, with its signals and its margin.
 
     Args:
         structure: The structure of the system.
@@ -75,7 +75,7 @@ def check_completion(
         )
     function = system.trace("coordinates", {"gradient": gradient}, often=False)
     (matrix,) = function(margin.state, system.parameter_values)
-    # How far each differential is from the span of those before it.
+    # The distance of each differential from the span of those before it.
     rows = _unit_rows(matrix.reshape(system.num_states, -1) * samples.scale)
     distances = np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]
     worst = int(np.argmin(distances))
@@ -90,8 +90,8 @@ def check_completion(
 def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
     """Single states whose differentials complete those of the chains, or else linear combinations.
 
-    They complete them where they are regular on the null spaces of the chains' differentials.
-    The arguments are those of `check_completion`.
+    They complete them if they are regular on the null spaces of the chains' differentials. The
+    arguments are those of `check_completion`.
 
     Raises:
         ModelError: No linear combinations complete the chains at all samples.
@@ -143,7 +143,7 @@ def _pivots(spaces: FloatArray) -> list[int]:
 
 
 def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
-    """A signal that is named as the combination reads: "x0 - 0.5 x1"."""
+    """A signal named like the combination, such as "x0 - 0.5 x1"."""
     terms = [(c, signal) for c, signal in zip(factors, signals, strict=True) if c]
     units = {signal.unit for _, signal in terms}
     sign = {1.0: "", -1.0: "-"}

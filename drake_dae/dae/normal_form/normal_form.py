@@ -1,4 +1,4 @@
-"""The normal form: constraint chains, output chains, and what completes them.       (20)-(24)"""
+"""The normal form: constraint chains, output chains, and their completion.          (20)-(24)"""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import ROUND_OFF, Linearization, newton
+from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton
 
 
 @checked(ModelError)
@@ -27,10 +27,10 @@ class NormalForm:
 
     both chains in the order of the system's constraints and outputs.
 
-    Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials
-    of both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular;
-    so where the Jacobian is singular, one of these is, or xi does not complete the chains there.
-    The paper allows any completion; L_h* xi = 0 is not required.
+    Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials of
+    both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular; if the
+    Jacobian is singular, A or B is, or xi does not complete the chains there. The paper allows any
+    completion; L_h* xi = 0 is not required.
 
     Args:
         system: The system (1)-(3).
@@ -45,7 +45,7 @@ class NormalForm:
         completion_signals: Names and units of xi. A chosen one is its own name: "x3", or
             "x0 - 0.5 x1".
         coordinate_signals: Names and units of (y, zeta, xi), n in all.
-        margin: How far the Jacobian of Phi is from singular over `structure.states`.
+        margin: The margin of the Jacobian of Phi over `structure.states`.
 
     Raises:
         ModelError: The completion does not fit, or its differentials are not independent of each
@@ -69,25 +69,25 @@ class NormalForm:
                 f"{show(structure.control_margin.state)}, so the output chains are not independent "
                 "there and are no coordinates; choose other outputs"
             )
-        chains = ca.vertcat(residual, structure.chain)
+        chains = ca.vertcat(residual, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
         if completion is None:
             found = choose_completion(structure, chains, samples)
         else:
             found = check_completion(structure, chains, samples, completion)
-        self.completion, self.completion_signals, self.margin = found
+        self.completion, self.completion_signals, self.margin = found  # (22)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
             *structure.layout.chain_signals(system.output_signals),
             *self.completion_signals,
         )
-        coordinates = ca.vertcat(chains, self.completion)
+        coordinates = ca.vertcat(chains, self.completion)  # (20)
         self._coordinates = system.trace("normal form", {"coordinates": coordinates})
         self._map = system.trace(
             "normal form and Jacobian",
             {"coordinates": coordinates, "jacobian": ca.jacobian(coordinates, system.state)},
         )
-        # Not that of `samples`: a state that is zero on N* is round-off there.
+        # Not the scale of `samples`, in which a state that is zero on N* is round-off.
         self._scale = structure.scale
 
     def __repr__(self) -> str:
@@ -123,10 +123,10 @@ class NormalForm:
     ) -> FloatArray:
         """x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
 
-        The inverse is local: other states may have the same coordinates (elbow up, elbow down;
-        an angle and the same angle plus 2 pi, as states are not wrapped). The one that continues
-        the guess is sought by damped Newton's method; where that fails, on the straight way from
-        the coordinates of the guess to the given ones.
+        The inverse is local: other states may have the same coordinates (elbow up, elbow down; an
+        angle and the same angle plus 2 pi, as states are not wrapped). The one that continues the
+        guess is found by damped Newton's method or, if that fails, by continuation along the
+        straight line from the coordinates of the guess to the given ones.
 
         Args:
             coordinates: (y, zeta, xi), shape (n,).
@@ -137,14 +137,14 @@ class NormalForm:
             x, shape (n,).
 
         Raises:
-            InconsistentStateError: There is no such state, or no way to it from the guess. Its
-                residual is what is left in the coordinates, shape (n,).
+            InconsistentStateError: There is no such state, or it is not reached from the guess. Its
+                residual is the remaining error of the coordinates, shape (n,).
             ModelError: Shapes do not fit, or numbers are not finite.
         """
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
         p = self.system.parameter_vector(parameters)
-        found = self._newton(x, target, p)
+        found = self._newton(x, target, p)  # (24)
         if found is not None:
             return found
         start, first = self._at(x, p)
@@ -175,11 +175,11 @@ class NormalForm:
         def left(z: FloatArray) -> FloatArray:
             return target - self._coordinates.evaluate(scale * z, parameters)[0]
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             solve = _solver(self._at(scale * z, parameters)[1] * scale)
             if solve is None:
                 return None
-            return Linearization(lambda z: solve(left(z)), True)
+            return NewtonModel(lambda z: solve(left(z)), True)
 
         found, converged = newton(state / scale, linearize)
         return scale * found if converged else None
@@ -192,7 +192,7 @@ class NormalForm:
         first: FloatArray,
         parameters: FloatArray,
     ) -> InconsistentStateError:
-        """Names the coordinate that the weak directions of the Jacobian keep from its target."""
+        """Names the coordinate that weak directions of the Jacobian keep from its target."""
         values, jacobian = self._at(state, parameters)
         left = target - values
         rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale

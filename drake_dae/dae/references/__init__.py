@@ -1,4 +1,4 @@
-"""What a system shall follow: values of time with all the derivatives that a law asks for."""
+"""References: desired values over time with all derivatives that a law needs."""
 
 from drake_dae.dae.references.by_name import ReferenceRows, references_by_name
 from drake_dae.dae.references.csv_file import CsvReference

@@ -1,8 +1,8 @@
-"""References by the names of the outputs that they are for.
+"""References by the names of their outputs.
 
-A name is that of an output, "tool.y"; of several that share what stands before their last dot,
-"tool", of which those with the highest degree are meant: positions before forces; of some of these
-by their letters, in that order, "tool.yz"; or a list of all these, "tool.y, joint3".
+A name is that of an output, "tool.y"; or of all outputs with the same prefix, "tool", restricted to
+those of the highest degree (positions rather than forces); or of some of these by their letters, in
+that order, "tool.yz"; or a list of such names, "tool.y, joint3".
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,10 +25,10 @@ class ReferenceRows(Reference):
 
     Attributes:
         reference: The reference.
-        rows: Which of its rows, shape (k,).
+        rows: The chosen rows, shape (k,).
 
     Raises:
-        ReferenceSignalError: There is no such row, a row stands twice, or there are none.
+        ReferenceSignalError: There is no such row, a row occurs twice, or no row is given.
     """
 
     reference: Reference
@@ -61,14 +61,14 @@ class ReferenceRows(Reference):
         return [given.get(row, 0) for row in range(self.reference.size)]
 
     def _places(self, degrees: Sequence[int]) -> list[int]:
-        """Where the values of the chosen rows stand among those of all."""
+        """The places of the chosen rows' values among those of all."""
         first = np.cumsum([0, *[degree + 1 for degree in degrees]])
         return [int(first[row]) + k for row in self.rows for k in range(degrees[row] + 1)]
 
 
 @dataclass(frozen=True)
 class Assigned:
-    """A reference, and where the outputs that it is for stand among all."""
+    """A reference, and the indices of its outputs."""
 
     name: str
     reference: Reference
@@ -78,16 +78,16 @@ class Assigned:
 def assigned(
     name: str, reference: Reference | float, outputs: Sequence[str], degrees: Sequence[int]
 ) -> Assigned:
-    """A reference and the outputs that a name means; a number is a constant for each of them.
+    """A reference and the outputs of a name; a number is a constant for each of them.
 
     Args:
         name: The name.
-        reference: The reference, with as many rows as the name means outputs.
+        reference: The reference, with one row for each output of the name.
         outputs: The names of all outputs.
         degrees: Their degrees mu_1, ..., mu_p.
 
     Raises:
-        ReferenceSignalError: The name means no output, or the reference has more or fewer rows, or
+        ReferenceSignalError: The name has no output, the number of rows differs, or the reference
             is not smooth enough.
     """
     places = meant(name, outputs, degrees)
@@ -104,7 +104,7 @@ def assigned(
 
 
 def in_order(references: Sequence[Assigned], outputs: Sequence[str]) -> list[Reference]:
-    """References in the order of the outputs, of which each needs one.
+    """References in the order of the outputs; each output needs one.
 
     Raises:
         ReferenceSignalError: An output has none, or two.
@@ -136,7 +136,7 @@ def references_by_name(
         degrees: Their degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
 
     Raises:
-        ReferenceSignalError: A name means no output, an output has no reference or two, or a
+        ReferenceSignalError: A name has no output, an output has no reference or two, or a
             reference does not fit or is not smooth enough.
     """
     found = []
@@ -149,17 +149,17 @@ def references_by_name(
 
 
 def meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """Where the outputs that a name means stand among all, shape (k,).
+    """The indices of the outputs of a name, shape (k,).
 
     Raises:
-        ReferenceSignalError: It means none.
+        ReferenceSignalError: It has none.
     """
     parts = [part.strip() for part in name.split(",")]
     return [place for part in parts for place in _meant(part, outputs, degrees)]
 
 
 def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[int]:
-    """The same for a name that is no list."""
+    """The same for a single name."""
     places = {output: place for place, output in enumerate(outputs)}
     if name in places:
         return [places[name]]
@@ -175,7 +175,7 @@ def _meant(name: str, outputs: Sequence[str], degrees: Sequence[int]) -> list[in
 
 
 def _runs(rows: Sequence[tuple[Assigned, int]]) -> Iterator[Reference]:
-    """The references of rows, as few as there can be."""
+    """The references of rows, as few as possible."""
     first = 0
     while first < len(rows):
         one, row = rows[first]

@@ -1,4 +1,4 @@
-"""A motion that a CSV file tells."""
+"""A reference from a CSV file."""
 
 import csv
 import os
@@ -23,7 +23,7 @@ from drake_dae.errors import ReferenceSignalError
 from drake_dae.files import read_text
 
 MOST = 1e15
-"""Of larger numbers a double has no digits that a robot could follow."""
+"""Larger numbers are refused: a double has no useful digits left."""
 
 
 @checked(ReferenceSignalError)
@@ -33,11 +33,11 @@ class CsvReference(SplineReference):
 
     Between rows the columns go straight. The reference is that motion q, averaged over a window: a
     uniform B-spline over q at times that are `smoothing` apart, with order + 2 of them in a window.
-    What that costs is, to first order, (order + 2) / 24 smoothing^2 q''; `deviation` tells how far
-    it is from the rows at most, and more than `tolerance` is refused. Where q turns at a row, as a
-    path of few rows does, it costs more: to first order in `smoothing`. Derivatives of noise grow
-    as it is divided by powers of `smoothing`: for rows with noise choose both numbers. Half a
-    window before the first row it begins to move, if q begins in motion.
+    The deviation from the rows is, to leading order, (order + 2) / 24 smoothing^2 q''; its maximum
+    is `deviation`, and more than `tolerance` is refused. At a kink of q, as on a path of few rows,
+    the deviation is of first order in `smoothing`. Derivatives divide noise by powers of
+    `smoothing`: choose both numbers for noisy rows. If q starts in motion, the reference starts
+    half a window before the first row.
 
     Attributes:
         file: The file: a row of names, then rows of numbers; comma, semicolon or tab between.
@@ -45,15 +45,14 @@ class CsvReference(SplineReference):
         time: The name of the column of times in s, which increase.
         smoothing: The time between points of the spline, in s; None for the median of that between
             rows, halved until the reference is within the tolerance.
-        start_time: When the first row is met, in s.
-        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
-        tolerance: How far the reference may be off its rows, as a share of the range of each
-            column.
+        start_time: The time of the first row, in s.
+        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
+        tolerance: The allowed deviation from the rows, as a fraction of the range of each column.
 
     Raises:
-        ReferenceSignalError: A number is of no use. When the reference is used: there is no such
-            file or column, it holds something else than numbers, or the reference would be off its
-            rows by more than the tolerance.
+        ReferenceSignalError: A number is not valid. When the reference is used: there is no such
+            file or column, it contains other values than numbers, or the deviation exceeds the
+            tolerance.
     """
 
     file: str
@@ -107,7 +106,7 @@ class CsvReference(SplineReference):
         return spline
 
     def _smoothed(self, step: float) -> TimeSpline:
-        """The spline whose points are a time in s apart."""
+        """The spline with a given spacing of its points in s."""
         times = self.table[:, 0]
         count = float(np.ceil(times[-1] / step - 1e-9)) + 1
         if count > MOST_POINTS + 1:
@@ -128,7 +127,7 @@ class CsvReference(SplineReference):
 
     @property
     def remark(self) -> str:
-        """How far it is off its rows."""
+        """The deviation from the rows, as text."""
         pairs = zip(self.columns, self.deviation, strict=True)
         told = ", ".join(f"{column} by {off:.2g}" for column, off in pairs)
         return (
@@ -137,19 +136,19 @@ class CsvReference(SplineReference):
         )
 
     def _off(self, spline: TimeSpline) -> FloatArray:
-        """How far a spline is off the rows at most, shape (size,)."""
+        """The largest deviation of a spline from the rows, shape (size,)."""
         found = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
         return np.abs(found - self.table[:, 1:]).max(axis=0)
 
     def _excess(self, spline: TimeSpline) -> float:
-        """How far a spline is off the rows, beside how far it may be."""
+        """The largest ratio of deviation to tolerance."""
         return float(np.max(self._off(spline) / self._allowed))
 
     @cached_property
     def _allowed(self) -> FloatArray:
-        """How far the reference may be off the rows of each column, shape (size,)."""
+        """The allowed deviation of each column, shape (size,)."""
         values = self.table[:, 1:]
-        # Of a column that stays, round-off.
+        # Round-off for a constant column.
         least = 1e-12 * np.abs(values).max(axis=0) + np.finfo(float).tiny
         return np.maximum(self.tolerance * np.ptp(values, axis=0), least)
 

@@ -83,9 +83,9 @@ class PointToPointReference(FormulaReference):
     Attributes:
         start: The values before, in the outputs' units, shape (k,), or one number for all.
         end: The values after, in the outputs' units, likewise.
-        start_time: When the move begins, in s.
-        end_time: When the move ends, in s.
-        order: How many derivatives are continuous, from 0 to 30; at least mu of the outputs.
+        start_time: The start of the move, in s.
+        end_time: The end of the move, in s.
+        order: The number of continuous derivatives, from 0 to 30; at least mu of the outputs.
 
     Raises:
         ReferenceSignalError: A number is not finite, or shapes or times do not fit.
@@ -172,7 +172,7 @@ def settle(reference: Reference, *names: str) -> None:
     """Makes fields tuples of the same length; a single number serves all.
 
     Raises:
-        ReferenceSignalError: They are no finite numbers, empty, or do not fit each other.
+        ReferenceSignalError: They are not finite numbers, are empty, or have different lengths.
     """
     listed = ", ".join(names)
     given = {name: getattr(reference, name) for name in names}

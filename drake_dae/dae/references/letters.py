@@ -1,7 +1,7 @@
 """Letters of single strokes, drawn for this library, on a grid that is 9 high.
 
-A stroke is a row of points, each as its digits x and y. Most letters are one stroke, which goes
-back along itself rather than to be taken up.
+A stroke is a row of points, each as its digits x and y. Most letters are one stroke, which retraces
+itself instead of lifting the tool.
 """
 
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ReferenceSignalError
 
 HEIGHT = 9
-"""Of capital letters, in cells of the grid."""
+"""The height of capital letters, in cells of the grid."""
 
 _GAP, _SPACE = 3, 4
-"""Between two letters, and the width of a space, likewise."""
+"""The gap between two letters and the width of a space, in cells."""
 
 _GLYPHS = {
     "A": "00 39 60/53 13",
@@ -69,7 +69,7 @@ def strokes(text: str) -> Iterator[FloatArray]:
     Small letters are written as capital ones.
 
     Raises:
-        ReferenceSignalError: There is no letter, or one that is not known.
+        ReferenceSignalError: There is no letter, or an unknown one.
     """
     if not text.strip():
         raise ReferenceSignalError("text: empty, at least one letter is needed")

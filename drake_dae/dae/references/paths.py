@@ -1,4 +1,4 @@
-"""Paths with a shape of their own: lines, circles and spirals, from rest to rest within limits."""
+"""Lines, circles and spirals, from rest to rest within limits."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -22,10 +22,9 @@ from drake_dae.errors import ReferenceSignalError
 class PathReference(FormulaReference):
     """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest.
 
-    s is a `Travel` with `order` continuous derivatives: as many as the law needs, where motions
-    that are the fastest within the same limits have two (a double S) or one (Drake's Toppra). Where
-    the curve makes the acceleration or the jerk too large, the whole motion is slowed until both
-    fit.
+    s is a `Travel` with `order` continuous derivatives, as many as the law needs; time-optimal
+    motions have two (double S) or one (Drake's Toppra). If the curve makes acceleration or jerk too
+    large, the whole motion is slowed until both are within limits.
 
     A member has p(s) with |dp/ds| <= 1, for 0 <= s <= `length`.
     """
@@ -37,7 +36,7 @@ class PathReference(FormulaReference):
     @property
     @abstractmethod
     def length(self) -> float:
-        """How long the path is at most, in the outputs' unit."""
+        """An upper bound of the length of the path, in the outputs' unit."""
 
     @abstractmethod
     def point(self, distance: ca.SX) -> ca.SX:
@@ -45,10 +44,10 @@ class PathReference(FormulaReference):
 
     @cached_property
     def travel(self) -> Travel:
-        """The distance along the path at a time after the start; `duration` tells how long.
+        """The distance along the path over time after the start.
 
         Raises:
-            ReferenceSignalError: The reference has no limits, as it never rests.
+            ReferenceSignalError: The reference has no limits, since it never rests.
         """
         if self.limits is None:
             raise ReferenceSignalError("this reference has no limits: it moves all the time")
@@ -64,7 +63,7 @@ class PathReference(FormulaReference):
         found = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
         excess = [peak / limit for peak, limit in zip(found, self.limits.values, strict=True)]
         slower = max(excess[0], excess[1] ** (1 / 2), excess[2] ** (1 / 3))
-        # What lies between the samples is below one in a thousand.
+        # The error between the samples is below 0.1 %.
         return travel if slower <= 1.0 + 1e-9 else travel.slower(1.001 * slower)
 
     def rows(self, time: ca.SX) -> ca.SX:
@@ -111,11 +110,11 @@ class LineReference(PathReference):
         start: The values before, in the outputs' unit, shape (k,), or one number for all.
         end: The values after, in the outputs' unit.
         limits: The largest speed, acceleration and jerk.
-        start_time: When the move begins, in s.
-        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+        start_time: The start of the move, in s.
+        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
 
     Raises:
-        ReferenceSignalError: A number is not finite or of no use, or start is end.
+        ReferenceSignalError: A number is not finite or not valid, or start is end.
     """
 
     start: ArrayLike
@@ -148,22 +147,22 @@ class LineReference(PathReference):
 class CircleReference(PathReference):
     """A circle: r = center + radius (cos a, sin a), for two outputs.
 
-    With `period` it goes round for ever, a = phase + 2 pi (t - start_time) / period. With `limits`
-    it makes a number of turns from rest to rest.
+    With `period` it turns without end, a = phase + 2 pi (t - start_time) / period. With `limits` it
+    makes a number of turns from rest to rest.
 
     Attributes:
         center: The center, in the outputs' unit, shape (2,).
         radius: The radius, in the outputs' unit.
-        period: How long a turn takes, in s; None with limits.
+        period: The time of one turn, in s; None with limits.
         limits: The largest speed, acceleration and jerk; None with a period.
-        turns: How many turns it makes with limits, negative for the other sense.
+        turns: The number of turns with limits; negative for clockwise.
         phase: The angle a at the start, in rad.
-        start_time: When the motion begins, in s; with a period, when the angle is `phase`.
+        start_time: The start of the motion, in s; with a period, when the angle is `phase`.
         order: How many derivatives are continuous with limits, from 2 to 12; at least mu of the
             outputs.
 
     Raises:
-        ReferenceSignalError: A number is of no use, or there are both a period and limits, or none.
+        ReferenceSignalError: A number is not valid, or there are both a period and limits, or none.
     """
 
     center: ArrayLike
@@ -215,27 +214,27 @@ class CircleReference(PathReference):
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class SpiralReference(PathReference):
-    """A spiral of Archimedes between two radii, from rest to rest, for two outputs.
+    """An Archimedean spiral between two radii, from rest to rest, for two outputs.
 
     With b = pitch / (2 pi) it is r = center + b a (cos, sin)(a + const), and a goes as
 
         a(s) = sqrt((a_0 + 1)^2 + 2 s / b) - 1,   so that   |dr/ds| = sqrt(1 + a^2) / (1 + a)
 
-    is from 0.71 (at a = 1) to 1: nearly an even speed, and smooth at the center.
+    is from 0.71 (at a = 1) to 1: the speed is nearly constant, and smooth at the center.
 
     Attributes:
         center: The center, in the outputs' unit, shape (2,).
-        start_radius: The radius at the start, in the outputs' unit; larger than the other for a
-            way inward.
+        start_radius: The radius at the start, in the outputs' unit; larger than `end_radius` to
+            move inward.
         end_radius: The radius at the end, in the outputs' unit.
-        pitch: How far apart neighbouring turns are, in the outputs' unit.
+        pitch: The distance between neighbouring turns, in the outputs' unit.
         limits: The largest speed, acceleration and jerk.
         phase: The angle at the start, in rad.
-        start_time: When the motion begins, in s.
-        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+        start_time: The start of the motion, in s.
+        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
 
     Raises:
-        ReferenceSignalError: A number is of no use.
+        ReferenceSignalError: A number is not valid.
     """
 
     center: ArrayLike

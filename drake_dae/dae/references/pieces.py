@@ -1,4 +1,4 @@
-"""Motions of polynomials in time, one after the other."""
+"""Piecewise polynomials in time."""
 
 from abc import abstractmethod
 from bisect import bisect
@@ -15,17 +15,17 @@ from drake_dae.dae.references.reference import Reference
 from drake_dae.errors import ReferenceSignalError
 
 MOST_IN_EXPRESSION = 200
-"""Of how many polynomials a reference is an expression of time: longer ones are tables."""
+"""The largest number of polynomials in a symbolic expression; longer references are tables."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Polynomials in time, one after the other: in piece i it is factors[i] @ (1, x, x^2, ...).
+    """Piecewise polynomials in time: factors[i] @ (1, x, x^2, ...) in piece i.
 
-    There x = (t - breaks[i]) / (breaks[i + 1] - breaks[i]); before and after the value stays.
+    Here x = (t - breaks[i]) / (breaks[i + 1] - breaks[i]); before and after, the value is constant.
 
     Attributes:
-        breaks: When each begins, and when the last one ends, in s, shape (n + 1,).
+        breaks: The start of each piece and the end of the last one, in s, shape (n + 1,).
         factors: The factors, shape (n, rows, degree + 1).
     """
 
@@ -72,9 +72,9 @@ class Pieces:
 
 @checked(ReferenceSignalError)
 class PiecewiseReference(Reference):
-    """A reference of polynomials in time, one after the other, `order` of whose derivatives exist.
+    """A piecewise polynomial reference with `order` continuous derivatives.
 
-    One with many pieces is no expression, but a table.
+    One with many pieces is a table and not an expression.
     """
 
     order: int

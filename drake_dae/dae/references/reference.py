@@ -1,4 +1,4 @@
-"""What a reference is, and all references as one function of the time."""
+"""The contract of a reference, and all references as one function of time."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -20,25 +20,25 @@ from drake_dae.trace.smoothness import find_flaw
 class Reference(ABC):
     """Desired values r(t) of one or several outputs, with their time derivatives.
 
-    1. `size`, at least 1, is the number of outputs that it covers. It never changes.
+    1. `size`, at least 1, is the number of its outputs. It never changes.
     2. `derivatives` takes one degree mu_i >= 0 per output, and returns a function of the time in s
        with the values r_1, r_1', ..., r_1^(mu_1), r_2, ...: output-major, shape
        (sum (mu_i + 1),).
-    3. Each value is the exact time derivative of the one before it. All but the last of an output
-       are continuous: the law integrates them.
-    4. A value depends on the time alone: not on the other degrees, nor on earlier calls.
-    5. An output that is not smooth enough for its degree is refused by `derivatives`, with the row
-       and a remedy, and never later. A time at which there is no value is refused by the function.
-    6. A reference that is an expression of time says so in `expression`, so that all of them are
-       traced as one function; the values are the same either way.
-    7. A reference that names a file reads it when it is used, and gives itself an absolute path by
-       `beside`; what of the file is approximate `remark` tells.
+    3. Each value is the exact time derivative of the one before it. All except the last of an
+       output are continuous.
+    4. A value depends only on time, not on the other degrees or on earlier calls.
+    5. `derivatives` refuses an output that is not smooth enough for its degree, with the row and a
+       remedy. The function refuses a time without a value.
+    6. A reference that is an expression of time returns it in `expression`, so that all references
+       are traced as one function. The values are the same.
+    7. A reference with a file reads it when it is used. `beside` makes its path absolute. `remark`
+       describes approximations of the file's data.
     """
 
     @property
     @abstractmethod
     def size(self) -> int:
-        """The number of outputs that it covers."""
+        """The number of its outputs."""
 
     @abstractmethod
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
@@ -52,7 +52,7 @@ class Reference(ABC):
         """
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
-        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None if they are no expression.
+        """The values at a symbolic time, shape (sum (mu_i + 1), 1); None without an expression.
 
         Raises:
             ReferenceSignalError: The reference is not smooth enough for these degrees.
@@ -60,12 +60,12 @@ class Reference(ABC):
         return None
 
     def beside(self, folder: Path) -> Self:
-        """The same, where a file that it names is relative to a folder."""
+        """The same reference with its file relative to a folder."""
         return self
 
     @property
     def remark(self) -> str:
-        """What of its data is approximate, and by how much; empty if nothing is."""
+        """The approximations of its data, as text; empty if there are none."""
         return ""
 
 
@@ -78,7 +78,7 @@ class FormulaReference(Reference):
         """r(t), shape (size, 1)."""
 
     def _check(self, degrees: Sequence[int]) -> None:
-        """Refuses what lacks derivatives up to the degrees."""
+        """Refuses references without derivatives up to the degrees."""
         time = ca.SX.sym("t")
         rows = self.rows(time)
         for i, degree in enumerate(degrees):
@@ -133,7 +133,7 @@ def stack_references(
 
 
 def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
-    """An expression of the time alone as a function that is called with a float."""
+    """An expression of time as a function of a float."""
     function = TracedFunction("reference", {"time": time}, {"R": rows})
     (moment,), (value,) = function.arguments, function.outputs
 

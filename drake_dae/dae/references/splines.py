@@ -1,4 +1,4 @@
-"""Motions through many points: uniform B-splines in time, with limits that their points tell."""
+"""Motions through many points: uniform B-splines in time, within limits."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -18,16 +18,16 @@ from drake_dae.dae.references.travel import PathLimits
 from drake_dae.errors import ReferenceSignalError
 
 MOST_POINTS = 20_000
-"""How many points a spline may have: more take longer to prepare than to follow."""
+"""The largest number of points; more would take longer to prepare than to follow."""
 
 
 @dataclass(frozen=True, eq=False)
 class TimeSpline:
     """r(t) = sum_k c_k N((t - start_time) / step - k), N the uniform B-spline of order + 1.
 
-    It rests at the first point before, and at the last one after; `order` derivatives are
-    continuous. Its derivatives are averages of differences of neighbouring points, and no larger:
-    |r^(j)| <= max |Delta^j c| / step^j.
+    Before, it rests at the first point and after, at the last; `order` derivatives are continuous.
+    Its derivatives are averages of differences of neighbouring points, and so bounded: |r^(j)| <=
+    max |Delta^j c| / step^j.
 
     Attributes:
         points: c_0, ..., c_(n-1), shape (n, k).
@@ -48,12 +48,12 @@ class TimeSpline:
 
     @property
     def spans(self) -> int:
-        """How many polynomials there are between the rests."""
+        """The number of polynomials between the rests."""
         return len(self.points) + self.degree - 2
 
     @property
     def duration(self) -> float:
-        """How long it moves, in s."""
+        """The duration of the motion, in s."""
         return self.spans * self.step
 
     @cached_property
@@ -117,14 +117,14 @@ class SplineReference(PiecewiseReference):
 def spline_within(
     points: FloatArray, limits: PathLimits, start_time: float, order: int, among: int | None = None
 ) -> TimeSpline:
-    """The fastest spline over points whose derivatives keep limits.
+    """The fastest spline over points with derivatives within limits.
 
     Args:
         points: The points, shape (n, k).
         limits: The largest speed, acceleration and jerk, of the first `among` columns.
         start_time: When it leaves the first point, in s.
         order: How many derivatives are continuous.
-        among: How many columns the limits are about; None for all.
+        among: The number of columns with limits; None for all.
     """
     rest = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
     steps = [
@@ -138,7 +138,7 @@ def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[i
     """Points along straight edges, no farther apart than a spacing, with the corners among them.
 
     Returns:
-        The points, shape (n, k), and which edge each is on; a corner is on the edge before it.
+        The points, shape (n, k), and the edge of each; a corner belongs to the edge before it.
     """
     found, edges = [corners[:1]], [0]
     for edge, (first, last) in enumerate(pairwise(corners)):
@@ -153,20 +153,20 @@ def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[i
 class PolylineReference(SplineReference):
     """Straight edges between points, with rounded corners, from rest to rest.
 
-    It leaves an edge `corner` before its end, and is back on the next one as far behind. It is a
-    uniform B-spline over points on the edges, 2 corner / order apart: on straight parts it has an
-    even speed, and at corners it is slower. That speed is the largest with which all limits are
-    kept, so that larger corners are faster.
+    It leaves an edge at the distance `corner` before its end, and joins the next one at the same
+    distance. It is a uniform B-spline over points on the edges, 2 corner / order apart: the speed
+    is constant on straight parts and lower at corners. It is the largest speed within all limits,
+    so that larger corners are faster.
 
     Attributes:
         points: The points, in the outputs' unit, shape (n, k).
         limits: The largest speed, acceleration and jerk.
-        corner: How far before and behind a point the path leaves the edges, in the outputs' unit.
-        start_time: When the motion begins, in s.
-        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+        corner: The distance from a point at which the path leaves the edges, in the outputs' unit.
+        start_time: The start of the motion, in s.
+        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
 
     Raises:
-        ReferenceSignalError: A number is of no use, there are fewer than two points, two in a row
+        ReferenceSignalError: A number is not valid, there are fewer than two points, two in a row
             are the same, or they are too many.
     """
 
@@ -191,8 +191,8 @@ def settle_points(reference: Any) -> FloatArray:
     """Makes the field `points` a tuple of rows, and returns it as an array, shape (n, k).
 
     Raises:
-        ReferenceSignalError: They are no rows of finite numbers, fewer than two, or two in a row
-            are the same.
+        ReferenceSignalError: They are not rows of finite numbers, fewer than two, or two in
+            succession are equal.
     """
     points = numbers("points", reference.points, ReferenceSignalError)
     if points.ndim != 2 or len(points) < 2 or not points.size or not np.isfinite(points).all():
@@ -210,7 +210,7 @@ def settle_points(reference: Any) -> FloatArray:
 
 
 def check_spline(corner: float, order: int, length: float) -> None:
-    """Refuses roundings of no use.
+    """Refuses invalid roundings.
 
     Raises:
         ReferenceSignalError: The corner is not positive or very small, or the order out of range.
@@ -226,6 +226,6 @@ def check_spline(corner: float, order: int, length: float) -> None:
 
 
 def rounded_up(value: float) -> str:
-    """A positive number as text with three digits, of which `float` makes no smaller number."""
+    """A positive number as text with three digits, rounded up."""
     text = f"{value:.3g}"
     return text if float(text) >= value else f"{1.01 * value:.3g}"

@@ -1,4 +1,4 @@
-"""How far along a path at what time: from rest to rest, within limits."""
+"""The distance along a path over time: from rest to rest, within limits."""
 
 from dataclasses import dataclass, replace
 from math import comb, factorial, inf, sqrt
@@ -14,10 +14,10 @@ from drake_dae.errors import ReferenceSignalError
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class PathLimits:
-    """The largest derivatives along a path: Euclidean norms over the outputs that it covers.
+    """The largest derivatives along a path: Euclidean norms over its outputs.
 
-    They are those of the whole motion, so that a curve is taken slower than a line. The outputs
-    have one unit, then.
+    They limit the whole motion, so that a curve is slower than a line. The outputs must have one
+    unit.
 
     Attributes:
         speed: The largest |r'|, in the outputs' unit per s.
@@ -45,21 +45,20 @@ class PathLimits:
 
 @dataclass(frozen=True)
 class Travel:
-    """A distance that goes from rest at 0 to rest at `length`.
+    """A distance from rest at 0 to rest at `length`.
 
-    The speed rises for `ramp`, stays, and falls as it rose:
+    The speed rises during `ramp`, is constant, and falls in the same way:
 
         s'(t) = speed S(t / ramp),   S(x) = x^order sum_k binom(order - 1 + k, k) (1 - x)^k,
 
-    where S, with k < order, is the polynomial that goes from 0 to 1 with order - 1 derivatives that
-    vanish at both ends. So s has `order` continuous ones; with order 2 its jerk is bounded as that
-    of the double S of drives, which has no more.
+    where S, with k < order, is the polynomial from 0 to 1 whose first order - 1 derivatives vanish
+    at both ends. So s has `order` continuous derivatives; order 2 is a double S with bounded jerk.
 
     Attributes:
         length: The whole distance.
         speed: The speed between the ramps.
-        ramp: How long the speed rises, in s; it falls as long.
-        order: How many derivatives are continuous, at least 2.
+        ramp: The duration of the rise of the speed, and of its fall, in s.
+        order: The number of continuous derivatives, at least 2.
     """
 
     length: float
@@ -69,18 +68,18 @@ class Travel:
 
     @property
     def duration(self) -> float:
-        """How long it takes, in s."""
+        """The duration, in s."""
         return self.length / self.speed + self.ramp
 
     def derivatives(self, time: ca.SX, degree: int) -> list[ca.SX]:
         """s, s', ..., s^(degree) at a symbolic time in s after the start, for degree <= order.
 
-        The second half is the first one backward: s^(k) has the sign (-1)^(k - 1) there.
+        The second half is the first one reversed: s^(k) has the sign (-1)^(k - 1) there.
         """
         is_first = time < self.duration / 2
         passed = ca.fmax(ca.fmin(time, self.duration - time), 0)
         x = ca.fmin(passed / self.ramp, 1)
-        # S by the Bernstein polynomials of degree 2 order - 1: nothing cancels in it.
+        # S by the Bernstein polynomials of degree 2 order - 1, without cancellation.
         steps = np.repeat([0.0, 1.0], self.order)
         integral = np.concatenate([[0.0], np.cumsum(steps) / steps.size])
         gone = self.speed * (self.ramp * _bernstein(integral, x) + ca.fmax(passed - self.ramp, 0))

@@ -20,26 +20,27 @@ from drake_dae.errors import ReferenceSignalError
 @checked(ReferenceSignalError)
 @dataclass(frozen=True)
 class WaypointsReference(PiecewiseReference):
-    """A curve through points, from rest to rest: of all that are there at some times the smoothest.
+    """The smoothest curve through points at given times, from rest to rest.
 
-    It has the least integral of |r^(order + 1)|^2, which with order 2 is the least jerk and with
-    order 3 the least snap: a spline of degree 2 order + 1. Between points it may swing out, the
-    more the less even the times are; a `PolylineReference` does not.
+    It minimizes the integral of |r^(order + 1)|^2, the jerk with order 2 and the snap with order 3:
+    a spline of degree 2 order + 1. Between points it may overshoot, more so with uneven times; a
+    `PolylineReference` does not.
 
     With limits the times are in proportion to the distances between the points, and as short as
     the limits allow.
 
     Attributes:
         points: The points, in the outputs' unit, shape (n, k).
-        times: When it is at each, in s after `start_time`, shape (n,); None with limits.
+        times: The time at each point, in s after `start_time`, shape (n,); None with limits.
         limits: The largest speed, acceleration and jerk; None with times.
-        start_time: When the motion begins, in s.
-        order: How many derivatives are continuous and vanish at both ends, from 2 to 6; at least mu
-            of the outputs.
+        start_time: The start of the motion, in s.
+        order: The number of continuous derivatives, which vanish at both ends, from 2 to 6; at
+            least mu of the outputs.
 
     Raises:
-        ReferenceSignalError: A number is of no use, there are fewer than two points, two in a row
-            are the same, times do not increase, or there are both times and limits, or none.
+        ReferenceSignalError: A number is not valid, there are fewer than two points, two in
+            succession are equal, times do not increase, or there are both times and limits, or
+            none.
     """
 
     points: Sequence[Sequence[float]]
@@ -70,12 +71,12 @@ class WaypointsReference(PiecewiseReference):
 
     @property
     def duration(self) -> float:
-        """When it is at the last point, in s after `start_time`."""
+        """The time at the last point, in s after `start_time`."""
         return float(self._moments[-1])
 
     @cached_property
     def _moments(self) -> FloatArray:
-        """When it is at each point, after the start, shape (n,)."""
+        """The time at each point, after the start, shape (n,)."""
         if self.limits is None:
             return np.array(self.times)
         edges = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
@@ -84,7 +85,7 @@ class WaypointsReference(PiecewiseReference):
         samples = np.linspace(0.0, moments[-1], 200 * len(edges) + 1)
         values = np.array([function(time).reshape(self.size, 4)[:, 1:] for time in samples])
         peaks = np.linalg.norm(values, axis=1).max(axis=0)
-        # What lies between the samples is below one in a thousand.
+        # The error between the samples is below 0.1 %.
         powers = 1.0 / np.arange(1, 4)
         return 1.001 * moments * max((peaks / self.limits.values) ** powers)
 
@@ -97,7 +98,7 @@ def _pieces(times: FloatArray, points: FloatArray, order: int, degrees: Sequence
     """The spline through points at times, and its derivatives, as polynomials."""
     from scipy.interpolate import make_interp_spline  # It takes long to load.
 
-    # In times about 1 apart, so that derivatives of all orders are of one size.
+    # In a time unit with spacing about 1, so that derivatives of all orders have similar sizes.
     scale = (times[-1] - times[0]) / (len(times) - 1)
     knots, degree = (times - times[0]) / scale, 2 * order + 1
     rest = [(j, np.zeros(points.shape[1])) for j in range(1, order + 1)]

@@ -25,22 +25,21 @@ from drake_dae.errors import ReferenceSignalError
 class TextReference(SplineReference):
     """A text in capital letters of single strokes, from rest to rest, for two outputs.
 
-    It goes as a `PolylineReference` goes, also straight from a stroke to the next one: a tool on a
-    surface is not lifted. With `press` there is a third output, a force that is smaller there.
+    It moves as a `PolylineReference`, also straight from a stroke to the next one: the tool is not
+    lifted. With `press` there is a third output, a force that is smaller between strokes.
 
     Attributes:
         text: The text: letters, digits, "-+.,!?" and spaces.
-        origin: The left end of the line that the letters stand on, shape (2,), in the
-            outputs' unit.
+        origin: The left end of the baseline, shape (2,), in the outputs' unit.
         height: The height of the letters, in the outputs' unit.
         limits: The largest speed, acceleration and jerk of the two outputs.
-        along: Where the text goes, shape (2,): by how much of the outputs for a unit of height.
-        up: Where the letters go up, likewise.
-        press: The force in strokes and that between them, in N, shape (2,); None for no force.
-        corner: How far before and behind a corner the path is rounded, in the outputs' unit; None
+        along: The direction of the text, shape (2,): the change of the outputs per unit of length.
+        up: The upward direction of the letters, shape (2,).
+        press: The force in strokes and between them, in N, shape (2,); None without force.
+        corner: The distance from a corner at which the path is rounded, in the outputs' unit; None
             for height / 15.
-        start_time: When the motion begins, in s.
-        order: How many derivatives are continuous, from 2 to 12; at least mu of the outputs.
+        start_time: The start of the motion, in s.
+        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
 
     Raises:
         ReferenceSignalError: A letter is not known, or a number is of no use.

@@ -1,4 +1,4 @@
-"""How far contacts are from jamming by friction: Painleve's critical coefficient."""
+"""The distance of frictional contacts from the Painleve paradox: critical coefficients."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,24 +14,24 @@ from drake_dae.dae.system.contacts import critical_factor
 from drake_dae.dae.system.system import DaeSystem
 
 MEANINGLESS = 1e6
-"""No coefficient of friction is so large: what slides but by round-off has such a critical one."""
+"""Critical coefficients above this are meaningless: they occur where sliding is only round-off."""
 
 CLOSER = (0.9, 0.99)
-"""The parts of the friction found critical so far for which a state that jams is sought."""
+"""The fractions of the lowest critical friction so far for which a paradoxical state is sought."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactMargin:
-    """How far contacts are from jamming by friction, over some states.
+    """The distance of contacts from the Painleve paradox, over some states.
 
     Attributes:
-        reserve: The smallest principal minor of A(x) over the contacts, each divided by what it is
-            without friction: 1 without friction, 1 - mu / mu_crit for a single contact; where it is
-            not positive a contact jams.
-        critical_friction: Name of a coefficient of friction -> where it jams first, if all grow in
-            proportion; infinite where none does. Of coefficients that are all zero, equal ones.
-        state: Where that is smallest, shape (n,).
-        time: When that is, in s; None where states are not those of a motion.
+        reserve: The smallest principal minor of A(x) over the contacts, each divided by its value
+            without friction: 1 - mu / mu_crit for a single contact. If it is not positive, the
+            Painleve paradox occurs.
+        critical_friction: Name of a coefficient of friction -> its lowest critical value if all
+            coefficients grow in proportion (equal ones if all are zero); infinite if there is none.
+        state: The state with the smallest value, shape (n,).
+        time: Its time in s; None if the states are not from a motion.
     """
 
     reserve: float
@@ -40,13 +40,13 @@ class ContactMargin:
     time: float | None = None
 
     @property
-    def jams(self) -> bool:
-        """Whether a contact jams with the friction that it has."""
+    def is_paradoxical(self) -> bool:
+        """Whether the Painleve paradox occurs with the present friction."""
         return not self.reserve > 0.0
 
 
 class ContactMargins:
-    """The margins of a system whose contacts rub, at states that one gives.
+    """The margins of a system with frictional contacts at given states.
 
     Args:
         system: The system.
@@ -54,12 +54,12 @@ class ContactMargins:
     """
 
     def __init__(self, system: DaeSystem, matrix: ca.SX) -> None:
-        self._system, self._rubbing = system, system.rubbing
+        self._system, self._contacts = system, system.frictional_contacts
         self._places = [
-            system.parameter_slice(p.name).start for p in self._rubbing.frictions if p is not None
+            system.parameter_slice(p.name).start for p in self._contacts.frictions if p is not None
         ]
-        self._names = [p.name for p in self._rubbing.frictions if p is not None]
-        reserve = self._rubbing.reserve(matrix)
+        self._names = [p.name for p in self._contacts.frictions if p is not None]
+        reserve = self._contacts.reserve(matrix)
         outputs = {"matrix": ca.densify(matrix), "reserve": reserve}
         self._values = system.trace("contact margin", outputs, often=False)
         slope = {"reserve": reserve, "gradient": ca.gradient(reserve, system.state)}
@@ -77,7 +77,7 @@ class ContactMargins:
             self._values(state, values)[0].reshape(size, size)
             for values in (without, self._with_friction(parameters, unit))
         )
-        factor = critical_factor(A_0, A_0 - A_1, self._rubbing.rows)
+        factor = critical_factor(A_0, A_0 - A_1, self._contacts.rows)
         if factor * unit.max() > MEANINGLESS:
             factor = np.inf
         critical = dict(zip(self._names, (factor * unit).tolist(), strict=True))
@@ -104,7 +104,7 @@ class ContactMargins:
     def _downhill(
         self, box: ConsistentRegion, start: ContactMargin, parameters: FloatArray
     ) -> Iterator[ContactMargin]:
-        """States that jam with ever less friction."""
+        """States in the Painleve paradox with decreasing friction."""
         unit, best = self._direction(parameters), start
         for part in CLOSER:
             for _ in range(20):
@@ -138,5 +138,5 @@ class ContactMargins:
 
 
 def _first(margin: ContactMargin) -> float:
-    """The largest coefficient of friction at which a contact jams."""
+    """The lowest critical coefficient of friction."""
     return max(margin.critical_friction.values())

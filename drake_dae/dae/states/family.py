@@ -1,4 +1,4 @@
-"""The family that a system is: its states, its parameters and its exogenous signals together."""
+"""Random members of a system: states, parameters and exogenous signals together."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,27 +12,27 @@ from drake_dae.dae.states.samples import fields_at
 from drake_dae.errors import InconsistentStateError
 
 MEMBERS = 4
-"""So many members are drawn. Functions are analytic almost everywhere: one that is zero at a few
-members that have nothing special is zero at all."""
+"""The number of random members. Functions are analytic almost everywhere: one that is zero at a few
+random members is zero at all."""
 
 VISIBLE = 1e-6
-"""What acts on a member by more than this, relative to the sizes of its terms, is no round-off."""
+"""An action above this, relative to the sizes of its terms, is not round-off."""
 
 _NEARER = 0.25
-"""Where there is no consistent state with some numbers, they are taken so much nearer to the
-defaults, and again."""
+"""If there is no consistent state for drawn numbers, they are moved towards the defaults by this
+factor, repeatedly."""
 
 _TRIES = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Deciding:
-    """Numbers with which something is zero at their defaults and not elsewhere.
+    """Parameters for which an expression is zero at the defaults and not for other values.
 
     Attributes:
-        names: The parameters, and the derivatives of exogenous signals, of which each alone
-            decides; or, where only several together do, those that it takes.
-        values: A value of each with which it is not zero.
+        names: The parameters and derivatives of exogenous signals that decide alone; or, if only
+            several together decide, a minimal set.
+        values: A value of each for which it is not zero.
         defaults: Their defaults.
     """
 
@@ -54,14 +54,13 @@ class Deciding:
 
 
 class Family:
-    """Members of the family that a system is, each a consistent state and numbers of its own.
+    """Random members of a system, each a consistent state with its own parameters.
 
-    A parameter is drawn within its bounds, or within a factor of two of its default, and at 0
-    within one of its unit; the derivatives of an exogenous signal likewise, unless its bounds hold
-    it at one value.
+    A parameter is drawn within its bounds, or within a factor of two of its default (if that is 0,
+    from -1 to 1). So are the derivatives of an exogenous signal, unless its bounds are equal.
 
     Args:
-        manifold: N*, or what is known of it.
+        manifold: N*, or the constraints known so far.
         states: Consistent states with the default parameters, shape (samples, n).
     """
 
@@ -70,16 +69,16 @@ class Family:
         self._system = manifold.system
 
     def deciding(self, acts: Callable[[FloatArray, FloatArray], bool]) -> Deciding | None:
-        """What decides whether something acts that does not with the default parameters.
+        """The parameters that decide whether an input acts that does not at the defaults.
 
         Args:
-            acts: Whether it acts at a state, with values of all parameters.
+            acts: (state, values of all parameters) -> whether it acts.
 
         Returns:
             The numbers that decide; None if it acts nowhere.
         """
         hits = [member for member in self._members if acts(*member)]
-        # One of many may be the round-off of a matrix that is nearly singular.
+        # One of many may be round-off of a nearly singular matrix.
         if 2 * len(hits) <= len(self._members):
             return None
         state, values = hits[0]
@@ -93,7 +92,7 @@ class Family:
 
         numbers = self._numbers
         found = [n for n in numbers if acts_with(n[1], others=defaults, those=values)]
-        # None alone: those without which it does not.
+        # No parameter alone decides: those without which it does not act.
         found = found or [n for n in numbers if not acts_with(n[1], others=values, those=defaults)]
         largest = [
             (name, places[int(np.argmax(np.abs(values[places] - defaults[places])))])
@@ -106,13 +105,13 @@ class Family:
         )
 
     def lost(self, determinant: Callable[[FloatArray, FloatArray], float]) -> Deciding | None:
-        """Where a determinant is zero on the way to bounds that somebody gave, if it is.
+        """A parameter for which a determinant vanishes within given bounds, if there is one.
 
         Args:
-            determinant: Its sign at a state, with values of all parameters; 0 where it vanishes.
+            determinant: (state, values of all parameters) -> its sign; 0 if it vanishes.
 
         Returns:
-            A parameter with a bound on the way to which, the bound included, it vanishes.
+            A parameter and the bound towards which (or at which) it vanishes.
         """
         system, state = self._system, self._states[0]
         defaults = system.parameter_values
@@ -134,7 +133,7 @@ class Family:
 
     @cached_property
     def _numbers(self) -> list[tuple[str, list[int]]]:
-        """What can be drawn: parameters and derivatives of signals, and where they stand."""
+        """The numbers to draw: parameters and derivatives of signals, with their places."""
         system = self._system
         found, start, following = [], 0, sum(p.value.size for p in system.parameters)
         rates = []
@@ -171,7 +170,7 @@ class Family:
     def _consistent(
         self, state: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """A consistent state near one with other numbers; None if there is none in the domain."""
+        """A consistent state near one for other numbers; None if there is none in the domain."""
         try:
             found = self._manifold.project(state, parameters)
         except InconsistentStateError:

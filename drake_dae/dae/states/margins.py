@@ -1,4 +1,4 @@
-"""How far a matrix of the state is from losing its rank."""
+"""Margins: the distance of a state-dependent matrix from losing its rank."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +16,7 @@ from drake_dae.trace.round_off import SINGULAR, equilibration, smallest_singular
 
 @dataclass(frozen=True)
 class Margin:
-    """How far a matrix is from losing its rank.
+    """The distance of a matrix from losing its rank.
 
     Attributes:
         singular_value: The smallest singular value over all examined states.
@@ -24,7 +24,7 @@ class Margin:
             that are common to all states, so that units do not matter.
         state: Where `relative` is smallest, shape (n,).
         vanishing_row: The row that is zero there; None if none is.
-        least: Below this `relative` counts as singular: `DaeSystem.least_margin`.
+        least: The threshold of `relative` for singular: `DaeSystem.least_margin`.
         matrix: The matrix there.
     """
 
@@ -44,17 +44,17 @@ class Margin:
 def find_margin(
     samples: Samples, matrix: ca.SX, round_off: Booleans | None = None, search: bool = False
 ) -> Margin:
-    """The smallest singular values of a matrix at sampled states and at what lies between.
+    """The smallest singular values of a matrix at sampled states and between them.
 
-    The determinant of a square matrix that changes its sign on the way from the first state is
-    zero there, unless N* has no way, or the determinant is infinite on it.
+    If the determinant of a square matrix changes its sign on the way from the first state, it is
+    zero on that way, unless N* is not connected or the determinant is infinite.
 
     Args:
         samples: The states.
         matrix: An expression of the state, shape (k, l), k <= l.
-        round_off: Which entries are taken as zero; none if None.
-        search: Also go downhill from the worst states, in the box that the states span and the
-            region.
+        round_off: The entries that count as zero; none if None.
+        search: Whether to minimize further from the worst states, in the box that the states span
+            and in the region.
     """
     scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
     candidates = list(samples.states)
@@ -79,7 +79,7 @@ def find_margin(
 
 
 def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = None) -> bool:
-    """Whether a square matrix is regular at every sampled state itself."""
+    """Whether a square matrix is regular at every sampled state."""
     scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
     least = samples.system.least_margin
     return all(scaled.distance(state) >= least for state in samples.states)
@@ -90,7 +90,7 @@ def surroundings(samples: Samples) -> Region:
     low, high = samples.states.min(axis=0), samples.states.max(axis=0)
     given = samples.consistent.region
     if given is not None:
-        # The edge of what is not named may lie a little beyond the random states.
+        # States without bounds may lie slightly beyond the random ones.
         more = 0.5 * (high - low)
         low = np.where(np.isfinite(given.low), given.low, low - more)
         high = np.where(np.isfinite(given.high), given.high, high + more)
@@ -98,7 +98,7 @@ def surroundings(samples: Samples) -> Region:
 
 
 def _crossing(samples: Samples, matrix: "_ScaledMatrix", there: FloatArray) -> FloatArray | None:
-    """Where the determinant changes its sign on the way from the first state, if it does."""
+    """The place where the determinant changes its sign on the way from the first state, if any."""
     here = samples.states[0]
 
     def sign(state: FloatArray) -> float:
@@ -131,7 +131,7 @@ class _ScaledMatrix:
         self._rows, self._columns = equilibration(sizes)
 
     def plain(self, state: FloatArray) -> FloatArray:
-        """The matrix as it is, not scaled."""
+        """The unscaled matrix."""
         value = self._function(state, self._system.parameter_values)[0]
         return value.reshape(self._matrix.shape)
 

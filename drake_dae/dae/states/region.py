@@ -1,4 +1,4 @@
-"""A box of the state space: the consistent states in it, and where a function is smallest."""
+"""A box of the state space: consistent states in it, and minima of functions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.newton import Linearization, newton
+from drake_dae.trace.newton import NewtonModel, newton
 
 _SLACK = 1e-6
-"""How far out of a box a state may be, relative to the box, as Newton's method leaves it."""
+"""The allowed distance of a state from the box after Newton's method, relative to the box."""
 
 
 _FLAT = 1e-3
-"""A slope that changes a function by less than this fraction across the box leads nowhere."""
+"""A gradient that changes a function by less than this fraction across the box counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Region:
     high: FloatArray
 
     def holds(self, state: FloatArray) -> bool:
-        """Whether a state is in it."""
+        """Whether a state is in the box."""
         bounds = np.where(np.isfinite([self.low, self.high]), [self.low, self.high], 0.0)
         slack = _SLACK * np.maximum(np.abs(bounds).max(axis=0), bounds[1] - bounds[0])
         return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
@@ -73,9 +73,9 @@ class ConsistentRegion:
         return state
 
     def draw(self, guess: FloatArray) -> FloatArray:
-        """A consistent state that has the bounded states of a guess, where there is one.
+        """A consistent state with the bounded states of a guess, if there is one.
 
-        So random values in the bounds cover them, whatever the constraints move.
+        So random values cover the bounds, whatever the constraints change.
 
         Raises:
             InconsistentStateError: No consistent state is found in the region.
@@ -94,10 +94,10 @@ class ConsistentRegion:
     def descend(
         self, function: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray
     ) -> FloatArray:
-        """Follows a function that is nowhere negative downhill, along N* and inside the region.
+        """Minimizes a nonnegative function along N* inside the region.
 
-        Each step is as long as it takes a straight slope to come to zero, so that zeros are found
-        in a few steps; the least of a function that has no zero is approached only.
+        Each step leads to the zero of the linearized function, so that zeros are found in a few
+        steps. A positive minimum is only approached.
 
         Args:
             function: Value and gradient, shape (n,), at a state.
@@ -162,11 +162,11 @@ class ConsistentRegion:
             return float(np.min((edge - state)[moving] / step[moving], initial=np.inf))
 
     def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
-        """Where Newton's method for the constraints ends, with steps that do not leave the box."""
+        """The result of Newton's method for the constraints, with steps inside the box."""
         scale = self.manifold.system.scale
         low, high = region.low / scale, region.high / scale
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             gradient = self.manifold.gradients(scale * z) * scale
             if not np.all(np.isfinite(gradient)):
                 return None
@@ -175,7 +175,7 @@ class ConsistentRegion:
                 residual = self.manifold.residual(scale * z)
                 return _bounded_step(gradient, residual, low - z, high - z)
 
-            return Linearization(step, True)
+            return NewtonModel(step, True)
 
         return scale * newton(np.clip(guess / scale, low, high), linearize)[0]
 
@@ -183,7 +183,7 @@ class ConsistentRegion:
 def _bounded_step(
     gradient: FloatArray, residual: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """A short dx with C dx + r = 0; what would go past its bound stops there."""
+    """A short dx with C dx + r = 0; components are limited by the bounds."""
     step, free = np.zeros(low.size), low < high
     while free.any():
         left = residual + gradient[:, ~free] @ step[~free]

@@ -18,20 +18,20 @@ from drake_dae.trace.round_off import Sized, multiply
 class Samples:
     """Consistent states near given ones, with the default parameters.
 
-    A state that does not get onto N*, or is outside the domain of (1)-(3), is left out.
+    States that cannot be projected onto N*, or are outside the domain of (1)-(3), are left out.
 
     Args:
-        manifold: N*, or what is known of it.
+        manifold: N*, or the constraints known so far.
         guesses: The nominal state first, shape (count, n).
         region: Where the states must be; None for anywhere.
 
     Attributes:
         states: The consistent states, shape (samples, n).
         fields: f, g, h, l and m of the system with E = 1 at each state, by letter.
-        scale: How large each state is over all of them and the guesses, shape (n,).
+        scale: The size of each state over all of them and the guesses, shape (n,).
 
     Raises:
-        InconsistentStateError: No guess gets onto N*.
+        InconsistentStateError: No guess can be projected onto N*.
         ModelError: A function is not finite at the nominal state.
     """
 
@@ -90,10 +90,10 @@ class Samples:
         return [(values[key], np.abs(values[key])) for values in self.fields]
 
     def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
-        """The derivatives of functions along fields; what is nothing but round-off is zero.
+        """The derivatives of functions along fields; entries that are only round-off are zero.
 
         Args:
-            rows: The derivatives, shape (a, k), whose structure may decide.
+            rows: The symbolic derivatives, shape (a, k), with their structural zeros.
             functions: The functions, shape (a, 1).
             field: The fields at each state, shape (n, k).
 
@@ -126,12 +126,12 @@ def fields_at(
 
 
 def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """The nominal state, and random ones around it, shape (count + 1, n); none is consistent yet.
+    """The nominal state and random ones around it, shape (count + 1, n); not yet consistent.
 
     Args:
         system: The system (1)-(3).
         spread: Their standard deviation, as in `spread_of`.
-        count: How many random states are drawn.
+        count: The number of random states.
         seed: The seed of the random numbers.
     """
     random = np.random.default_rng(seed)

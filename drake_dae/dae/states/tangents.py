@@ -13,14 +13,14 @@ def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 
     Args:
         gradients: Of the constraints, independent rows, shape (k, n).
-        scale: How large the states are, shape (n,).
+        scale: The sizes of the states, shape (n,).
     """
     rows = _unit_rows(gradients * scale)
     return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
 
 
 def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
-    """States that are coordinates, (n - k,), and how all states move with them, (n, n - k).
+    """States that are coordinates, (n - k,), and the derivatives of all by them, (n, n - k).
 
     Unlike an orthonormal basis this one leaves a triangular system triangular. The arguments are
     those of `tangent`.

@@ -13,7 +13,7 @@ from drake_dae.errors import AssumptionError
 
 
 class Cause(Enum):
-    """What a violation is; the value says what can be done about it."""
+    """The kind of a violation; the value is the remedy."""
 
     COUNT = "Remove the redundant ones"
     CONSTRAINT_DEGREE = (
@@ -68,16 +68,16 @@ class Violation:
     Attributes:
         assumption: Its number in the paper.
         cause: What is wrong.
-        names: The names of the constraints or outputs that it is about.
-        order: The order of the derivative of a constraint or output that it is about, if any.
+        names: The names of the constraints or outputs concerned.
+        order: The order of the derivative concerned, if any.
         state: A consistent state where the assumption fails, shape (n,); None if it fails
             everywhere.
         singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
             if the rank is lost.
-        least: Below this it counts as lost, `DaeSystem.least_margin`.
-        combinations: The constraints that follow from others there, if the rank of A(x) is lost;
-            the outputs, if that of B(x) is, or if they follow from the constraints.
-        deciding: The parameters and signals that decide, where it is so at their defaults alone.
+        least: The threshold for a lost rank, `DaeSystem.least_margin`.
+        combinations: The dependent constraints there if A(x) lost its rank; the dependent outputs
+            if B(x) did, or if outputs depend on the constraints.
+        deciding: The parameters and signals whose defaults cause the violation, if others do not.
     """
 
     assumption: int
@@ -102,7 +102,7 @@ class Violation:
         return f"{text}. This depends on numbers: {acts.get(self.cause, regular)} {self.deciding}"
 
     def error(self) -> AssumptionError:
-        """The exception to raise where the violation ends what was asked for."""
+        """The exception for this violation."""
         return AssumptionError(str(self), self.assumption, self.state, self)
 
     def _found(self) -> str:
@@ -196,11 +196,11 @@ def rank_violation(
     vanishing: tuple[int, Cause],
     dependent: tuple[int, Cause],
 ) -> Violation | None:
-    """What a singular matrix violates: one assumption if a whole row vanishes, another if not.
+    """The violation by a singular matrix: one assumption if a whole row vanishes, else another.
 
     Args:
-        margin: How far the matrix is from singular; None if there is no matrix.
-        signals: What its rows are about.
+        margin: The margin of the matrix; None if there is no matrix.
+        signals: The signals of its rows.
         degrees: The order of the derivative that each row belongs to.
         vanishing, dependent: The number of the assumption, and the cause.
 

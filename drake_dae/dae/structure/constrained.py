@@ -1,6 +1,7 @@
-"""What the constraints alone decide of a system: Assumptions (1)-(3), N*, and (9)-(14)."""
+"""The structure of the constraints alone: Assumptions (1)-(3), N*, and (9)-(14)."""
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -25,13 +26,15 @@ from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
+Kind = TypeVar("Kind", bound="ConstraintStructure")
+
 
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class ConstraintStructure:
-    """What the constraints alone decide of a system, by Assumptions (1)-(3): how it moves.
+    """The structure of the constraints of a system, by Assumptions (1)-(3).
 
-    Simulation needs no more: neither controls nor controlled outputs.
+    It is enough for simulation. Controls and controlled outputs are not needed.
 
     Attributes:
         system: The system.
@@ -40,7 +43,7 @@ class ConstraintStructure:
         derivatives: The time derivatives along the motion on N*.
         elimination: Equations (9)-(14) as expressions; not finite where A(x) is singular.
         states: The consistent states at which numbers were decided, shape (samples, n).
-        scale: How large each state is over them and the states near which they were sought, shape
+        scale: The size of each state over them and the guesses from which they were found, shape
             (n,).
         constraint_margin: The margin of A(x), Assumption (2), without friction; None without
             constraints.
@@ -67,7 +70,7 @@ class ConstraintStructure:
     def constraint_matrix(
         self, state: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """A(x) at a state, shape (m, m): of a contact without friction its mobility in 1/kg.
+        """A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
 
         Args:
             state: x, shape (n,).
@@ -84,10 +87,11 @@ class ConstraintStructure:
         """An expression on N* as a function of state, control and parameters.
 
         Args:
-            name: What it is, for messages.
+            name: Its name in messages.
             value: An expression of the state and of the control `derivatives.control`.
-            needs_control: Whether the function takes the control; without one it is put to 0.
-            doubt: Negative where its values are not valid though A(x) is regular.
+            needs_control: Whether the function takes the control; otherwise the control is 0.
+            doubt: An expression that is negative where the values are not valid though A(x) is
+                regular.
 
         Returns:
             A function with the output "value", and with A(x) as the matrix that must be regular.
@@ -108,7 +112,7 @@ def find_constraint_structure(
     """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3).
 
     Args:
-        system: The system (1)-(3); it may be without controls and outputs, and B(x) singular.
+        system: The system (1)-(3). It may have no controls or outputs, and a singular B(x).
         spread, count, seed: How states are drawn, as for `find_structure`.
 
     Raises:
@@ -121,7 +125,7 @@ def find_constraint_structure(
     violation = constraint_violation(found)
     if violation:
         raise violation.error()
-    # Rows of n* that are zero but for round-off are no feedthrough.
+    # Rows of n* that are only round-off are no feedthrough.
     _, n_star = eliminated_at(samples, found.elimination)
     acts = np.any([value for value, _ in n_star], axis=(0, 2))
     rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
@@ -132,39 +136,48 @@ def find_constraint_structure(
 def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
-    """The constraint structure of a system, as given, or found where it is not known yet.
+    """The given constraint structure of a system, or that found if none is given.
 
     Args:
-        owner: Who needs it, for messages.
+        owner: The caller's name in messages.
         system: The system (1)-(3).
         structure: The structure, or that with the outputs; None to find it.
 
     Raises:
-        AssumptionError, InconsistentStateError: There is none; see `find_constraint_structure`.
-        ModelError: The structure is none, or that of another system.
+        AssumptionError, InconsistentStateError: It has none; see `find_constraint_structure`.
+        ModelError: It is not a structure, or that of another system.
     """
-    if structure is None:
-        return find_constraint_structure(system)
-    if not isinstance(structure, ConstraintStructure):
-        raise ModelError(
-            f"{owner}: structure must be what find_structure or find_constraint_structure returns, "
-            f"got {type(structure).__name__}"
+    return (
+        find_constraint_structure(system)
+        if structure is None
+        else checked_structure(
+            owner,
+            system,
+            structure,
+            ConstraintStructure,
+            "find_structure or find_constraint_structure",
         )
-    check_same_system(owner, system, structure)
-    return structure
+    )
 
 
-def check_same_system(owner: str, system: DaeSystem, structure: ConstraintStructure) -> None:
-    """Refuses the structure of another system.
+def checked_structure(
+    owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
+) -> Kind:
+    """The given structure of a system.
 
     Raises:
-        ModelError: It is.
+        ModelError: It is not a structure of this kind, or that of another system.
     """
+    if not isinstance(structure, kind):
+        raise ModelError(
+            f"{owner}: structure must be what {made_by} returns, got {type(structure).__name__}"
+        )
     if structure.system is not system:
         raise ModelError(
             f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
             f"'{system.name}'; leave it out, or find that of this one"
         )
+    return structure
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
@@ -207,8 +220,8 @@ def examine_constraints(
     check_mass_matrix(system, samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
-    # Where friction turns it around the contact jams, which is decided at the states of a motion.
-    matrix = system.rubbing.without_friction(elimination.constraint_matrix)
+    # Friction can change the sign of A(x); the Painleve paradox is tested along motions.
+    matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
     found = ConstraintStructure(
         system=system,
         constraint_degrees=tuple(len(chain) for chain in chains),
@@ -223,7 +236,7 @@ def examine_constraints(
 
 
 def check_system(system: DaeSystem) -> None:
-    """Refuses a system in which there is too much to keep, or no mass matrix.
+    """Refuses a system with too many constraints, or with an invalid mass matrix.
 
     Raises:
         AssumptionError: There are more constraints than states.
@@ -242,7 +255,7 @@ def constraint_violation(found: ConstraintStructure) -> Violation | None:
     violation = rank_violation(margin, signals, found.constraint_degrees, *causes)
     if margin is None:
         return None
-    matrix = found.system.rubbing.without_friction(found.elimination.constraint_matrix)
+    matrix = found.system.frictional_contacts.without_friction(found.elimination.constraint_matrix)
     violation = with_numbers(violation, 2, found.manifold, found.states, matrix)
     if violation is None or violation.cause is Cause.BOUNDS:
         return violation
@@ -265,18 +278,18 @@ def with_numbers(
     states: FloatArray,
     matrix: ca.SX,
 ) -> Violation | None:
-    """What a matrix violates, once it is looked at with other parameters than the default ones.
+    """The violation by a matrix, including parameters other than the defaults.
 
     Args:
-        violation: What its rank violates with these; None if nothing.
+        violation: The violation with the defaults; None if there is none.
         assumption: The number of the assumption that it is regular.
         manifold: N*.
         states: Consistent states, shape (samples, n).
         matrix: The matrix.
 
     Returns:
-        The violation with the numbers that decide, where it is regular with others; or that it is
-        singular within bounds that somebody gave.
+        The violation with the deciding numbers, if the matrix is regular for others; or the
+        violation that it is singular within given bounds.
     """
     system = manifold.system
     bounded = any(p.bounds is not None for p in system.parameters)
@@ -284,7 +297,7 @@ def with_numbers(
         return None
     function = system.trace("rank", {"matrix": ca.densify(matrix)}, often=False)
 
-    @np.errstate(all="ignore")  # Not finite is not regular.
+    @np.errstate(all="ignore")  # A matrix that is not finite is not regular.
     def determinant(state: FloatArray, parameters: FloatArray) -> float:
         """1 or -1 as its sign, and 0 where the matrix is singular."""
         value = function(state, parameters)[0].reshape(matrix.shape)
@@ -306,14 +319,14 @@ def with_numbers(
 
 
 def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
-    """What is really violated where redundant constraints led to a singular configuration.
+    """The actual violation if redundant constraints led to a singular configuration.
 
-    Off N* they are more than there is to keep, and the states that keep them are those.
+    Off N* they are overdetermined, and only singular configurations satisfy them.
     """
     if violation.cause not in (Cause.CONSTRAINT_DEGREE, Cause.SINGULAR_CONFIGURATION):
         return violation
     combinations = find_redundant(system)
-    # A gradient that vanishes wherever its constraint holds follows from no other one.
+    # A gradient that vanishes wherever its constraint holds does not depend on others.
     if not combinations or not all(combination.others for combination in combinations):
         return violation
     names = tuple(signal.name for signal in system.constraint_output_signals)

@@ -1,4 +1,4 @@
-"""Which constraints and outputs follow from which others, where A(x) or B(x) loses its rank."""
+"""The dependent constraints and outputs where A(x) or B(x) loses its rank."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from drake_dae.trace.newton import are_dependent
 from drake_dae.trace.round_off import SINGULAR, equilibration
 
 _ON_MANIFOLD = 1e-8
-"""A state on N* may leave this much of a constraint. An output that is a constraint times a factor
-has it in its gradient."""
+"""The residual of a constraint that a state on N* may have. It appears in the gradient of an output
+that is a constraint times a factor."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Combination:
     Attributes:
         name: The constraint or the output whose row it is.
         others: The constraints or outputs that it follows from.
-        factors: Theirs, shape (len(others),), at the state where this was found.
+        factors: The factors, shape (len(others),), at the state where this was found.
         constant: Whether the factors are the same at all examined states.
     """
 
@@ -120,7 +120,7 @@ def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combin
 
 
 def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
-    # Alone in its column, a residual counts as much as any other entry.
+    # A residual alone in its column counts as much as any other entry.
     sizes = np.abs(gradients * scale)
     return np.where(sizes < _ON_MANIFOLD * sizes.max(axis=1, keepdims=True), 0, gradients)
 
@@ -131,9 +131,9 @@ def combinations_of(
     """The rows that follow from those before them at the first of some states.
 
     Args:
-        names: What the rows are about.
+        names: The names of the rows.
         values: The matrix at each state.
-        least: What is left of a row that follows from others, relative to its length, is below it.
+        least: A row depends on others if its remainder, relative to its length, is below this.
     """
     matrix, lengths = _scaled(values[0])
     kept: list[int] = []
@@ -155,7 +155,7 @@ def combinations_of(
 
 
 def _fit(matrix: FloatArray, kept: list[int], row: int) -> tuple[FloatArray, float]:
-    """The factors by which rows make another one, and what they leave of it."""
+    """The factors of rows whose combination is nearest to another row, and the remainder."""
     if not kept:
         return np.zeros(0), float(np.linalg.norm(matrix[row]))
     factors = scipy.linalg.lstsq(matrix[kept].T, matrix[row])[0]
@@ -163,6 +163,6 @@ def _fit(matrix: FloatArray, kept: list[int], row: int) -> tuple[FloatArray, flo
 
 
 def _scaled(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A matrix with rows and columns of about length one, and what its rows were divided by."""
+    """A matrix with rows and columns of about length one, and the divisors of its rows."""
     rows, columns = equilibration(matrix)
     return matrix / rows[:, None] / columns, rows

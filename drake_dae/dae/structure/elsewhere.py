@@ -1,4 +1,4 @@
-"""What is zero with the default parameters and signals at rest, looked at with other numbers."""
+"""Entries that are zero for the default parameters and signals at rest, tested for other values."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,35 +14,35 @@ from drake_dae.errors import NegligibleWarning
 from drake_dae.trace.round_off import Sized
 
 Row = Callable[[FloatArray, FloatArray, float], Sized]
-"""A row of numbers at a state, with values of all parameters, and what is negligible in it."""
+"""A row of numbers at a state for values of all parameters, and the threshold for zero."""
 
 DOUBTFUL = 1e-13
-"""What is above this, relative to the others in its row or column, may be meant."""
+"""An entry above this, relative to the others in its row or column, may be intended."""
 
 
 class Elsewhere:
-    """What is zero with the default parameters and not with other ones, by constraint or output."""
+    """Rows that are zero for the default parameters and not for others, by constraint or output."""
 
     def __init__(self) -> None:
         self._found: dict[int, Violation] = {}
 
     def look(self, index: int, violation: Violation, samples: Samples, row: Row) -> None:
-        """Looks whether a row that is zero with the default parameters is zero with others, too.
+        """Tests whether a row that is zero for the default parameters is zero for others as well.
 
         Args:
-            index: Which constraint or output the row belongs to; the first that is not zero counts.
-            violation: What it is if it is not.
+            index: The constraint or output of the row; the first row that is not zero is kept.
+            violation: The violation if the row is not zero.
             samples: The states at which it is zero.
             row: The row at a state, with values of all parameters.
 
         Warns:
-            NegligibleWarning: It counts as zero, and may be meant.
+            NegligibleWarning: An entry counts as zero but may be intended.
         """
         if index in self._found:
             return
         system = samples.system
 
-        @np.errstate(all="ignore")  # Not finite is no answer.
+        @np.errstate(all="ignore")  # Values that are not finite decide nothing.
         def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
             value, size = row(state, parameters, negligible)
             return bool(np.any(np.abs(value) > VISIBLE * size))
@@ -65,15 +65,15 @@ class Elsewhere:
             )
 
     def refuse(self, index: int) -> None:
-        """Refuses a constraint or output whose degree is another one with other parameters.
+        """Refuses a constraint or output whose degree differs for other parameters.
 
         Raises:
-            AssumptionError: It is; with the numbers that decide.
+            AssumptionError: The degree differs; the message has the deciding numbers.
         """
         if index in self._found:
             raise self._found[index].error()
 
     def deciding(self, indices: Sequence[int]) -> Deciding | None:
-        """The numbers that decide about some on which nothing acts with the default ones."""
+        """The deciding numbers for constraints or outputs on which nothing acts at the defaults."""
         found = (self._found[i].deciding for i in indices if i in self._found)
         return next(found, None)

@@ -1,4 +1,4 @@
-"""What a mass matrix E(x) of E x' = f + g v + h u must be."""
+"""Checks of a mass matrix E(x) of E x' = f + g v + h u."""
 
 import casadi as ca
 import numpy as np
@@ -9,7 +9,7 @@ from drake_dae.errors import ModelError
 
 
 def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Refuses what is no mass matrix: its factorization LDL^T reads one triangle alone.
+    """Refuses an invalid mass matrix, since LDL^T reads only one triangle of it.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.
@@ -17,12 +17,8 @@ def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
     function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
     for state in states:
         mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
-        length = np.sqrt(np.abs(np.diag(mass)))
-        if np.all(np.isfinite(mass)) and np.all(length > 0.0):
-            scaled = mass / length / length[:, None]
-            symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
-            if symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
-                continue
+        if is_positive_definite(mass):
+            continue
         raise ModelError(
             f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
             f"{show(state)}. An equation in which no derivative stands is a constraint 0 = k(x) "
@@ -30,3 +26,13 @@ def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
             "make z a state with z' = v, v a new constraint input, and keep the equation as "
             "constraint"
         )
+
+
+def is_positive_definite(matrix: FloatArray) -> bool:
+    """Whether a matrix is symmetric and positive definite, independent of units."""
+    length = np.sqrt(np.abs(np.diag(matrix)))
+    if not (np.all(np.isfinite(matrix)) and np.all(length > 0.0)):
+        return False
+    scaled = matrix / length / length[:, None]
+    is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+    return bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)

@@ -1,4 +1,4 @@
-"""Through a singular configuration: how a system moves where its constraints lose their rank."""
+"""Motion through a singular configuration, where the constraints lose their rank."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,29 +12,29 @@ from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import positive
 
 WINDOW = 1e-3
-"""So near to a singular configuration, as the sine of an angle between gradients, A(x) is not used.
-Beyond, the round-off of a state on N* makes errors of 1e-16 / WINDOW^3 in what accelerates it off
-its branch; within, what is left out makes some of WINDOW, before and after with opposite signs.
-Of 1e-4, 3e-4 and 1e-3 the last one had the smallest errors after passing."""
+"""A(x) is not used if the sine of the angle between gradients is below this. Outside, the round-off
+of a state on N* causes errors of 1e-16 / WINDOW^3 in the acceleration off its branch; inside,
+neglected terms cause errors of the order of WINDOW, with opposite signs before and after. Of 1e-4,
+3e-4 and 1e-3 the last had the smallest errors."""
 
 NULL = 10.0 * WINDOW**2
-"""An eigenvalue of A(x), its diagonal usually 1, below this belongs to gradients that are lost."""
+"""An eigenvalue of A(x), scaled to a diagonal of 1, below this belongs to lost gradients."""
 
 CROSSING = 1e-3
-"""A motion crosses a singular configuration if the lost gradients come back at least so fast,
-relative to how fast gradients turn."""
+"""A motion crosses a singular configuration if the lost gradients return at least at this rate,
+relative to the rate at which gradients turn."""
 
 BRANCH = 0.05
-"""By so much a velocity may miss the directions of the branches, relative to what is between them:
-that of a trial state does, a little."""
+"""The allowed deviation of a velocity from the directions of the branches, relative to the angle
+between them. The velocity of a trial state deviates slightly."""
 
 MISS, SEARCH = 1e-5, 5
-"""N* misses a singular configuration if it does not come as near as that, as the sine of an angle;
-and the steps of Newton's method that tell, from a state in the window."""
+"""N* misses a singular configuration if the sine of the angle stays above MISS. SEARCH is the
+number of Newton steps for this test, from a state in the window."""
 
 STEADY, NEAREST = 0.2, 1e-6
-"""By so much of itself the speed of crossing may change on the way to the configuration, or on one
-of this length where it is nearer: otherwise the system is all but at rest there."""
+"""The allowed relative change of the crossing speed on the way to the configuration (or on a way of
+length NEAREST if it is nearer). With a larger change the system is almost at rest there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +42,18 @@ class Passage:
     """The motion of a system on N* through a singular configuration that it crosses.
 
     Let n be the combinations of constraints whose gradients vanish in the configuration, n^T C = 0
-    with the gradients C of the last derivatives c = L_f^(r_i - 1) k_i. There n^T c' = 0 says
-    nothing of the acceleration, and an input along n has no effect. But both are limits: on the
-    branch of N* on which the system comes, n^T c'' = 0 holds too, which is an equation for the
-    acceleration, since n^T C turns as the system moves; and a bounded force of the constraints acts
-    in the direction in which the vanishing n-th column of g comes back. So
+    with the gradients C of the last derivatives c = L_f^(r_i - 1) k_i. There n^T c' = 0 does not
+    restrict the acceleration, and an input along n has no effect. Both are limits: on the branch of
+    N* on which the system arrives, n^T c'' = 0 holds as well, which is an equation for the
+    acceleration, since n^T C changes with the motion; and a bounded constraint force acts in the
+    direction in which the vanishing column of g returns. So
 
         E x' = f + g v + h u + (g' n) s,    P c' = 0,    n^T c'' = 0,
 
-    with P the constraints that are left, determines x'. It is the branch that the velocity points
-    along: where the system is at rest, or N* has a cusp, nothing tells how to go on. Where N* only
-    comes near to a singular configuration, by more than `MISS`, it is not in it. The inputs v
-    have no part along n: those of the branch grow there without bound, as 1 / time as a rule.
+    with the remaining constraints P determines x'. The branch is that of the velocity. If the
+    system is at rest, or N* has a cusp, the continuation is undetermined. If N* only comes near a
+    singular configuration, by more than `MISS`, it does not pass through it. The inputs v have no
+    component along n; there they grow without bound, usually as 1 / time.
 
     Attributes:
         structure: The structure of the system.
@@ -67,10 +67,10 @@ class Passage:
         """x' and v at a state next to a singular configuration, shapes (n,) and (m,).
 
         Returns:
-            None if the system does not cross one there: its gradients are as independent as
-            anywhere, or are lost along its way, or it is at rest, or its velocity is on no branch;
-            if it just misses one; if A(x) is not symmetric, as with friction; or if constraints
-            have other degrees than 2, there are exogenous signals, or shared forces.
+            None if the system does not cross one there: its gradients are independent, or stay
+            dependent along its motion, it is at rest, its velocity is not along a branch, or it
+            narrowly misses one. None also if A(x) is not symmetric, as with friction, if
+            constraints have other degrees than 2, or with exogenous signals or shared forces.
         """
         system, n = self.structure.system, state.size
         if self.doubt is None:
@@ -96,7 +96,7 @@ class Passage:
             return None
         kept, null = unit[:, None] * vectors[:, ~lost], unit[:, None] * vectors[:, lost]
 
-        # As if the lost constraints were not there.
+        # The motion without the lost constraints.
         free = values["f"][:, 0] + values["h"] @ control
         c_rate = self._along(state, free, parameters)[0]
         v = -kept @ ((kept.T @ c_rate) / eigenvalues[~lost])
@@ -106,7 +106,7 @@ class Passage:
         least, most = _return_of_lost(mass, values["g"] @ kept, columns)
         if not least > CROSSING**2 * most:
             return None
-        # With r = 2, c = J v: on a branch the lost part of J' v is zero, too.
+        # With r = 2, c = J v: on a branch the lost part of J' v is zero as well.
         moving = np.where(np.any(values["g"], axis=1), state, 0.0)
         energy = float(moving @ mass @ moving)
         if not np.linalg.norm(null.T @ c_rate) <= BRANCH * np.sqrt(most * energy):
@@ -115,7 +115,7 @@ class Passage:
         if not missed * np.sqrt(most) < MISS**2 * np.sqrt(energy):
             return None
 
-        # With what brings them back.
+        # With the input directions that return.
         ways = np.hstack([values["g"] @ kept, np.linalg.solve(mass, turning @ null)])
         for _ in range(3):
             c_rate, c_second, slope, _, _ = self._along(state, rate, parameters)
@@ -134,7 +134,7 @@ class Passage:
     def _missed(
         self, state: FloatArray, parameters: FloatArray, kept: FloatArray, null: FloatArray
     ) -> float:
-        """By how much constraints are off N* in the singular configuration next to a state.
+        """The residual of the constraints in the singular configuration next to a state.
 
         There P k = 0 and J^T n = 0, which is solved for positions and for n = null + kept M by
         Newton's method. Where n^T k is not zero, N* comes near to it and turns away.
@@ -183,7 +183,7 @@ class Passage:
 
     @cached_property
     def doubt(self) -> ca.SX | None:
-        """Negative where `motion` should be asked; None where there is nothing to cross."""
+        """Negative where `motion` is needed; None if no singular configuration can be crossed."""
         elimination, system = self.structure.elimination, self.structure.system
         if set(self.structure.constraint_degrees) != {2}:
             return None
@@ -194,7 +194,7 @@ class Passage:
 
     @cached_property
     def _sizes(self) -> FloatArray:
-        """The usual size of the diagonal of A(x): near a configuration its entries may vanish."""
+        """The usual size of the diagonal of A(x), whose entries may vanish near a configuration."""
         m = self.structure.system.num_constraints
         values = self.structure.system.parameter_values
         sizes = [
@@ -215,7 +215,7 @@ class Passage:
 
     @cached_property
     def _derivatives(self) -> TracedFunction:
-        """c', c'' and its slope with x', g' and g'', with the part of x'' that x' tells."""
+        """c', c'' and its derivative by x', g' and g'', with the part of x'' that x' determines."""
         structure, system = self.structure, self.structure.system
         x, rate = system.state, ca.SX.sym("rate", system.num_states)
         ends = np.cumsum(structure.constraint_degrees) - 1
@@ -263,12 +263,12 @@ def _is_plain(mass: ca.SX, row: int) -> bool:
 
 
 def _return_of_lost(mass: FloatArray, kept: FloatArray, turning: FloatArray) -> tuple[float, float]:
-    """How fast lost gradients come back, and how fast gradients turn; both squared.
+    """The rate at which lost gradients return, and that at which gradients turn; both squared.
 
     Args:
         mass: E.
-        kept: E^-1 g of what is left.
-        turning: How fast the columns of g turn, those of what is left first.
+        kept: E^-1 g of the remaining constraints.
+        turning: The rates of the columns of g, those of the remaining constraints first.
     """
     speeds = turning.T @ np.linalg.solve(mass, turning)
     count = kept.shape[1]

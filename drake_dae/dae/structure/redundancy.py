@@ -18,11 +18,11 @@ from drake_dae.trace.newton import DEPENDENT, ROUND_OFF
 from drake_dae.trace.round_off import equilibration, positive
 
 SEARCH = 200
-"""After so many steps the search for a state at which all constraints hold ends; a dozen do."""
+"""The largest number of steps to a state where all constraints hold; a dozen are enough."""
 
 PREFERRED = 0.5
-"""Of several constraints that could stay the first is taken that is so independent of those that
-stay already, relative to the most independent one."""
+"""The next constraint to keep is the first whose independence of those already kept is at least
+this fraction of the best."""
 
 
 @checked(ModelError)
@@ -30,9 +30,9 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
     """The same motion with fewer constraints: those that follow from others are left out.
 
     A constraint goes with the constraint input of the same number. The motion is the same, since
-    the inputs that remain act in all directions in which those that go did. What the forces of the
-    remaining constraints are is a choice: the split among redundant ones is not determined by
-    (1)-(3), and another choice has other forces with the same sum g(x) v.
+    the inputs that remain act in all directions in which those that go did. The forces of the
+    remaining constraints depend on this choice: the split among redundant constraints is not
+    determined by (1)-(3), only the sum g(x) v is.
 
     Args:
         system: The system (1)-(3).
@@ -41,8 +41,8 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
 
     Raises:
         InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: No constraint has that name; or one that goes does not follow from those that
-            stay, its input acts in a direction of its own, or an output is its force.
+        ModelError: No constraint has that name; or one that is left out is not redundant, its input
+            acts in an independent direction, or an output is its force.
     """
     samples = consistent_samples(system)
     if names is None:
@@ -69,17 +69,17 @@ def find_redundant(system: DaeSystem) -> tuple[Combination, ...]:
 
 
 def consistent_samples(system: DaeSystem) -> Samples:
-    """Consistent states around the nominal one, as far as the constraints k_i tell."""
+    """Consistent states around the nominal one, by the constraints k_i alone."""
     return Samples(_Redundant(system), draw(system, None, 12, 0))
 
 
 class _Redundant(Manifold):
-    """The states at which all constraints k_i hold, however many of them are redundant.
+    """The states at which all constraints k_i hold, redundant ones included.
 
-    Next to these states the gradients of redundant constraints are nearly dependent, and a Newton
-    step follows the little by which they are not to far away, or to a singular configuration. By
-    Levenberg and Marquardt, with a damping as large as the residual, steps stay short and converge
-    quadratically nevertheless (Yamashita and Fukushima 2001).
+    Near these states the gradients of redundant constraints are nearly dependent, so that Newton
+    steps become very long or lead to a singular configuration. Levenberg-Marquardt steps with a
+    damping as large as the residual stay short and still converge quadratically (Yamashita and
+    Fukushima 2001).
     """
 
     def __init__(self, system: DaeSystem) -> None:
@@ -116,7 +116,7 @@ class _Redundant(Manifold):
 
 
 def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
-    """The constraints that stay where those with given names go.
+    """The constraints that remain without those of the given names.
 
     Raises:
         ModelError: No constraint has that name.
@@ -165,7 +165,7 @@ def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
 
 
 def check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
-    """Refuses to leave out what the remaining constraints do not replace."""
+    """Refuses to leave out constraints that are not redundant."""
     system = samples.system
     moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
     gradients = samples.values(
@@ -200,7 +200,7 @@ def _rank(matrix: FloatArray) -> int:
 def _fewer(
     system: DaeSystem, kept: list[int]
 ) -> Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None:
-    """The shorter form of a system, where it has one, of the inputs and outputs that stay."""
+    """The implicit form of a system, if it has one, for the remaining inputs and outputs."""
     whole = system.implicit
     if whole is None:
         return None

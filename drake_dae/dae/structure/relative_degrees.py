@@ -1,4 +1,4 @@
-"""Relative degrees by Assumptions (1), (3) and (4), and the chains that they end.
+"""Relative degrees by Assumptions (1), (3) and (4), and the chains of derivatives.
 
 Whether an input acts on a derivative is decided by the structure of the expression first, then by
 its numbers at consistent states, with the default parameters and signals at rest; what is zero
@@ -55,7 +55,7 @@ def constraint_chains(
     """
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
-    chains = [[system.k[i]] for i in range(system.num_constraints)]
+    chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
     undecided, elsewhere = list(range(system.num_constraints)), Elsewhere()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
@@ -107,7 +107,7 @@ def constraint_chains(
 
 
 class OutputChains(NamedTuple):
-    """What Assumption (4) decides of the outputs, as `Structure` explains its fields."""
+    """The result of Assumption (4) for the outputs; see `Structure` for the fields."""
 
     chains: tuple[tuple[ca.SX, ...], ...]
     drift: ca.SX
@@ -150,7 +150,7 @@ def output_chains(
             if acts[row].all():
                 elsewhere.refuse(i)
                 drift[i] = following[row]
-                control_matrix[i, :] = rows[row, :]
+                control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
                 highest_derivatives[i] = moving[row]
             elif acts[row].any():
@@ -179,8 +179,8 @@ def output_chains(
             if rows[row, :].nnz():
                 violation = Violation(4, Cause.NUMBERS, (names[i],), len(chains[i]))
                 elsewhere.look(i, violation, samples, numbers.along(chains[i][-1], "h*"))
-            # By Theorem 2.1 these differentials are independent if the output has a degree; worth
-            # a look where nothing acts although the structure says that it could.
+            # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
+            # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
             if (
                 used.numel() >= system.num_states
@@ -217,11 +217,12 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
 
 
 class _Rows:
-    """How inputs act, at a state with values of all parameters.
+    """The action of inputs at a state, for values of all parameters.
 
     Args:
-        samples: States with the default parameters, near which others are looked at.
-        elimination: Equations (9)-(14), for what the control does through the constraint inputs.
+        samples: States with the default parameters.
+        elimination: Equations (9)-(14), for the action of the control through the constraint
+            inputs.
     """
 
     def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
@@ -277,12 +278,12 @@ class _Rows:
 
 
 def _acts(numbers: FloatArray) -> Booleans:
-    """Which rows are not zero where: shape (a, samples), of numbers of shape (samples, a, k)."""
+    """The rows that are not zero, shape (a, samples), of numbers of shape (samples, a, k)."""
     return np.asarray(numbers.any(axis=2)).T
 
 
 def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:
-    """Which expressions an input along the fields can influence at all, by structure."""
+    """The expressions that an input along the fields can influence, by structure."""
     influence = _pattern(drift, state)
     moved = nonzeros(fields.sparsity()).any(axis=1)
     for _ in range(state.numel()):

@@ -33,22 +33,22 @@ def share_forces(
 ) -> DaeSystem:
     """The same motion with fewer constraints, and the forces of all by least squares.
 
-    On N* the input of a constraint that is left out acts as a combination of those that stay,
-    E^-1 g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all
-    v_all = (v_stay, v_out) with one v move the system in the same way: the split among redundant
-    constraints is not determined by (1)-(3). Shown is the one with the least sum of c_i v_i^2,
+    On N* the input of a constraint that is left out acts as a combination of those that stay, E^-1
+    g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all v_all =
+    (v_stay, v_out) with one v move the system in the same way: the split among redundant
+    constraints is not determined by (1)-(3). The reported split has the least sum of c_i v_i^2,
 
         v_all = T v,   T = C^-1 G^T (G C^-1 G^T)^-1,   G = [1, D],   C = diag(c_1, ..., c_M),
 
-    whichever constraints stay. It is more than a convention where the c_i are the compliances of
-    what the constraints are made of, in m/N or rad/(N m): then it is how stiff springs in place of
-    the constraints share a load that changes slowly (Menabrea 1858), and only ratios matter. With
-    all c_i = 1, the default, it is that of equal stiffness in SI units, which means little where
-    forces and moments are redundant together.
+    and does not depend on which constraints are kept. It is physical if the c_i are the compliances
+    of the constrained parts, in m/N or rad/(N m): stiff springs in place of the constraints share a
+    slowly changing force in this way (Menabrea 1858). Only ratios matter. With all c_i = 1, the
+    default, stiffnesses are equal in SI units, which means little if forces and moments are
+    redundant together.
 
     The system has the constraints that stay, and its `sharing` shows the forces of all on the port
-    `constraint_force` of a plant. Those that stay must stay independent wherever the system moves:
-    else A(x) becomes singular there, and others may do better.
+    `constraint_force` of a plant. Those that are kept must stay independent along the whole motion,
+    otherwise A(x) becomes singular; then keep others.
 
     Args:
         system: The system (1)-(3).
@@ -61,10 +61,9 @@ def share_forces(
 
     Raises:
         InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: There is no such constraint or constraint input, or a compliance is not
-            positive; one that goes does not follow from those that stay, or its input acts in a
-            direction of its own; or an output is no function of the sum G v_all, and therefore not
-            determined.
+        ModelError: There is no such constraint or constraint input; a compliance is not positive; a
+            constraint that is left out is not redundant, or its input acts in an independent
+            direction; or an output is not a function of the sum G v_all, and so not determined.
     """
     weights = _weights(system, compliances or {})
     samples = consistent_samples(system)
@@ -97,9 +96,9 @@ def share_forces(
 
 
 def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
-    """Where the constraints hold that were left out as redundant; None if none were.
+    """The states at which the redundant constraints that were left out hold; None without any.
 
-    N* is a part of it, and so may states be that are assembled in another way.
+    It contains N*, and possibly states of another assembly mode.
     """
     sharing = system.sharing
     if sharing is None:
@@ -137,7 +136,7 @@ def _undetermined(samples: Samples, gather: ca.SX, split: ca.SX) -> tuple[str, .
     """The constraint inputs that are not determined.
 
     Raises:
-        ModelError: An output is not.
+        ModelError: An output is not determined.
     """
     system = samples.system
     every = np.eye(system.num_constraints)
@@ -160,7 +159,7 @@ def _undetermined(samples: Samples, gather: ca.SX, split: ca.SX) -> tuple[str, .
 
 
 def _changes(rows: FloatArray, gather: FloatArray, split: FloatArray) -> Booleans:
-    """Which rows S of S v_all change with v_all while G v_all stays: S is not S T G."""
+    """The rows S of S v_all that are not determined by G v_all: S is not S T G."""
     sized = np.abs(rows) + np.abs(rows) @ np.abs(split) @ np.abs(gather)
     changed, _ = without_round_off(rows - rows @ split @ gather, sized)
     return np.asarray(changed.any(axis=1))

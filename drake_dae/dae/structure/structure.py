@@ -1,9 +1,8 @@
-"""What kind of system it is: relative degrees, index, Assumptions (1)-(5) with their margins."""
+"""The structure of a system: relative degrees, index, Assumptions (1)-(5) with margins."""
 
 from dataclasses import dataclass, fields, replace
 
 import casadi as ca
-import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
@@ -13,13 +12,14 @@ from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Cause, Violation, rank_violation
 from drake_dae.dae.structure.constrained import (
     ConstraintStructure,
-    check_same_system,
+    checked_structure,
     constraint_violation,
     examine_constraints,
     guesses,
     with_numbers,
 )
 from drake_dae.dae.structure.dependence import combinations_of
+from drake_dae.dae.structure.mass_matrix import is_positive_definite
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.system import DaeSystem
@@ -41,8 +41,8 @@ class Structure(ConstraintStructure):
         control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p); of a
             system with a `control_metric` it has more columns than rows.
         chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
-        round_off: Which entries of B(x) are zero but for round-off at all of many states, of its
-            shape. A column of nothing else would be scaled up to the size of the others.
+        round_off: The entries of B(x) that are only round-off at all sampled states, in its shape.
+            A column of such entries would otherwise be scaled up to the size of the others.
         control_margin: The margin of B(x), Assumption (5).
     """
 
@@ -67,12 +67,7 @@ class Structure(ConstraintStructure):
     @property
     def output_order(self) -> tuple[int, ...]:
         """The outputs in the paper's order (15): those with mu_i >= 1 first."""
-        return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))
-
-    @property
-    def num_dynamic_outputs(self) -> int:
-        """s of (15), the number of outputs with mu_i >= 1."""
-        return len(self.layout.dynamic)
+        return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))  # (15)
 
     @property
     def zero_dynamics_dimension(self) -> int:
@@ -87,17 +82,17 @@ class Structure(ConstraintStructure):
     def motion_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
         """x' and v under the control of `control_for`, solved for along with it.
 
-        That takes no forward dynamics: with rigid joints it is kinematics, and no M(q) is factored.
+        No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
         Args:
             wanted: ubar of (28), shape (p, 1).
 
         Returns:
             x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
-            not determined; None where the control is not found in that way, and where friction may
-            leave the motion open though the control is determined.
+            not determined; None if the control is not found in this way, or if friction may leave
+            the motion undetermined.
         """
-        if self.system.control_metric is not None or self.system.rubbing:
+        if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
         motion = self.derivatives
         shown = ca.vertcat(motion.rate, motion.constraint_input)
@@ -110,7 +105,7 @@ class Structure(ConstraintStructure):
     def control_for(self, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
         """u = B(x)^-1 (-a(x) + wanted), for which z_i^(mu_i) = wanted_i on N*.
 
-        Where B(x) leaves some of u open, it is the u that `DaeSystem.control_metric` chooses.
+        If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
 
         Args:
             wanted: ubar of (28), shape (p, 1).
@@ -120,7 +115,7 @@ class Structure(ConstraintStructure):
         """
         found: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
-            found = self.derivatives.inverse(self.highest_derivatives, wanted)
+            found = self.derivatives.inverse(self.highest_derivatives, wanted)  # (28)
         if found is None:  # L_h* of an output vanishes, but not by structure.
             found = self.control_by_matrix(wanted)
         control, pivot, *_ = found
@@ -137,7 +132,7 @@ class Structure(ConstraintStructure):
         Returns:
             u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
         """
-        needed, metric = wanted - self.drift, self.system.control_metric
+        needed, metric = wanted - self.drift, self.system.control_metric  # (28)
         if metric is not None:
             return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
         factors = Factorization(self.control_matrix)
@@ -152,15 +147,15 @@ def find_structure(
 
     Whether an expression is zero is decided by its structure first, then by its numbers at
     consistent states drawn around `system.nominal_state`, with the default parameters and exogenous
-    signals at rest. What is zero there must be zero with all other numbers that parameters, signals
-    and their derivatives may have, see `Parameter.bounds`: otherwise the degree is another one once
-    they move, and the system is refused.
+    signals at rest. An expression that is zero there must be zero for all other values of
+    parameters, signals and their derivatives, see `Parameter.bounds`; otherwise the degree would
+    change with them, and the system is refused.
 
     Args:
         system: The system (1)-(3).
         spread: The standard deviation of the drawn states around the nominal one, a number for all
             or shape (n,); `DaeSystem.nominal_spread` if None.
-        count: How many states are drawn, at least 1.
+        count: The number of random states, at least 1.
         seed: The seed of the random numbers.
 
     Raises:
@@ -177,7 +172,7 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """The structure of a system, as given, or found where it is not known yet.
+    """The given structure of a system, or that found if none is given.
 
     Args:
         owner: Who needs it, for messages.
@@ -186,17 +181,13 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
 
     Raises:
         AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
-        ModelError: This is no system, or the structure is that of another one.
+        ModelError: It is not a system, or the structure is that of another one.
     """
-    if structure is None:
-        return find_structure(system)
-    if not isinstance(structure, Structure):
-        raise ModelError(
-            f"{owner}: structure must be what find_structure returns, got "
-            f"{type(structure).__name__}"
-        )
-    check_same_system(owner, system, structure)
-    return structure
+    return (
+        find_structure(system)
+        if structure is None
+        else checked_structure(owner, system, structure, Structure, "find_structure")
+    )
 
 
 def examine_structure(
@@ -210,7 +201,7 @@ def examine_structure(
     Raises:
         AssumptionError: There is no B(x), since one of Assumptions (1)-(3) is violated or an
             output has no degree.
-        InconsistentStateError, ModelError: There is no structure to find; see `find_structure`.
+        InconsistentStateError, ModelError: It has no structure; see `find_structure`.
     """
     _check_counts(system)
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
@@ -222,7 +213,7 @@ def examine_structure(
 
 
 def why_no_law(system: DaeSystem) -> str:
-    """Why there is no law (28) for a system, by counting alone; empty if there may be one."""
+    """Why a system has no law (28), by its numbers of inputs and outputs; empty if it may have."""
     p, q = system.num_controls, system.num_outputs
     if p == 0:
         return "there is no control input, so there is nothing to steer"
@@ -252,7 +243,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
     Raises:
         AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
             B(x) is left to `control_violation`.
-        ModelError: A function is not finite, or `control_metric` is no metric.
+        ModelError: A function is not finite, or `control_metric` is not valid.
     """
     _check_metric(samples)
     elimination = constrained.elimination
@@ -279,7 +270,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
 
 
 def _check_metric(samples: Samples) -> None:
-    """Refuses a `control_metric` that is none.
+    """Refuses an invalid `control_metric`.
 
     Raises:
         ModelError: It is not symmetric and positive definite at a state.
@@ -289,16 +280,11 @@ def _check_metric(samples: Samples) -> None:
         return
     values = samples.values(metric=system.control_metric)
     for state, (metric,) in zip(samples.states, values, strict=True):
-        length = np.sqrt(np.abs(np.diag(metric)))
-        if np.all(length > 0.0):
-            scaled = metric / length / length[:, None]
-            symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
-            if symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
-                continue
-        raise ModelError(
-            f"{system.name}: control_metric is not symmetric and positive definite at x = "
-            f"{show(state)}; give each control a positive weight"
-        )
+        if not is_positive_definite(metric):
+            raise ModelError(
+                f"{system.name}: control_metric is not symmetric and positive definite at x = "
+                f"{show(state)}; give each control a positive weight"
+            )
 
 
 def control_violation(structure: Structure) -> Violation | None:

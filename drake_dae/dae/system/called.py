@@ -1,4 +1,4 @@
-"""The functions of (1)-(3) as a user writes them in Python, called once with symbols."""
+"""Python functions of (1)-(3), called once with symbols."""
 
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace

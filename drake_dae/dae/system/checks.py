@@ -16,13 +16,13 @@ from drake_dae.trace.compiled import check_choice
 
 
 def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a system as it holds them, of those that were given.
+    """The fields of a system, converted from the given ones.
 
     Args:
         given: Every field by its name; see `DaeSystem`.
 
     Raises:
-        ModelError: They make no system; see `DaeSystem`.
+        ModelError: They do not form a system; see `DaeSystem`.
     """
     name = given["name"]
     if not isinstance(name, str):
@@ -116,7 +116,7 @@ def _numbers(name: str, given: Mapping[str, Any], size: int) -> dict[str, FloatA
 
 
 def _choice(name: str, given: Mapping[str, Any], controls: int, outputs: int) -> dict[str, ca.SX]:
-    """u_0 where it is left out; a choice where there is none, or no metric, is refused."""
+    """The default of u_0; refuses u_0 without a metric, and a metric that is not needed."""
     has_metric, has_free = (given[key] is not None for key in ("control_metric", "free_control"))
     if has_free and not has_metric:
         raise ModelError(f"{name}: free_control needs a control_metric that it is near in")

@@ -1,13 +1,13 @@
-"""Contacts that rub: when their forces are sure to push, and what becomes of the motion if not.
+"""Frictional contacts: whether a unique nonnegative force exists, and the motions if not.
 
 A contact that can only push keeps phi >= 0 with lambda >= 0 and phi'' lambda = 0, where
 
     phi'' = A(x) lambda + b(x, u).
 
 Without friction A = J M^-1 J^T is positive definite, and exactly one lambda fits. With friction it
-is A = J M^-1 (J^T - mu J_t^T s), not symmetric; one lambda fits for every b exactly where
-all principal minors of A are positive (a P-matrix: Samelson, Thrall and Wesler 1958). A minor that
-comes to zero is Painleve's paradox (1895): there the contact jams.
+is A = J M^-1 (J^T - mu J_t^T s), not symmetric; one lambda fits for every b exactly where all
+principal minors of A are positive (a P-matrix: Samelson, Thrall and Wesler 1958). A minor that
+reaches zero is the Painleve paradox (1895).
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,10 +23,10 @@ from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 
 FAR = 1e9
-"""Forces that are so much larger than what they balance are infinite but for round-off."""
+"""Forces that exceed what they balance by this factor count as infinite."""
 
 MOST = 8
-"""The most forces that can only push of a robot that rubs: every set of them is examined."""
+"""The largest number of unilateral forces with friction: every subset of them is examined."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Contact:
     friction: str | None = None
 
 
-class Jam(Enum):
-    """How many motions fit where a contact jams; the value says it."""
+class PainleveOutcome(Enum):
+    """The number of motions in a Painleve paradox; the value describes it."""
 
     INCONSISTENT = (
         "inconsistent: no force that pushes keeps the contact, and without a force it would be "
@@ -64,8 +64,8 @@ class Contacts:
         contacts: Its contacts.
 
     Attributes:
-        rows: Where the contacts stand among the constraint inputs; those of inputs that the system
-            has no more are left out.
+        rows: The indices of the contacts among the constraint inputs. Contacts whose input was
+            removed are left out.
         frictions: The coefficients of friction, in the order of the rows; None without one.
 
     Raises:
@@ -110,12 +110,12 @@ class Contacts:
         """An expression with all coefficients of friction zero."""
         if not self:
             return matrix
-        own = {p.name: p.symbol for p in self.frictions if p}  # Contacts may share one.
+        own = {p.name: p.symbol for p in self.frictions if p}  # Contacts may share a coefficient.
         symbols = ca.vertcat(*own.values())
         return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
 
     def reserve(self, matrix: ca.SX) -> ca.SX:
-        """The smallest principal minor of A(x), each divided by what it is without friction.
+        """The smallest principal minor of A(x), each divided by its value without friction.
 
         Minors are those of sets of contacts with all other constraints, of which none can open. The
         least ratio is the same in any order of the contacts and in any units, 1 without friction,
@@ -125,7 +125,7 @@ class Contacts:
             matrix: A(x), shape (m, m).
 
         Returns:
-            A scalar; where it is not positive its value has no meaning but that.
+            A scalar. Where it is not positive, only its sign has a meaning.
         """
         smallest = ca.SX(1)
         kept = [i for i in range(matrix.shape[0]) if i not in self.rows]
@@ -167,7 +167,7 @@ def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[in
 
     Args:
         without: A_0, A(x) without friction, shape (m, m).
-        per_unit: D, how much a unit of friction takes from it, shape (m, m).
+        per_unit: D, the decrease of A per unit of friction, shape (m, m).
         rows: The contacts; minors hold all other rows.
     """
     largest = 0.0
@@ -179,32 +179,32 @@ def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[in
     return 1.0 / largest if largest > 0.0 else np.inf
 
 
-def jam(
+def painleve_outcome(
     matrix: FloatArray,
     without: FloatArray,
     force: FloatArray,
     size: FloatArray,
     rows: Sequence[int],
-) -> Jam | None:
-    """What becomes of contacts that jam, by the linear complementarity problem of all sets.
+) -> PainleveOutcome | None:
+    """The outcome of a Painleve paradox, by the linear complementarity problem of all sets.
 
     Args:
         matrix: A(x), shape (m, m).
         without: A(x) without friction, shape (m, m).
         force: v = -A^-1 b, which keeps all constraints whether or not it pushes, shape (m,).
-        size: How large the terms are that b is the sum of, shape (m,).
+        size: The size of the terms whose sum is b, shape (m,).
         rows: The contacts; all other constraints are kept.
 
     Returns:
-        None where one set of forces fits that keeps a contact, or where that cannot be told.
+        None if exactly one set of forces fits and keeps a contact, or if this cannot be decided.
     """
     if not np.all(np.isfinite(force)):
-        return Jam.INCONSISTENT
+        return PainleveOutcome.INCONSISTENT
     edge = np.abs(without) @ np.abs(force)
     if not np.all(edge <= FAR * size):
-        return Jam.INCONSISTENT  # A is singular, and b not among what forces can balance.
+        return PainleveOutcome.INCONSISTENT  # A is singular, and no forces balance b.
     if np.all(np.abs(matrix @ force) <= edge / FAR):
-        return Jam.INDETERMINATE  # It is, and b is: forces that differ fit.
+        return PainleveOutcome.INDETERMINATE  # A is singular, and several forces balance b.
     free = -matrix @ force
     fitting = []
     for used in _sets(len(matrix), rows, with_none=True):
@@ -218,14 +218,14 @@ def jam(
         if np.all(force[rows][kept] >= 0.0) and np.all(rate[~kept] >= 0.0):
             fitting.append(kept)
     if not fitting:
-        return Jam.INCONSISTENT
+        return PainleveOutcome.INCONSISTENT
     if len(fitting) > 1:
-        return Jam.INDETERMINATE
-    return None if fitting[0].any() else Jam.OPENING
+        return PainleveOutcome.INDETERMINATE
+    return None if fitting[0].any() else PainleveOutcome.OPENING
 
 
 def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
-    """Every set of contacts, each with all constraints that are none."""
+    """Every set of contacts, each together with all bilateral constraints."""
     kept = [i for i in range(size) if i not in rows]
     counts = range(0 if with_none else 1, len(rows) + 1)
     for chosen in chain.from_iterable(combinations(rows, count) for count in counts):

@@ -1,4 +1,4 @@
-"""Signals w(t) that nobody here steers, and how they enter time derivatives."""
+"""Exogenous signals w(t), and how they enter time derivatives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Exogenous:
 
     @property
     def moving(self) -> tuple[Parameter, ...]:
-        """Those that move."""
+        """The parameters that move."""
         return tuple(p for p in self.parameters if p.exogenous)
 
     def __bool__(self) -> bool:
@@ -38,7 +38,7 @@ class Exogenous:
         """The part sum_j (d/dw^(j)) w^(j+1) of the time derivative of an expression, shape (k, 1).
 
         Raises:
-            ModelError: The expression needs more derivatives of w than there are.
+            ModelError: The expression needs more derivatives of w than are available.
         """
         rate = ca.SX(expression.numel(), 1)
         for p in self.moving:

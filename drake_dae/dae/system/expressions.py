@@ -1,6 +1,6 @@
-"""What users give as expressions, names and functions: converted and checked.
+"""Expressions, names and functions from users: converted and checked.
 
-CasADi's own messages tell neither which function of (1)-(3) was wrong nor what would be right.
+CasADi's own messages do not say which function of (1)-(3) is wrong, or how to correct it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,7 +47,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 def as_functions(
     owner: str, given: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
-    """f, g, h, k, l, m of (1)-(3), and what else there is, of the shapes that they must have.
+    """The given functions of (1)-(3) and others as expressions of the right shapes.
 
     Args:
         owner: The name of the system, for messages.
@@ -99,7 +99,7 @@ def _misshapen(
 
 
 def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, other: ca.SX) -> None:
-    """Refuses what evaluates without complaint, but makes no sense in (1)-(3)."""
+    """Refuses expressions that can be evaluated but are not smooth."""
     if find_flaw(ca.veccat(*values.values()), state, other) is None:
         return
     for key, value in values.items():
@@ -113,7 +113,7 @@ def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, oth
 
 
 def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
-    """Refuses names that stand twice.
+    """Refuses names that occur twice.
 
     Raises:
         ModelError: A name stands twice.
@@ -139,11 +139,11 @@ def as_signals(what: str, given: Any) -> tuple[Signal, ...]:
 def call(
     owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
 ) -> ca.SX:
-    """The expression that a user's function of symbols returns; empty where there is none.
+    """The expression that a user's function of symbols returns; empty without a function.
 
     Args:
         owner: The name of the system, for messages.
-        letter: What of (1)-(3) the function is, for messages.
+        letter: The letter of the function in (1)-(3), for messages.
         function: A function of the state, and of the parameters if there are any.
         arguments: The CasADi column x, and a namespace of the parameters' symbols.
 
@@ -179,7 +179,7 @@ def _explained(error: Exception, function: Callable[..., Any], arguments: Sequen
         called = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
         return f"{text}. It is called with {called}"
     except ValueError:
-        pass  # Of built-in functions nothing is known.
+        pass  # Built-in functions have no signature.
     if "truth value" in text:
         return (
             "it asks whether a condition on the state is true, as in if, max or min. Conditions "

@@ -1,4 +1,4 @@
-"""Where the parameters of a system stand below each other."""
+"""The order of the parameters of a system in one vector."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,13 @@ from drake_dae.errors import ModelError
 
 
 def parameter_symbol(parameters: Sequence[Parameter]) -> ca.SX:
-    """The symbols of all parameters, below each other; then w', w'', ... of those that move."""
+    """The symbols of all parameters in one column; then w', w'', ... of those that move."""
     rates = [rate for p in parameters if p.exogenous for rate in p.derivatives]
     return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters], *rates)
 
 
 def parameter_slice(owner: str, parameters: Sequence[Parameter], name: str) -> slice:
-    """Where a parameter stands among all.
+    """The slice of a parameter in the vector of all.
 
     Raises:
         ModelError: No parameter has that name.

@@ -1,7 +1,7 @@
-"""How large the states of a system are, as its own equations tell.
+"""The natural sizes of the states of a system, from its equations.
 
-Units are a choice of whoever writes a system, and no verdict may hang on them. So random states,
-searches and tolerances measure a state relative to a size that changes with its unit.
+No verdict may depend on the choice of units. So random states, searches and tolerances measure a
+state relative to a size that changes with its unit.
 """
 
 from collections import Counter
@@ -15,7 +15,8 @@ import numpy as np
 from drake_dae.arrays import Booleans, FloatArray
 
 ORDER = 3
-"""Derivatives up to this order are compared: a pendulum that hangs shows its size in the third."""
+"""Derivatives up to this order are compared. The size of a hanging pendulum appears in the
+third."""
 
 ENTRIES = 2000
 """An order with more derivatives than this is left out, as are the orders after it."""
@@ -24,11 +25,11 @@ OPERATIONS = 100_000
 """An order whose derivatives may take more operations than this is left out, too."""
 
 SHARE = 0.5
-"""States are taken to be in use up to this part of where the terms of the equations are alike."""
+"""The scale of a state as a fraction of the size at which the terms of the equations are equal."""
 
 FAINT = 1e-3
-"""The weight of constant terms, which hang on where the nominal state is: they decide where other
-terms do not. The weight of nominal values is its square: they decide where nothing else does."""
+"""The weight of constant terms, which depend on the nominal state: they decide where other terms do
+not. The weight of nominal values is its square: they decide where nothing else does."""
 
 NEGLIGIBLE = log(1e-10)
 """The logarithm of a term, relative to the largest of its equation, that may be round-off."""
@@ -38,15 +39,15 @@ ROUND_OFF = 1e-13
 in the units at hand: it is taken only if it turns out not to be negligible."""
 
 SELECTIONS = 10
-"""The terms that say something are chosen so often, or until the choice stays."""
+"""The largest number of selections of relevant terms; fewer if the selection does not change."""
 
 REPETITIONS = 300
-"""Weighted least squares are repeated so often, with weights by the last, or until `CONVERGED`."""
+"""The largest number of reweighted least-squares iterations; fewer if they reach `CONVERGED`."""
 
 CONVERGED = 1e-8
 """A change of the logarithms below this ends the repetitions."""
 
-# Each function of (1)-(3), of which equations its rows are a part, and what its columns multiply.
+# Each function of (1)-(3): the equations that its rows belong to, and what its columns multiply.
 _PARTS = (
     ("f", "dynamics", None),
     ("g", "dynamics", "constraint_input"),
@@ -59,7 +60,7 @@ _PARTS = (
 
 
 class _Term(NamedTuple):
-    """A term of a Taylor series: in which entry, by columns, which states it multiplies."""
+    """A term of a Taylor series: its entry (by columns) and the states that it multiplies."""
 
     entry: int
     states: tuple[int, ...]
@@ -83,15 +84,15 @@ def natural_scale(
     parameters: tuple[ca.SX, FloatArray],
     nominal: FloatArray,
 ) -> FloatArray:
-    """Half the sizes of the states at which the terms of the equations (1)-(3) are alike.
+    """Half the sizes of the states at which the terms of the equations (1)-(3) are equally large.
 
     The equations are expanded in Taylor series around the nominal state. A term c x_i^a x_j^b has
     the size |c| s_i^a s_j^b, where s are the sizes wanted; a derivative x_i' has the size w s_i
-    with a common rate w; inputs and equations have sizes of their own. The logarithms are linear
-    in those of the unknowns, so that a fit makes the terms of each equation as alike as they can
-    be. In other units of states, inputs and equations the same sizes come out, in those units.
-    What the equations leave open, such as the amplitude of a linear system, is as constant terms
-    and the nominal state tell, or near 1.
+    with a common rate w; inputs and equations have sizes of their own. The logarithms are linear in
+    those of the unknowns, so that a fit makes the terms of each equation as alike as they can be.
+    The sizes do not depend on the units of states, inputs and equations. Where the equations leave
+    a size open, such as the amplitude of a linear system, constant terms and the nominal state
+    decide; otherwise it is near 1.
 
     Args:
         functions: E, f, g, h, k, l and m as expressions; E under "mass_matrix".
@@ -142,9 +143,9 @@ def natural_scale(
 
 
 def _alike(comparisons: list[_Comparison]) -> FloatArray:
-    """Logarithms of sizes that make terms alike; terms that say nothing are left out.
+    """Logarithms of sizes that make terms equally large; irrelevant terms are left out.
 
-    The sum of sqrt(1 + left^2) is made least, which a few terms that are far off hardly move.
+    The sum of sqrt(1 + residual^2) is minimized, which is robust against a few outliers.
     """
     unknowns, logarithms, equation, weight, is_plain = map(np.array, zip(*comparisons, strict=True))
     kept: Booleans = is_plain
@@ -174,7 +175,7 @@ def _terms(
 ) -> Iterator[_Term]:
     """The terms of the Taylor series of a matrix; those that are zero or not finite are left out.
 
-    The constant one is without what the linear ones make of the nominal state.
+    The constant term does not contain the linear terms at the nominal state.
     """
     symbol, values = parameters
     places: list[tuple[int, tuple[int, ...]]] = [(i, ()) for i in range(expression.numel())]
@@ -220,10 +221,10 @@ def _linear_part(
 
 
 def spread_about(state: FloatArray, scale: FloatArray) -> FloatArray:
-    """How far states are drawn from one where nobody says, shape (n,): 0.1 of their scale.
+    """The default standard deviation of random states around one, shape (n,): 0.1 of their scale.
 
-    It is a hundredth of a value that is above 10 of them, and a tenth of one that is below 1e-3 and
-    not round-off.
+    It is a hundredth of a value above 10 scales, and a tenth of one below 1e-3 scales that is not
+    round-off.
     """
     size = np.abs(state) / scale
     small = (size < 1e-3) & (size > 1e-12 * size.max())

@@ -1,4 +1,4 @@
-"""How forces are shared among redundant constraints, where one asks for it."""
+"""How forces are shared among redundant constraints."""
 
 from dataclasses import dataclass
 

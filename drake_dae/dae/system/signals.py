@@ -38,12 +38,12 @@ class Signal:
 
 
 DERIVATIVES = 10
-"""How many derivatives of an exogenous parameter there are symbols for; long chains need 8."""
+"""The number of symbols for derivatives of an exogenous parameter; long chains need 8."""
 
 
 LARGEST = 1e60
-"""No parameter is larger, and none that is positive is smaller than its inverse: equations multiply
-five of them before they divide."""
+"""The largest value of a parameter; positive ones are at least its inverse. Equations multiply up
+to five parameters before they divide."""
 
 
 @checked(ModelError)
@@ -51,8 +51,8 @@ five of them before they divide."""
 class Parameter:
     """A number, or a vector of numbers, that a study changes without tracing again.
 
-    An exogenous one is a signal w(t) that nobody here steers, but whose derivatives are known, as
-    those of a reference are: where a surface is that moves, a known load, time.
+    An exogenous one is a signal w(t) that is not controlled but has known derivatives, as a
+    reference has: the position of a moving surface, a known load, time.
 
     Attributes:
         name: Its name, unique in its system, for example "link1.mass".
@@ -63,10 +63,9 @@ class Parameter:
         symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
             not given.
         exogenous: Whether it moves.
-        bounds: Between which values it stays, (low, high), each a number or of shape (k,): only
-            there relative degrees have to be the same. If None, they are those of half and twice
-            the default, and -1 and 1 where that is 0. Bounds of one value hold it there, and as a
-            signal it stands still.
+        bounds: The range (low, high) of its values, each a number or of shape (k,). Relative
+            degrees must be the same in this range. If None, half and twice the default, or -1 and 1
+            where the default is 0. Equal bounds fix the value; the signal is then constant.
         derivatives: The symbols of w', w'', ..., each of shape (k, 1), if it moves.
 
     Raises:
@@ -119,7 +118,7 @@ class Parameter:
 
     @property
     def low(self) -> FloatArray:
-        """The lowest values that are looked at, shape (k,)."""
+        """The lowest values that are examined, shape (k,)."""
         if self.bounds is not None:
             return np.broadcast_to(np.asarray(self.bounds[0], dtype=float), self.value.shape)
         least = -1.0 if not (self.positive or self.nonnegative) else 0.0
@@ -127,7 +126,7 @@ class Parameter:
 
     @property
     def high(self) -> FloatArray:
-        """The highest values that are looked at, shape (k,)."""
+        """The highest values that are examined, shape (k,)."""
         if self.bounds is not None:
             return np.broadcast_to(np.asarray(self.bounds[1], dtype=float), self.value.shape)
         return np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
@@ -141,15 +140,14 @@ class Parameter:
 
     @property
     def rate(self) -> ca.SX:
-        """The symbols of w', shape (k, 1); zeros without structure where it stands still."""
+        """The symbols of w', shape (k, 1); structural zeros if it is constant."""
         return self.derivatives[0] if self.derivatives else ca.SX(self.value.size, 1)
 
     def check(self, value: FloatArray) -> None:
-        """Refuses values that make no sense for the parameter.
+        """Refuses values outside the range of the parameter.
 
         Raises:
-            ModelError: A number is not finite, or not positive or negative where it must (not) be;
-                or it is beyond `LARGEST`.
+            ModelError: A number is not finite, has the wrong sign, or exceeds `LARGEST`.
         """
         if not np.all(np.isfinite(value)):
             raise ModelError(f"parameter '{self.name}' must be finite, got {value}")
@@ -175,7 +173,7 @@ def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
 
 
 def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Parameter, ...]:
-    """The same parameters, of which those with some names move."""
+    """The same parameters; those with the given names are exogenous."""
     return tuple(
         replace(p, exogenous=True) if p.name in names and not p.exogenous else p for p in parameters
     )
@@ -185,10 +183,10 @@ def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parame
     """The same parameter, with the same symbols, within bounds.
 
     Raises:
-        ModelError: They are no bounds, or its value is out of them.
+        ModelError: The bounds are not valid, or the value is outside of them.
     """
     made = replace(parameter, bounds=bounds)
-    # Expressions hold the symbols of the derivatives already.
+    # Expressions already contain the symbols of the derivatives.
     object.__setattr__(made, "derivatives", parameter.derivatives)
     return made
 

@@ -33,7 +33,7 @@ class DaeSystem:
 
         x' = f(x) + g(x) v + h(x) u,    0 = k(x),    z = l(x) + m(x) v.
 
-    All functions may also depend on exogenous signals w(t), which nobody here steers and whose
+    All functions may also depend on exogenous signals w(t), which are not controlled and whose
     derivatives are known: they are parameters with `exogenous=True`. In section 2, L_f then becomes
     the total derivative D = L_f + sum_j (d/dw^(j)) w^(j+1); degrees, A, B and (9)-(28) keep their
     form, and N* moves.
@@ -42,15 +42,15 @@ class DaeSystem:
     E^-1 f, E^-1 g, E^-1 h (see `explicit`). Giving E, as a robot has it in M(q), costs far fewer
     operations than giving its inverse.
 
-    Where there are more controls than outputs, B(x) of (16) leaves some of the control open. A
-    `control_metric` W says how controls compare: the law (28) takes the u next to `free_control`
-    u_0, of all with B u = ubar - a,
+    If there are more controls than outputs, B(x) of (16) does not determine the control. Among all
+    u with B u = ubar - a the law (28) then takes the one nearest to `free_control` u_0 in the
+    metric `control_metric` W,
 
         u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0).
 
-    Whatever u_0 is, it moves no output. W u . u means something only if it adds what is alike: of
-    torques in N m and forces in N, weights by the squares of what each may be. Such systems have
-    zero dynamics that depend on the choice, which pinned outputs and stability therefore make, too.
+    u_0 does not affect the outputs. W must make the terms of u^T W u comparable: for torques in N m
+    and forces in N, take 1 / limit^2 as weights. The zero dynamics of such systems depend on W and
+    u_0; pinned outputs and stability use the same choice.
 
     The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers
     and NumPy arrays are taken as constants. The data checks itself when it is made.
@@ -58,40 +58,41 @@ class DaeSystem:
     Attributes:
         state: The symbols x, shape (n, 1).
         f: The drift, shape (n, 1).
-        g: How the constraint inputs v enter, shape (n, m).
-        h: How the control inputs u enter, shape (n, p); p = 0 is a system that nobody steers.
+        g: The input matrix of the constraint inputs v, shape (n, m).
+        h: The input matrix of the control inputs u, shape (n, p); p = 0 without control.
         k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
         l: The controlled outputs z at v = 0, as many as the controls for a law (28), shape (p, 1),
             or fewer with a `control_metric`; a system that is only simulated may have others, or
             none.
-        m: How v enters the controlled outputs, shape (p, m).
+        m: The matrix of v in the controlled outputs, shape (p, m).
         parameters: Named numbers that the expressions depend on.
         state_signals, constraint_input_signals, control_signals, constraint_output_signals,
             output_signals: Names and units of x, v, u, y and z; a plain name is a Signal without
             unit. Made up ("x0", "x1", ...) where not given.
         nominal_state: Where a search for consistent states starts, shape (n,); zero if not given.
-        state_scale: How large the states are in use, positive, shape (n,): random states, searches
-            and tolerances are relative to it. If None, `scale` finds it from the equations.
-        name: What messages call the system.
+        state_scale: The typical size of each state, positive, shape (n,). Random states, searches
+            and tolerances are relative to it. If None, `scale` is computed from the equations.
+        name: The name of the system in messages.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
             derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
             operations than the expressions above: for a robot it is inverse dynamics.
-        sharing: How v is shared among redundant constraints, of which k holds those that stay;
-            None where v is all there is. `share_forces` makes it.
+        sharing: How v is shared among redundant constraints; k holds those that are kept. None
+            without redundant constraints. Made by `share_forces`.
         control_metric: W, shape (p, p), symmetric positive definite, for more controls than
-            outputs; None if there is nothing to choose.
+            outputs; None otherwise.
         free_control: u_0, shape (p, 1); zero if None.
-        compiled: Whether functions of the system that are called often become machine code, where a
-            C compiler is found: True, from the first call on; False; or "auto", what the cache has,
-            and else what was called so often that compiling it pays. See `trace.compiled`.
+        compiled: Whether functions that are called often are compiled to machine code, if there is
+            a C compiler: True, from the first call; False, never; "auto", if the cache has the
+            code, or once a function was called so often that compilation pays. See
+            `trace.compiled`.
         least_margin: A(x) and B(x) count as singular where their smallest singular value, rows and
             columns scaled to about length one, is below this.
-        negligible: What is below this, relative to the other entries of its row or column, counts
-            as zero where relative degrees are decided: 1e-17 in place of a typed 0. What is smaller
-            and meant needs other units, or a smaller number here.
-        contacts: Those constraint inputs that can only push, where friction acts on one of them:
-            the motion makes sense only where they are sure to push, see `dae.contacts`.
+        negligible: Entries below this, relative to the others in their row or column, count as zero
+            when relative degrees are decided, such as 1e-17 in place of 0. If such an entry is
+            intended, change units or this number.
+        contacts: The unilateral constraint inputs, if friction acts on one of them. The motion is
+            well defined only where a unique nonnegative force exists, see `dae.system.contacts`.
 
     Raises:
         ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
@@ -153,22 +154,22 @@ class DaeSystem:
     ) -> "DaeSystem":
         """Builds a system from Python functions of the state.
 
-        Each function is called once with a CasADi column x, and, if there are `parameters`, with
-        a namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns
-        an expression, or a list (of lists for a matrix, row by row). Functions of CasADi are meant,
-        casadi.sin; numpy.sin works too, but CasADi warns of it, and math.sin does not.
+        Each function is called once with a CasADi column x, and, if there are `parameters`, with a
+        namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns an
+        expression, or a list (of lists for a matrix, row by row). Use functions of CasADi, such as
+        casadi.sin. numpy.sin works but CasADi warns about it; math.sin does not work.
 
         Args:
             state: Names (or Signals) of the states, or their number n.
             f, g, h, k, l, m: The functions of (1)-(3). Without constraints leave out g, k and m;
                 without controls h; without controlled outputs l and m.
             parameters: Name -> default; a name must be a Python identifier.
-            exogenous: The names of those parameters that move, as signals w(t).
-            bounds: Name of a parameter -> (low, high), between which it stays; see `with_bounds`.
+            exogenous: The names of the parameters that are exogenous signals w(t).
+            bounds: Name of a parameter -> its range (low, high); see `with_bounds`.
             labels: The remaining fields of the class.
 
         Raises:
-            ModelError: A function fails, or the functions make no system; see the class.
+            ModelError: A function fails, or the functions do not form a system; see the class.
         """
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
         names = [item.name for item in fields(cls)]
@@ -218,7 +219,7 @@ class DaeSystem:
 
     @property
     def num_outputs(self) -> int:
-        """The number of controlled outputs; that of the controls where there is a law (28)."""
+        """The number of controlled outputs; a law (28) needs as many as controls."""
         return int(self.l.numel())
 
     @property
@@ -234,16 +235,16 @@ class DaeSystem:
 
     def outputs(self, constraint_input: ca.SX) -> ca.SX:
         """z = l(x) + m(x) v (3) of v, shape (m, 1): the controlled outputs, shape (p, 1)."""
-        return self.l + ca.mtimes(self.m, constraint_input)
+        return self.l + ca.mtimes(self.m, constraint_input)  # (3)
 
     @cached_property
     def parameter_symbol(self) -> ca.SX:
-        """The symbols of all parameters, below each other; then w', w'', ... of those that move."""
+        """The symbols of all parameters in one column; then w', w'', ... of those that move."""
         return parameter_symbol(self.parameters)
 
     @property
     def parameter_values(self) -> FloatArray:
-        """The defaults of all parameters, in the order of `parameter_symbol`: nothing moves."""
+        """The defaults of all parameters as `parameter_symbol`; derivatives are zero."""
         return self._defaults.copy()
 
     @cached_property
@@ -257,13 +258,13 @@ class DaeSystem:
         return Exogenous(self.name, self.parameters)
 
     @cached_property
-    def rubbing(self) -> Contacts:
-        """The contacts that can only push, if friction acts on one of them; see `dae.contacts`."""
+    def frictional_contacts(self) -> Contacts:
+        """The unilateral contacts, if friction acts on one of them; see `dae.system.contacts`."""
         return Contacts(self.name, self.constraint_input_signals, self.parameters, self.contacts)
 
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
-        """The same system, some of whose parameters move.
+        """The same system with some parameters as exogenous signals.
 
         Raises:
             ModelError: No parameter has that name.
@@ -274,18 +275,18 @@ class DaeSystem:
 
     @checked(ModelError)
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
-        """The same system, some of whose parameters stay between bounds.
+        """The same system with bounds for some parameters.
 
-        Relative degrees belong to all numbers that a system may have: an input acts on a derivative
-        everywhere or nowhere. Where this holds only for some of them, bounds say which are meant.
+        Relative degrees must be the same for all values of the parameters: an input acts on a
+        derivative for all of them or for none. Bounds restrict the values to those for which this
+        holds.
 
         Args:
             bounds: Name -> (low, high), each a number or one for each entry; the default lies
-                between them. Where both are the same, the parameter stays there, and as an
-                exogenous signal it stands still.
+                between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
 
         Raises:
-            ModelError: No parameter has that name, or bounds make no sense.
+            ModelError: No parameter has that name, or bounds are not valid.
         """
         for name in bounds:
             self.parameter_slice(name)
@@ -298,9 +299,9 @@ class DaeSystem:
 
     @property
     def parameter_box(self) -> tuple[FloatArray, FloatArray]:
-        """The lowest and highest values of `parameter_symbol` at which degrees are looked at.
+        """The lowest and highest values of `parameter_symbol` for which degrees are checked.
 
-        Derivatives of signals are as large as the signals, or 1, in one second.
+        Derivatives of signals are bounded by the size of the signal, or 1, per second.
         """
         low, high = (
             [np.zeros(0), *[getattr(p, k) for p in self.parameters]] for k in ("low", "high")
@@ -313,10 +314,9 @@ class DaeSystem:
 
     @cached_property
     def scale(self) -> FloatArray:
-        """How large the states are in use, shape (n,): `state_scale`, or as the equations tell.
+        """The typical size of each state, shape (n,): `state_scale`, or from the equations.
 
-        In other units the same sizes come out, in those units; see `natural_scale`. Do not change
-        the array.
+        The sizes do not depend on the units; see `natural_scale`. Do not change the array.
         """
         if self.state_scale is not None:
             return self.state_scale
@@ -327,11 +327,11 @@ class DaeSystem:
 
     @property
     def nominal_spread(self) -> FloatArray:
-        """How far states are drawn from the nominal one where nobody says, shape (n,)."""
+        """The default standard deviation of random states around the nominal one, shape (n,)."""
         return self.usual_spread(self.nominal_state)
 
     def usual_spread(self, state: ArrayLike) -> FloatArray:
-        """How far states are drawn from one where nobody says, shape (n,); see `spread_about`.
+        """The default standard deviation of random states around one, shape (n,).
 
         Raises:
             ModelError: The state has a wrong shape, or a number is not finite.
@@ -352,9 +352,9 @@ class DaeSystem:
         """Expressions as a fast function of the state, of other inputs and of the parameters.
 
         Args:
-            name: What the outputs are, for messages.
+            name: The name of the outputs in messages.
             outputs, pivot, regular, often, doubt, lean: The arguments of `TracedFunction`.
-            inputs: Other symbols, which stand between "state" and "parameters".
+            inputs: Further input symbols, placed between "state" and "parameters".
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
         return TracedFunction(
@@ -371,7 +371,7 @@ class DaeSystem:
         """
         if parameters is None:
             return self._defaults
-        if (  # In each step of a simulation, so without a copy.
+        if (  # Called in each step of a simulation, so without a copy.
             type(parameters) is np.ndarray
             and parameters.dtype == np.float64
             and parameters.shape == self._defaults.shape
@@ -390,7 +390,7 @@ class DaeSystem:
 
     @checked(ModelError)
     def parameter_slice(self, name: str) -> slice:
-        """Where a parameter stands in `parameter_values`.
+        """The slice of a parameter in `parameter_values`.
 
         Raises:
             ModelError: No parameter has that name.

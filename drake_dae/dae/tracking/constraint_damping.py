@@ -1,4 +1,4 @@
-"""Damping of the constraint by the law, for contacts that give way."""
+"""Damping of the constraint by the law, for compliant contacts."""
 
 import warnings
 from dataclasses import replace
@@ -17,14 +17,14 @@ from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.errors import AdviceWarning, GainError, ModelError
 from drake_dae.trace.given import result_of
 
-STEPS = 200
-"""Into how many steps an interval is divided in which the best damping is sought, twice."""
+INTERVALS = 200
+"""The number of steps of an interval in the search for the best damping, which is refined once."""
 
 STIFFER = 2.0
-"""By this factor a contact may be stiffer than was said, or softer by any, for what is advised."""
+"""The contact may be stiffer than given by this factor, or softer by any factor."""
 
 STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIFFER, 31)[1:]])
-"""The stiffnesses that are looked at, relative to what was said."""
+"""The examined stiffnesses, relative to the given one."""
 
 
 def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structure:
@@ -32,16 +32,16 @@ def damped(structure: Structure, damping: GainDesign | FeedbackGains) -> Structu
 
         y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
 
-    with no term in y_i itself, which would hold the place of a surface and not its force. On N* all
-    y_i^(j) vanish, so that nothing changes there: alpha (13) becomes
-    alpha - A^-1 (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
+    without a term in y_i itself, which would control the position of the surface instead of the
+    force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
+    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
 
-    Where a force is an output of degree mu >= 1, behind springs or motors, the law differentiates
-    alpha. There it takes what is added as constant: a contact that gives way does not move as the
-    model demands, so that derivatives by the model drive it (with poles of the force at -p and a
-    contact of frequency w = sqrt(A k) unstable for c > p, at mu = 1 already). Then for mu = 1 the
-    contact is damped for all p, and for mu = 2 and c from w to 2 w from about p = 2.5 w on, best
-    near 5 w: the poles of a force must be faster than the contact.
+    If a force is an output of degree mu >= 1 (flexible joints, motors), the law differentiates
+    alpha and takes the added term as constant: a compliant contact does not move as the model
+    demands, so that the derivatives of the model would destabilize it (with force poles at -p and a
+    contact of frequency w = sqrt(A k), for c > p already at mu = 1). Then for mu = 1 the contact is
+    damped for all p; for mu = 2 and c from w to 2 w it is damped from about p = 2.5 w on, best near
+    5 w. The force poles must be faster than the contact.
 
     Args:
         structure: The structure of the system.
@@ -103,41 +103,40 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
 def contact_damping(
     stiffness: float, mobility: float, sample_time: float = 0.0, delay: int = 1
 ) -> float:
-    """The damping c that brings a contact of some stiffness to rest soonest.
+    """The damping c for which a contact of given stiffness settles fastest.
 
-    On a contact that gives way, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
+    On a compliant contact, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
 
         phi'' + c phi' = A (F - lambda_d),    so    phi'' + c phi' + A k phi = -A lambda_d,
 
-    which is critically damped at c = 2 sqrt(A k). A force that changes is followed with an error of
+    which is critically damped at c = 2 sqrt(A k). A changing reference force leaves an error of
     about c lambda_d' / (A k).
 
-    A sampled law holds -c phi' for a sample time T, and what it holds was measured `delay` samples
-    before. Between samples the contact swings freely; so (phi, phi', what is held) of one sample
-    follow from those before by a matrix, and c is that for which its spectral radius is least: the
-    contact comes to rest soonest. For a contact that is slow beside the samples that is 2 w, with
-    w = sqrt(A k). Without a contact a delay of one sample gives z^2 - z + c T = 0, which bears
-    c = 1 / (4 T) without a swing and c = 1 / T at all; so c stays of that size. Where w T comes to
-    about 1, what is held is late by a quarter of a swing: it damps no more, and c is 0. Then the
-    contact's own damping, or a shorter sample time, must help.
+    A sampled law holds -c phi' for a sample time T, from a measurement `delay` samples before.
+    Between samples the contact oscillates freely, so (phi, phi', the held value) follow from the
+    previous sample by a matrix. c minimizes its spectral radius. For a slow contact c is 2 w, with
+    w = sqrt(A k). Without contact a delay of one sample gives z^2 - z + c T = 0, which does not
+    oscillate up to c = 1 / (4 T) and is stable up to c = 1 / T; so c stays of this size. At w T of
+    about 1 the held value lags by a quarter of a period and does not damp any more; then c is 0,
+    and the contact needs damping of its own or a shorter sample time.
 
-    The advice is right, and nothing is said, where the contact comes to rest with it also if it is
-    softer, or stiffer by a factor of two: with one sample of delay up to w T = 0.6, with none up to
-    1.3, with two up to 0.36, with three up to 0.24. Beyond, this warns: a contact that is stiffer
-    by a tenth may diverge there, and above w T = pi samples do not show how it swings.
+    The result is valid if the contact is stable for all lower stiffnesses and up to twice the given
+    one: with one sample of delay up to w T = 0.6, with none up to 1.3, with two up to 0.36, with
+    three up to 0.24. Beyond, a warning is issued: a contact that is stiffer by 10 % may diverge
+    there, and above w T = pi its oscillation is aliased.
 
     Args:
         stiffness: k in N/m, positive.
         mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive: see
-            `ConstraintStructure.constraint_matrix`. The largest one of those on the way.
+            `ConstraintStructure.constraint_matrix`. Take the largest along the motion.
         sample_time: T in s; 0 for a law that runs continuously.
-        delay: How many samples a control is late.
+        delay: The delay of the control in samples.
 
     Returns:
         c in 1/s, from 0 to 2 sqrt(A k).
 
     Warns:
-        AdviceWarning: The contact is outside of the range in which the advice is right.
+        AdviceWarning: The contact is outside the range in which the result is valid.
 
     Raises:
         ModelError: A number is not positive, or is negative.
@@ -151,7 +150,7 @@ def contact_damping(
 
 
 def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:
-    """`contact_damping`, whether or not the contact is in the range in which it is right."""
+    """`contact_damping` without a warning outside its range of validity."""
     for name, value, least in (
         ("stiffness", stiffness, "positive"),
         ("mobility", mobility, "positive"),
@@ -166,25 +165,25 @@ def best_damping(stiffness: float, mobility: float, sample_time: float, delay: i
         return critical
     step, low, high = _step(frequency, sample_time), 0.0, critical
     for _ in range(2):
-        tried = np.linspace(low, high, STEPS + 1)
+        tried = np.linspace(low, high, INTERVALS + 1)
         best = int(np.argmin([_radius(step, c, delay) for c in tried]))
-        low, high = tried[max(best - 1, 0)], tried[min(best + 1, STEPS)]
+        low, high = tried[max(best - 1, 0)], tried[min(best + 1, INTERVALS)]
     return float(tried[best])
 
 
 def unstable_from(
     frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
 ) -> float | None:
-    """The stiffness from which on a contact does not come to rest, relative to what was said.
+    """The lowest stiffness at which a contact is unstable, relative to the given one.
 
     Args:
-        frequency: w = sqrt(A k) of what was said.
+        frequency: w = sqrt(A k) of the given stiffness.
         sample_time, delay: As for `contact_damping`.
         damping: c.
         integral: The gain K_i of the integral of the force's error.
 
     Returns:
-        The least one of those up to a factor of two; None if all of them come to rest.
+        The lowest up to a factor of two; None if all are stable.
     """
     for share in STIFFNESSES.tolist():
         own = frequency * share**0.5
@@ -196,16 +195,16 @@ def unstable_from(
 
 
 def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
-    """Warns where what is advised is not right.
+    """Warns if a recommended gain is outside its range of validity.
 
     Args:
-        lost: What `unstable_from` says.
-        stiffness: k of what was said, in N/m.
-        swing: w T of it.
-        advice: What is advised, in words.
+        lost: The result of `unstable_from`.
+        stiffness: The given k in N/m.
+        swing: Its w T.
+        advice: The recommended gain, in words.
 
     Warns:
-        AdviceWarning: It is not.
+        AdviceWarning: It is outside.
     """
     if lost is None:
         return
@@ -220,22 +219,22 @@ def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> 
 
 
 def _step(frequency: float, sample_time: float) -> FloatArray:
-    """What (phi, phi', what is held) become within a sample, phi in units of 1 / frequency."""
+    """The matrix of (phi, phi', held value) over a sample, phi in units of 1 / frequency."""
     swing = np.zeros((3, 3))
     swing[0, 1], swing[1, 0], swing[1, 2] = frequency, -frequency, 1.0
     return np.asarray(expm(swing * sample_time)[:2])
 
 
 def _radius(step: FloatArray, damping: float, delay: int, integral: float = 0.0) -> float:
-    """The spectral radius of a contact whose damping is sampled, held and late.
+    """The spectral radius of a contact whose damping is sampled, held and delayed.
 
     Args:
-        step: What (phi, phi', what is held) become within a sample, shape (2, 3).
+        step: The matrix of `_step`, shape (2, 3).
         damping: c.
-        delay: How many samples later c phi' acts.
-        integral: What a sample adds to the sum of phi that acts as well, for phi of 1.
+        delay: The delay in samples until c phi' acts.
+        integral: The increment per sample of the integral of phi, for phi = 1.
     """
-    # (phi, phi', the sum, what is held next, ..., what is held last).
+    # (phi, phi', the integral, the held values from next to last).
     matrix = np.zeros((3 + delay, 3 + delay))
     matrix[:2, :2] = step[:, :2]
     matrix[2, 0], matrix[2, 2] = integral, 1.0 if integral else 0.0

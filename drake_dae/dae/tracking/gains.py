@@ -24,12 +24,12 @@ class FeedbackGains:
 
         (e_1^(mu_1), ..., e_p^(mu_p)) = -K e.
 
-    A row K of one output may use the errors of others: that is how the full matrices Lambda_1,
-    Lambda_2, ... of (60), (72) and (82) are written.
+    A row of K may contain the errors of other outputs, as the full matrices Lambda_1, Lambda_2, ...
+    of (60), (72) and (82) do.
 
     Attributes:
         names: Names of the p outputs, in their order.
-        degrees: mu_1, ..., mu_p; 0 for an output that is met at once (31).
+        degrees: mu_1, ..., mu_p; 0 for an output with e = 0 at all times (31).
         matrix: K, shape (p, N); rows of outputs with degree 0 are zero.
 
     Raises:
@@ -75,7 +75,7 @@ class FeedbackGains:
         """E of e' = E e, shape (N, N)."""
         layout = self.layout
         result = np.eye(layout.chain_size, k=1)
-        result[layout.ends] = -self.matrix[layout.dynamic]
+        result[layout.ends] = -self.matrix[layout.dynamic]  # (30)
         return result
 
     @property
@@ -104,19 +104,20 @@ class FeedbackGains:
                 f"the error has sum mu_i = {matrix.shape[0]} coordinates, got shape "
                 f"{coordinates.shape}"
             )
-        # From one time to the next: a log with fixed steps has few different lengths, once its
-        # times are rounded to a power of 2, of which floating-point numbers take differences
+        # From one time to the next: a log with fixed steps has few different step lengths once its
+        # times are rounded to a power of 2, whose differences floating-point numbers compute
         # exactly.
         grid = np.exp2(np.floor(np.log2(np.max(np.abs(moments), initial=1e-300))) - 50.0)
         order = np.argsort(moments)
         steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
         lengths, which = np.unique(steps, return_inverse=True)
-        result = np.zeros((moments.size, len(self.degrees)))
+        result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
         orders, owner = self.layout.orders, self.layout.owners
         for block in _coupled(self.layout, self.matrix):
             rows = np.flatnonzero(np.isin(owner, block))
             own = matrix[np.ix_(rows, rows)]
-            # In units of its own rate, a power of 2, so that the entries of exp(E t) are alike.
+            # In units of its own rate, a power of 2, so that the entries of exp(E t) have similar
+            # sizes.
             rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(own))))))
             scale = rate ** orders[rows]
             transitions = scipy.linalg.expm(lengths[:, None, None] * (own / scale[:, None] * scale))
@@ -130,7 +131,7 @@ class FeedbackGains:
 
 
 GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
-"""Makes gains for outputs of given names and degrees, once these are known."""
+"""A function that makes gains for outputs of given names and degrees."""
 
 
 Poles = float | complex | Sequence[float | complex]
@@ -215,6 +216,7 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
                         f"{', '.join(names[i] for i in members)} need "
                         f"({len(members)}, {len(members)})"
                     )
+                # (60), (72)-(73), (82)-(83)
                 matrix[np.ix_(np.array(members), starts[members] + order)] = block
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
@@ -227,7 +229,7 @@ T = TypeVar("T")
 def _per_output(
     values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
 ) -> list[tuple[str, int, T]]:
-    """The name, the degree and what was given of each output with a degree above 0."""
+    """The name, degree and given value of each output with a degree above 0."""
     dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
     if not isinstance(values, Mapping):
         return [(name, degree, values) for name, degree in dynamic]
@@ -261,14 +263,14 @@ def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
         raise GainError(
             f"output '{name}' has degree {degree} and takes 1 or {degree} poles, got {roots.size}"
         )
-    monic = np.poly(roots)
+    monic = np.poly(roots)  # (32)
     if np.abs(np.imag(monic)).max() > 1e-12 * np.abs(monic).max():
         raise GainError(f"complex poles of output '{name}' must come in conjugate pairs: {roots}")
     return [float(number) for number in np.real(monic)[:0:-1]]
 
 
 def _coupled(layout: Layout, matrix: FloatArray) -> list[list[int]]:
-    """Groups of outputs whose errors influence each other."""
+    """Groups of outputs whose errors are coupled."""
     groups: list[set[int]] = []
     for i in map(int, layout.dynamic):
         joined = {i, *map(int, layout.owners[np.flatnonzero(matrix[i])])}

@@ -9,22 +9,22 @@ from drake_dae.arrays import unknown_name
 from drake_dae.dae.system.layout import Layout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.measured_force import MeasuredForce
+from drake_dae.dae.tracking.measured_force import ForceMeasurement
 from drake_dae.errors import GainError
 
 
 @dataclass(frozen=True, eq=False)
 class IntegralAction:
-    """sigma_i' = z_i - r_i of some outputs, which stands before their errors in (30):
+    """The integrals sigma_i' = z_i - r_i of some outputs, which extend (30) to
 
         e_i^(mu_i) = -K_i0 sigma_i - K_i1 e_i - ... - K_i mu_i e_i^(mu_i - 1),
 
-    so that an output has mu_i + 1 poles in place of mu_i. Where mu_i = 0 it is the integral of a
-    measured force: u_i = r_i - K_i0 int (v_j - r_i) dt. Against a model error delta that is
-    constant, e_i tends to zero.
+    so that an output has mu_i + 1 poles in place of mu_i. If mu_i = 0 it is the integral of a
+    measured force: ubar_i = r_i - K_i0 int (v_j - r_i) dt. With a constant model error, e_i tends
+    to zero.
 
     Attributes:
-        outputs: Which outputs, by their place.
+        outputs: The indices of these outputs.
         degrees: mu_1, ..., mu_p.
         signals: Names and units of sigma.
         symbol: The symbols of sigma, shape (k, 1).
@@ -41,13 +41,13 @@ class IntegralAction:
         system: DaeSystem,
         degrees: Sequence[int],
         names: Sequence[str],
-        measured: MeasuredForce | None,
+        measured: ForceMeasurement | None,
     ) -> "IntegralAction":
         """Integral action on outputs by their names.
 
         Raises:
-            GainError: A name is that of no output, stands twice, or is that of a force that the
-                law meets at once and does not measure.
+            GainError: A name is not that of an output, occurs twice, or is that of a force with
+                mu_i = 0 that is not measured.
         """
         known = [signal.name for signal in system.output_signals]
         found = []
@@ -73,7 +73,7 @@ class IntegralAction:
 
     @property
     def all_degrees(self) -> tuple[int, ...]:
-        """How many poles each output has."""
+        """The number of poles of each output."""
         return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
 
     def coordinates(self, errors: ca.SX, integral: ca.SX | None = None) -> ca.SX:
@@ -91,13 +91,13 @@ class IntegralAction:
             rows.append(errors[starts[i] : starts[i] + degree, :])
         return ca.vertcat(ca.SX(0, 1), *rows)
 
-    def rate(self, chain: ca.SX, values: ca.SX, measured: MeasuredForce | None) -> ca.SX:
+    def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
         """sigma' = z - r of these outputs, shape (k, 1).
 
         Args:
-            chain: The output chains, with measured forces where the law takes them.
+            chain: The output chains, with measured forces where the law uses them.
             values: r_1, ..., r_p, shape (p, 1).
-            measured: How the law takes them.
+            measured: The measurement, if the law uses it.
         """
         starts, rows = Layout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
         for i in self.outputs:

@@ -13,7 +13,7 @@ from drake_dae.errors import GainError, ModelError
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredForce:
+class ForceMeasurement:
     """How a measurement of v enters the law (28), for the outputs z_i = v_j:
 
         mu_i = 0:  ubar_i = r_i - Gbar_j (v - r), the term J^T Gbar (lambda - r_2) of (59). The
@@ -33,7 +33,7 @@ class MeasuredForce:
     symbol: ca.SX
 
     @classmethod
-    def of(cls, system: DaeSystem, layout: Layout, gain: ArrayLike) -> "MeasuredForce":
+    def of(cls, system: DaeSystem, layout: Layout, gain: ArrayLike) -> "ForceMeasurement":
         """The measurement of all constraint inputs of a system.
 
         Args:
@@ -70,7 +70,7 @@ class MeasuredForce:
         result = ca.SX(chain)
         for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
             if output in self.inputs:
-                result[int(head)] = self.symbol[self.inputs[int(output)]]
+                result[int(head)] = self.symbol[self.inputs[int(output)]]  # (71), (81)
         return result
 
     def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
@@ -86,7 +86,7 @@ class MeasuredForce:
         result = ca.SX(highest)
         for i in map(int, self.layout.direct):
             if i in self.inputs:
-                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)
+                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)  # (59)
         return result
 
 

@@ -17,7 +17,7 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.constraint_damping import damped
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.integral import IntegralAction
-from drake_dae.dae.tracking.measured_force import MeasuredForce
+from drake_dae.dae.tracking.measured_force import ForceMeasurement
 from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.given import result_of
@@ -31,9 +31,9 @@ class TrackingLaw:
         ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
 
     with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
-    exactly. Where controls outnumber outputs, it is the u that the system's `control_metric`
-    chooses, next to its `free_control`. The law needs the state x; it needs no measurement of the
-    constraint inputs, but takes one with `measured_force`; see `MeasuredForce`.
+    exactly. If there are more controls than outputs, the system's `control_metric` and
+    `free_control` choose u. The law needs the state x. It does not need a measurement of the
+    constraint inputs, but can use one with `measured_force`; see `ForceMeasurement`.
 
     The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
     numbers.
@@ -46,11 +46,11 @@ class TrackingLaw:
             with state where mu_i = 0; see `ForceSensor`.
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
-        constraint_damping: What the law's own model demands of the constraints that its plant may
-            break, as a contact that gives way does: a design such as `poles(-200.0)`, with r_i - 1
-            poles of phi'; see `dae.constraint_damping`. On N* it changes nothing. None for none.
+        constraint_damping: Damping of constraints that the plant may violate, such as a compliant
+            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi'; see
+            `dae.tracking.constraint_damping`. On N* it changes nothing. None for no damping.
         integral: The names of the outputs whose errors are integrated as well, positions or
-            measured forces; see `IntegralAction`. They take a pole more.
+            measured forces; see `IntegralAction`. They have one more pole.
 
     Attributes:
         layout: How references and chains are stacked.
@@ -58,16 +58,16 @@ class TrackingLaw:
         function: The law as (state, reference, measured_force, parameters) -> control and
             tracking_error, with `all_parameters`; without measured force there is no such input.
         measured_force: How the measurement enters; None without one.
-        exogenous_degrees: How many derivatives of each entry of w the law needs.
-        integral: What is integrated; then `function` takes "integral" before the parameters, and
-            returns "integral_rate" as well.
+        exogenous_degrees: The number of derivatives of each entry of w that the law needs.
+        integral: The integrated outputs; then `function` takes "integral" before the parameters,
+            and returns "integral_rate" as well.
         control_takes_force: Whether the measured force enters the control in the same instant.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
         GainError: The gains do not fit, or are not Hurwitz.
-        ModelError: This is no DaeSystem, or the structure is that of another system; or force is
-            measured, and no output is a constraint input.
+        ModelError: The system is not a DaeSystem, the structure is that of another system, or force
+            is measured and no output is a constraint input.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class TrackingLaw:
         """The law (28) and the tracking error (29) as one function."""
         structure, layout, measured = self._model, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
-        # Symbols where K is not zero: the errors of most outputs are not coupled.
+        # Symbols only for nonzero entries of K: the errors of most outputs are not coupled.
         gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
         values = reference[layout.lowest.tolist(), :]
         highest = reference[layout.highest.tolist(), :]
@@ -116,13 +116,13 @@ class TrackingLaw:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
         errors = chain - reference[layout.chained.tolist(), :]
-        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
         control, pivot = structure.control_for(ubar)
-        # By the model; what the control reaches at once is as wanted.
+        # By the model; outputs with direct feedthrough have their wanted values.
         output = ca.SX(ubar)
         output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
-        outputs = {"control": control, "tracking_error": output - values}
+        outputs = {"control": control, "tracking_error": output - values}  # (29)
         if self.integral.outputs:
             inputs["integral"] = self.integral.symbol
             outputs["integral_rate"] = self.integral.rate(chain, values, measured)
@@ -195,12 +195,12 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         gains: GainDesign | FeedbackGains | None = None,
     ) -> FloatArray:
-        """What `function` takes as parameters: the system's, then the entries of K by columns.
+        """The parameters of `function`: those of the system, then the entries of K by columns.
 
         Args:
             parameters: Values of the system's parameters; the defaults if None.
-            gains: Other gains than those of the law; its own if None. Of K only those entries
-                count that are not zero in the law's own gains.
+            gains: Other gains than those of the law; its own if None. Only entries of K that are
+                nonzero in the law's own gains are used.
 
         Raises:
             GainError: The gains do not fit, or couple outputs that the law does not.
@@ -301,9 +301,9 @@ class TrackingLaw:
 
 def _measured_force(
     system: DaeSystem, layout: Layout, wanted: bool, gain: ArrayLike
-) -> MeasuredForce | None:
+) -> ForceMeasurement | None:
     if wanted:
-        return MeasuredForce.of(system, layout, gain)
+        return ForceMeasurement.of(system, layout, gain)
     if numbers("force_gain", gain, GainError).any():
         raise GainError("force_gain needs measured_force=True")
     return None

@@ -6,33 +6,32 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause, PinnedMotion
+from drake_dae.dae.zero_dynamics.long_term import Behavior, behavior_of, carry_in_halves, leave
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause, PinnedMotion
 from drake_dae.dae.zero_dynamics.returns import Return, close, find_multiple
-from drake_dae.dae.zero_dynamics.settling import Fate, carry_in_halves, fate_of, leave
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict
 
 
 @dataclass(frozen=True, eq=False)
 class StabilityAlong:
-    """Whether the internal states stay near their motion while the outputs follow a reference.
+    """The stability of the internal states while the outputs follow a reference.
 
     Attributes:
-        verdict: With a period: exponentially stable if all multipliers are inside the unit circle,
-            unstable if one is outside, bounded if the motions that leave are seen to come to one
-            that repeats itself, undecided if these draw their neighbours to them and are not seen
-            to return, or if a multiplier is on the circle up to the error. Without: what the
-            exponents of the disturbances say over the second half of the time; undecided where
-            these neither grow nor die out.
-        period: The period of the reference in s, or of the motion where that repeats itself after
-            several of them; None if there is none, 0 if the reference is constant.
+        verdict: With a period: exponentially stable if all multipliers are inside the unit circle;
+            unstable if one is outside; bounded if motions that leave converge to a periodic one;
+            undecided if they converge to a motion that does not return, or if a multiplier is on
+            the circle up to the error. Without a period: by the exponents of the disturbances over
+            the second half of the time; undecided if they neither grow nor decay.
+        period: The period of the reference in s, or of the motion if that is a multiple of it; None
+            without a period, 0 if the reference is constant.
         multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
             (dimension,); empty if there is no such motion.
         exponents: The rates at which disturbances grow, in 1/s, the largest first: log |multiplier|
             per period, or of the singular values of the transition matrix over the second half
             of the time, shape (dimension,); empty if the motion ends. If the reference is constant
             the real parts of the eigenvalues at rest.
-        state: Where the periodic motion begins, shape (n,); None if there is none.
-        reason: What decided, in words.
+        state: The start of the periodic motion, shape (n,); None without one.
+        reason: The reason for the verdict, in words.
     """
 
     verdict: Verdict
@@ -46,7 +45,7 @@ class StabilityAlong:
     def without_numbers(
         cls, verdict: Verdict, reason: str, period: float | None = None
     ) -> "StabilityAlong":
-        """One that nothing is computed for."""
+        """A result without numbers."""
         return cls(verdict, period, np.zeros(0, dtype=complex), np.zeros(0), None, reason)
 
 
@@ -59,20 +58,20 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
         period: The period of the reference; None if it has none.
     """
     if motion.ending is not None:
-        unbounded = motion.ending.cause is Cause.UNBOUNDED
+        unbounded = motion.ending.cause is EndCause.UNBOUNDED
         verdict = Verdict.UNSTABLE if unbounded else Verdict.UNDECIDED
         return StabilityAlong.without_numbers(verdict, f"the motion ends: {motion.ending}", period)
     if motion.times.size < 2:
         reason = "one time alone is no motion; give more times"
         return StabilityAlong.without_numbers(Verdict.UNDECIDED, reason, period)
     if period is not None:
-        # Late, where what dies out has died out; or early, where what grows is small yet.
+        # Late, when decaying disturbances are gone; or early, when growing ones are still small.
         late = int(np.flatnonzero(motion.times <= motion.times[-1] - period)[-1])
         starts = dict.fromkeys((late, 0))
         found = (_closed(flow, motion, first, period) for first in starts)
         closed = next((one for one in found if one is not None), None)
         if closed is None or closed[0].repels:
-            # The motion itself may be another one, which repeats itself after several periods.
+            # The motion itself may have a period of several periods of the reference.
             begin = float(motion.times[late])
             repeating = flow.repeating(begin, period)
             several = find_multiple(repeating, motion.states[late], begin, period)
@@ -86,7 +85,7 @@ def judge_along(flow: Flow, motion: PinnedMotion, period: float | None) -> Stabi
 def _closed(
     flow: Flow, motion: PinnedMotion, first: int, period: float
 ) -> tuple[Return, float] | None:
-    """The motion of the period near one of the states of a motion, and when it begins."""
+    """The periodic motion near one of the states of a motion, and its start time."""
     begin = float(motion.times[first])
     found = close(flow, motion.states[first], begin, period, patient=True)
     return None if found is None else (found, begin)
@@ -104,10 +103,10 @@ def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
         repeating, turning = flow.repeating(begin, period), 2.0 * np.pi / period
         rate = float(exponents[0])
         course = leave(repeating, closed.state, begin, rate, turning, period)
-        verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
-            course.fate, verdict
+        verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
+            course.behavior, verdict
         )
-        if course.fate not in (Fate.UNCLEAR, Fate.GROWS, Fate.SPREADS):
+        if course.behavior not in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
             reason += f"; what leaves it {course}"
     else:
         count = np.count_nonzero(np.abs(sizes - 1.0) <= errors)
@@ -120,29 +119,29 @@ def _by_multipliers(flow: Flow, closed: Return, begin: float) -> StabilityAlong:
 
 
 def _by_exponents(flow: Flow, motion: PinnedMotion, period: float | None) -> StabilityAlong:
-    """What the second half of the time does with disturbances of the motion there."""
+    """The growth of disturbances over the second half of the time."""
     middle = int(np.searchsorted(motion.times, 0.5 * (motion.times[0] + motion.times[-1])))
     middle = min(middle, motion.times.size - 2)
     begin, end = float(motion.times[middle]), float(motion.times[-1])
     try:
         passage, halves = carry_in_halves(flow, motion.states[middle], begin, end)
     except Lost as lost:
-        verdict = Verdict.UNSTABLE if lost.cause is Cause.UNBOUNDED else Verdict.UNDECIDED
+        verdict = Verdict.UNSTABLE if lost.cause is EndCause.UNBOUNDED else Verdict.UNDECIDED
         reason = f"from x = {show(motion.states[middle])}: {lost}"
         return StabilityAlong.without_numbers(verdict, reason, period)
-    fate = fate_of(passage, *halves)
+    behavior = behavior_of(passage, *halves)
     verdict = {
-        Fate.SPREADS: Verdict.UNSTABLE,
-        Fate.SETTLES: Verdict.STABLE,
-    }.get(fate, Verdict.UNDECIDED)
+        Behavior.SPREADS: Verdict.UNSTABLE,
+        Behavior.SETTLES: Verdict.STABLE,
+    }.get(behavior, Verdict.UNDECIDED)
     sizes = np.linalg.svd(passage.transition, compute_uv=False)
     exponents = (np.log(np.maximum(sizes, 1e-300)) + passage.growth) / (end - begin)
     reason = (
         f"from {begin:.6g} to {end:.6g} s disturbances of the motion change by a factor "
         f"{np.exp(min(passage.growth, 700.0)):.3g} at most, {exponents[0]:.3g} 1/s"
     )
-    if fate is Fate.WANDERS:
-        reason += f"; the motion {fate.value}"
+    if behavior is Behavior.WANDERS:
+        reason += f"; the motion {behavior.value}"
     elif verdict is Verdict.UNDECIDED:
         reason += "; that is not long enough to tell"
     none = np.zeros(0, dtype=complex)

@@ -1,4 +1,4 @@
-"""Motions with pinned outputs, and what becomes of small disturbances of them.            (35)
+"""Motions with pinned outputs, and the growth of their small disturbances.            (35)
 
 To first order a disturbance delta of a state on Z(R(t)) moves by delta' = (dx'/dx) delta, with the
 derivative of x' = f* + h* u at fixed R, and stays tangent to Z(R(t)). In bases T of the tangent
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy  # Which loads its heavy parts when they are used.
+import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.zero_dynamics.periods import find_period
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
 from drake_dae.trace.given import result_of
@@ -25,31 +25,32 @@ from drake_dae.trace.given import result_of
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""
 
-STEPS = 5000
-"""The most steps of one interval."""
+MOST_STEPS = 5000
+"""The largest number of steps in one interval."""
 
 SECTIONS = 16
-"""In so many parts of an interval the state is put back on Z(R), and bases are chosen anew."""
+"""The number of parts of an interval; after each, the state is projected onto Z(R) and bases are
+renewed."""
 
 
 class Lost(Exception):
     """A motion cannot be followed to the end of an interval."""
 
-    def __init__(self, cause: Cause) -> None:
+    def __init__(self, cause: EndCause) -> None:
         super().__init__(cause.value)
         self.cause = cause
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
-    """What an interval of time makes of a state on Z(R), and of its disturbances.
+class Transition:
+    """The flow of a state on Z(R) and of its disturbances over an interval of time.
 
     Attributes:
         state: The state at the end, shape (n,).
         basis: T_1, of the tangent space there, orthonormal relative to the scale, shape (n, d).
-        transition: M divided by exp(growth), shape (d, d); the identity if nobody asked for it.
-        growth: The logarithm of the norm of M, by which disturbances grow at most.
-        volume: The logarithm of |det M|, by which a volume of disturbances grows.
+        transition: M divided by exp(growth), shape (d, d); the identity if it was not computed.
+        growth: The logarithm of the norm of M, the largest growth of a disturbance.
+        volume: The logarithm of |det M|, the growth of volumes.
     """
 
     state: FloatArray
@@ -66,7 +67,7 @@ class Flow:
         pinned: Z(R).
         reference: The function t -> R(t).
         parameters: The function t -> values of all parameters.
-        scale: How large the states are, shape (n,).
+        scale: The sizes of the states, shape (n,).
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Flow:
         )
 
     def repeating(self, begin: float, period: float) -> "Flow":
-        """The same along a reference and parameters that repeat what they are in one period."""
+        """The same flow for a reference and parameters that repeat one period."""
 
         def within(time: float) -> float:
             return begin + (time - begin) % period
@@ -116,24 +117,24 @@ class Flow:
         """The state on Z(R(t)) next to a given one.
 
         Raises:
-            Lost: There is none, or it is far.
+            Lost: There is none, or it is not near.
         """
         found, converged = self.pinned.project(state, self.goal(time), self.parameters(time))
         if not converged or not np.all(np.abs(found - state) <= 0.1 * (self.scale + np.abs(state))):
-            raise Lost(Cause.NO_WAY_ON)
+            raise Lost(EndCause.NO_WAY_ON)
         return found
 
     def carry(
         self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
-    ) -> Passage:
-        """Where an interval of time takes a state, and its disturbances.
+    ) -> Transition:
+        """The state and its disturbances at the end of an interval.
 
         Raises:
             Lost: The motion grows without bound, is too fast, or leaves the domain.
         """
         d = self.pinned.structure.zero_dynamics_dimension
         basis, transition, growth, volume = self.basis(state, begin), np.eye(d), 0.0, 0.0
-        times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
+        times, steps = np.linspace(begin, end, SECTIONS + 1), MOST_STEPS
         for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
             columns = basis if disturbed else basis[:, :0]
             state, columns, steps = self._integrate(state, columns, start, stop, steps)
@@ -145,22 +146,22 @@ class Flow:
                 size = max(float(np.linalg.norm(transition, 2)), 1e-300)
                 transition, growth = transition / size, growth + float(np.log(size))
                 volume += max(float(np.linalg.slogdet(scaled)[1]), -700.0)
-        return Passage(state, basis, transition, growth, volume)
+        return Transition(state, basis, transition, growth, volume)
 
     def way(
         self, state: FloatArray, begin: float, end: float
     ) -> Iterator[tuple[float, FloatArray]]:
-        """Times, and the states there, after each step of the way from a state.
+        """The times and states after each step from a state.
 
         Raises:
             Lost: As `carry`.
         """
-        times, steps = np.linspace(begin, end, SECTIONS + 1), STEPS
+        times, steps = np.linspace(begin, end, SECTIONS + 1), MOST_STEPS
         for start, stop in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
             for time, there, _ in self._steps(state, self.basis(state, start)[:, :0], start, stop):
                 steps -= 1
                 if steps < 0:
-                    raise Lost(Cause.TOO_FAST)
+                    raise Lost(EndCause.TOO_FAST)
                 state = there
                 yield time, state
             state = self.onto(state, stop)
@@ -168,11 +169,11 @@ class Flow:
     def _integrate(
         self, state: FloatArray, columns: FloatArray, begin: float, end: float, steps: int
     ) -> tuple[FloatArray, FloatArray, int]:
-        """A state and directions at the end of a section, and how many steps are left."""
+        """The state and directions at the end of a section, and the number of remaining steps."""
         for _, there, along in self._steps(state, columns, begin, end):
             state, columns, steps = there, along, steps - 1
             if steps < 0:
-                raise Lost(Cause.TOO_FAST)
+                raise Lost(EndCause.TOO_FAST)
         return state, columns, steps
 
     def _steps(
@@ -195,11 +196,11 @@ class Flow:
                 self.pinned.rate(x, goal, p), self.pinned.slopes_along(x, goal, p, along)
             )
             if not np.all(np.isfinite(moved)):
-                raise Lost(Cause.NO_WAY_ON)
+                raise Lost(EndCause.NO_WAY_ON)
             return moved
 
         def slopes(time: float, both: FloatArray) -> FloatArray:
-            # Without the second derivatives, which the iteration of the integrator makes up for.
+            # Without second derivatives, for which the iteration of the integrator compensates.
             goal, p = self.goal(time), self.parameters(time)
             matrix = self.pinned.slopes(split(both)[0], goal, p)[0]
             blocks = [matrix * self.scale / unit] * (1 + columns.shape[1])
@@ -207,7 +208,7 @@ class Flow:
 
         def quietly(work: Callable[[], Any]) -> Any:
             with np.errstate(all="ignore"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # That of a step that fails; it is told as Lost.
+                warnings.simplefilter("ignore")  # Of a failed step: see Lost.
                 return work()
 
         y = joined(state, columns)
@@ -219,7 +220,7 @@ class Flow:
         while solver.status == "running":
             quietly(solver.step)
             if not np.max(np.abs(solver.y[:n])) <= bound:
-                raise Lost(Cause.UNBOUNDED)
+                raise Lost(EndCause.UNBOUNDED)
             if solver.status == "failed":
-                raise Lost(Cause.TOO_FAST)
+                raise Lost(EndCause.TOO_FAST)
             yield solver.t, *split(solver.y)

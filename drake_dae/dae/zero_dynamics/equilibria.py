@@ -10,22 +10,22 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.isolation import Isolation, isolation
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     balanced_norm,
     linearized_eigenvalues,
 )
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, Linearization, newton, shortest_steps
+from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
 
 AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
 
 
 FAR = 1e8
-"""A search that comes so far beyond the states that are known, relative to their sizes, has found
-nothing: beside a state so large any rate looks like rest."""
+"""A search fails if it leaves the known states by this factor of their sizes: relative to such
+large states any rate looks like zero."""
 
 APART = 1e-6
 """States at rest that are nearer than this, relative to their sizes, are the same."""
@@ -33,11 +33,11 @@ APART = 1e-6
 
 @dataclass(frozen=True)
 class Unrest:
-    """Why a state is no regular equilibrium.
+    """The reason why a state is not a regular equilibrium.
 
     Attributes:
         regularity: Whether the motion is determined there.
-        moving: If it is, the state that moves most, relative to the terms that cancel in its rate.
+        moving: If it is, the state that changes most, relative to the terms of its rate.
         rate: The time derivative of this state.
     """
 
@@ -50,7 +50,7 @@ class Unrest:
 
 
 def clock_rates(system: DaeSystem) -> FloatArray:
-    """The rates of states that run at a constant one whatever is done, shape (n,); 0 for others."""
+    """The rates of states with a constant rate, such as clocks, shape (n,); 0 for others."""
     explicit, rates = system.explicit, np.zeros(system.num_states)
     for i in range(system.num_states):
         if explicit.f[i].is_constant() and not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz()):
@@ -76,9 +76,9 @@ class Equilibria:
         self._clocks = clock_rates(pinned.system)
 
     def held_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """R with constant outputs, as they are at a state.
+        """R with constant outputs, taken at a state.
 
-        The state does not tell outputs of degree 0; they are as brings it nearest to rest.
+        The state does not determine outputs of degree 0; they are chosen to minimize its rate.
         """
         pinned, layout = self.pinned, self.pinned.layout
         reference = np.zeros(layout.reference_size)
@@ -97,8 +97,8 @@ class Equilibria:
     def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
         """An equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
 
-        T spans the tangent space of Z(R), in which x' is. Where there is a continuum, the step
-        along it is the shortest.
+        T spans the tangent space of Z(R), which contains x'. On a continuum of equilibria the
+        shortest step is taken.
         """
         pinned = self.pinned
         if self._clocks.any():
@@ -115,7 +115,7 @@ class Equilibria:
 
         scale = pinned.system.scale
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             gradients = pinned.gradients(scale * z, parameters) * scale
             onto = shortest_steps(
                 gradients, lambda z: pinned.residual(scale * z, reference, parameters)
@@ -134,7 +134,7 @@ class Equilibria:
                 rate = pinned.rate(scale * z, reference, parameters) / scale
                 return across - inner @ (rate + slopes @ across)
 
-            return Linearization(step, onto.is_regular)
+            return NewtonModel(step, onto.is_regular)
 
         start = pinned.state(reference, guess, parameters)
         z, converged = newton(start / scale, linearize)
@@ -157,9 +157,9 @@ class Equilibria:
     def find_all(
         self, reference: FloatArray, guesses: Sequence[FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """The equilibria that searches from several guesses find, each once, shape (k, n).
+        """The distinct equilibria found from several guesses, shape (k, n).
 
-        Of those that are not isolated, which have a zero eigenvalue, only one that is found first.
+        Of equilibria that are not isolated (with a zero eigenvalue) only the first is kept.
         """
         found = np.zeros((0, self.sizes.size))
         radii: list[float] = []
@@ -175,7 +175,7 @@ class Equilibria:
             if np.all(np.abs(values) > errors):
                 radius = 0.0
             else:
-                # Without a radius where the linearization is singular but for its round-off.
+                # Without a radius if the linearization is singular up to round-off.
                 radius = known.radius if known.degenerate else np.inf
             off = np.max(np.abs(found - rest) / self.pinned.system.scale, axis=1)
             if np.any(off <= radius + np.array(radii)) or (radius == np.inf and len(found)):
@@ -187,16 +187,16 @@ class Equilibria:
     def eigenvalues(
         self, reference: FloatArray, rest: FloatArray, parameters: FloatArray
     ) -> tuple[ComplexArray, FloatArray, Isolation]:
-        """The eigenvalues at an equilibrium, their errors, and how well it is known."""
+        """The eigenvalues at an equilibrium, their errors, and the accuracy of its position."""
         known = isolation(self.pinned, rest, reference, parameters)
         known = known or Isolation(0, 0.0)
         found = linearized_eigenvalues(self.pinned, self.sizes, rest, reference, parameters)
         return found[0], known.errors(*found), known
 
     def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
-        """What moves at a point, or that it is singular; None at a regular equilibrium.
+        """What changes at a point, or that it is singular; None at a regular equilibrium.
 
-        Neither moves what a tiny change of the state brings to rest, as in a fast system.
+        A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """
         regularity = self.pinned.regularity(point)
         if regularity is not Regularity.REGULAR:

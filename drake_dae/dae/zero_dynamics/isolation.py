@@ -1,9 +1,9 @@
-"""Whether a state at which a search for rest ends is an equilibrium, and which one it is.
+"""Whether the result of a search for an equilibrium is one, and how well it is isolated.
 
-A rate that is small proves no rest: that of x' = exp(-x) is small wherever x is large. Next to an
-equilibrium the rate grows with the distance from it, and Newton's step from a state is that
-distance. Where the slope vanishes, as at the one equilibrium of x' = -x^3, the rate still grows,
-and the state is known up to a radius.
+A small rate does not prove an equilibrium: that of x' = exp(-x) is small for all large x. Near an
+equilibrium the rate grows with the distance from it, and a Newton step is that distance. If the
+slope vanishes, as at the equilibrium of x' = -x^3, the rate still grows, and the state is known up
+to a radius.
 """
 
 from dataclasses import dataclass
@@ -15,43 +15,46 @@ from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.stability import ROUNDED, ComplexArray
 
 ISOLATED = 1e-6
-"""An equilibrium is isolated if it is this near, relative to the scale of the states."""
+"""An equilibrium is isolated if its distance is at most this, relative to the scale of the
+states."""
 
 BESIDE = 1e-5
-"""At this distance from it, relative to the scale, the slopes must still be about the same."""
+"""The distance, relative to the scale, within which the slopes must be nearly constant."""
 
 SAME = 0.5
-"""How much they may differ, relative to themselves: then Newton's method contracts."""
+"""The allowed relative change of the slopes: then Newton's method contracts."""
 
 GROWTH = 1e3
-"""By so much the rate grows from a state at rest to where it is seen not to be at rest."""
+"""The growth of the rate, from that at the state, that shows that it is not zero along a
+direction."""
 
 RADII = tuple(0.5**k for k in range(30))
-"""Radii at which that is looked for, relative to the scale of the states."""
+"""The radii of this test, relative to the scale of the states."""
 
 AFAR = 64.0
-"""Up to such a distance, or as far as the state is from zero, a rate that vanishes all along a
-direction still vanishes."""
+"""A rate that vanishes along a direction must vanish up to this distance, or up to the size of the
+state."""
 
 STRAIGHT = 0.1
-"""Which holds for states that the way back to Z(R) moves by less than this part of the distance."""
+"""Tested at states that the projection onto Z(R) moves by less than this fraction of the
+distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Isolation:
-    """How well an equilibrium is known.
+    """The accuracy to which an equilibrium is known.
 
     Attributes:
-        degenerate: In how many directions its linearization does not isolate it.
-        radius: How far it may be from the state, relative to the scale of the states; infinite if
-            it is one of a continuum.
+        degenerate: The number of directions in which its linearization does not isolate it.
+        radius: The largest distance from the state, relative to the scale; infinite on a continuum
+            of equilibria.
     """
 
     degenerate: int
     radius: float
 
     def errors(self, values: ComplexArray, errors: FloatArray) -> FloatArray:
-        """Errors of eigenvalues: in directions that are degenerate there is none but 0."""
+        """Errors of eigenvalues, which are 0 in degenerate directions."""
         widened = errors.copy()
         smallest = np.argsort(np.abs(values))[: self.degenerate]
         widened[smallest] = np.maximum(errors[smallest], 2.0 * np.abs(values[smallest]))
@@ -64,7 +67,7 @@ def isolation(
     reference: FloatArray,
     parameters: FloatArray,
 ) -> Isolation | None:
-    """How well the equilibrium is known at which a search ends; None if there is none.
+    """The isolation of the equilibrium at which a search ends; None if there is none.
 
     Args:
         pinned: Z(R).
@@ -124,7 +127,7 @@ class _Rest:
         along /= np.max(np.abs(along) / self._scale)
         return np.asarray(self._state + distance * along)
 
-    @np.errstate(all="ignore")  # Beside the state the domain may end.
+    @np.errstate(all="ignore")  # The domain may end near the state.
     def isolates(self, index: int) -> bool:
         """Whether the linearization isolates the equilibrium in a singular direction of it."""
         size = float(self.sizes[index])
@@ -141,15 +144,16 @@ class _Rest:
     def radius(self, index: int) -> float | None:
         """How far the equilibrium is in a direction in which it is not isolated.
 
-        Infinite where the rate vanishes all along, None where it vanishes nowhere. A function that
-        is analytic vanishes on a whole line if it does on a part of it; one that is only flat where
-        the state is, like exp(-x), is seen to grow farther away.
+        Infinite if the rate vanishes along the whole direction, None if it vanishes nowhere. An
+        analytic function that vanishes on a part of a line vanishes on all of it; one that is only
+        flat at the state, like exp(-x), grows farther away.
         """
         noise = max(self._noise[index], ROUNDED * self._usual(index))
         seen = GROWTH * max(self._left[index], noise)
         found = None
         for distance in RADII:
-            # On both sides: what grows on one and falls on the other vanishes nowhere.
+            # On both sides: a function that grows on one and decreases on the other does not
+            # vanish.
             if not min(self._at_distance(index, distance)) > seen:
                 break
             found = distance
@@ -161,7 +165,7 @@ class _Rest:
         return None if any(rate > seen for rate in far) else np.inf
 
     def _at_distance(self, index: int, distance: float) -> tuple[float, float]:
-        """How large the rate in a direction is on both sides along it; 0 where nothing is known."""
+        """The size of the rate on both sides of a direction; 0 where it is not known."""
         found = []
         for side in (distance, -distance):
             aside = self._beside(index, side)
@@ -176,5 +180,5 @@ class _Rest:
         return abs(float(self._u[:, index] @ rate)) if np.all(np.isfinite(rate)) else 0.0
 
     def _usual(self, index: int) -> float:
-        """How large the rate in this direction is at the states of the structure."""
+        """The usual rate in this direction, at the states of the structure."""
         return max(self._left_at(state, index) for state in self._pinned.structure.states)

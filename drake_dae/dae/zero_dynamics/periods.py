@@ -6,7 +6,7 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.zero_dynamics.pursuit import Reference
 
 SAMPLES = 2000
-"""At so many times a reference is looked at."""
+"""The number of times at which a reference is sampled."""
 
 REPEATED = 1e-6
 """A reference has a period if it repeats itself to this, relative to its range."""

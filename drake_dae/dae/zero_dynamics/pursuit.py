@@ -3,29 +3,29 @@
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import scipy  # Which loads its heavy parts when they are used.
+import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause, Ending, PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause, MotionEnd, PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.given import result_of
 
 TOLERANCE = 1e-6
-"""The error of an integration step by the method's estimate, which is two orders too high."""
+"""The tolerance of an integration step; the method overestimates its error by two orders."""
 
 
 SHORTEST = 1e-6
-"""The part of a time step at which a search for the way on ends."""
+"""The smallest step, as a fraction of a time step, at which the motion ends."""
 
 
 JUMP = 0.1
-"""A correction of this size, relative to the state, may lead to another solution."""
+"""A correction above this, relative to the state, may lead to another solution."""
 
 
-STEPS = 20_000
-"""The most steps of one motion, beside its times."""
+MOST_STEPS = 20_000
+"""The largest number of steps of one motion, besides its given times."""
 
 
 GROWN = 1e8
@@ -33,7 +33,7 @@ GROWN = 1e8
 
 
 LOST = 1e-2
-"""A margin below this part of its largest value on the way tends to zero."""
+"""A margin below this fraction of its largest value along the motion counts as tending to zero."""
 
 
 Reference = Callable[[float], FloatArray]
@@ -59,11 +59,11 @@ def follow(
     points: list[Point] = []
     ending = None
     try:
-        with np.errstate(all="ignore"):  # States out of the domain are tried, and refused.
+        with np.errstate(all="ignore"):  # States outside the domain are tried and rejected.
             pursuit = _Pursuit(pinned, reference, parameters, times.tolist(), guess)
             for point in pursuit.points():
                 points.append(point)
-    except _MotionEnd as end:
+    except _Ended as end:
         ending = end.ending
     system, count = pinned.system, len(points)
 
@@ -86,16 +86,16 @@ def follow(
     )
 
 
-class _MotionEnd(Exception):
-    """A motion with pinned outputs does not go on."""
+class _Ended(Exception):
+    """The end of a motion with pinned outputs."""
 
-    def __init__(self, ending: Ending) -> None:
+    def __init__(self, ending: MotionEnd) -> None:
         super().__init__(str(ending))
         self.ending = ending
 
 
 class _Pursuit:
-    """Follows a reference from point to point; raises _MotionEnd where that ends."""
+    """Follows a reference from point to point; raises _Ended at the end of the motion."""
 
     def __init__(
         self,
@@ -109,22 +109,22 @@ class _Pursuit:
         self._reference = reference
         self._parameters = parameters
         self._times = times
-        self._remaining = STEPS + len(times)
+        self._remaining = MOST_STEPS + len(times)
         self._name = pinned.system.name
         self._time = times[0]
         goal, when = self._goal(self._time), f"t = {self._time:.6g} s"
         try:
             start = pinned.state(goal, guess, parameters(self._time))
         except InconsistentStateError as error:
-            ending = Ending(Cause.NO_START, self._time, f"{error} ({when})")
-            raise _MotionEnd(ending) from error
+            ending = MotionEnd(EndCause.NO_START, self._time, f"{error} ({when})")
+            raise _Ended(ending) from error
         self._last = pinned.point(start, goal, parameters(self._time))
         if pinned.regularity(self._last) is not Regularity.REGULAR:
             text = (
                 f"{self._name}: at the start, {when}, x = {show(start)}, A(x) or B(x) is singular, "
                 "or the domain of the system ends"
             )
-            raise _MotionEnd(Ending(Cause.SINGULAR_START, self._time, text, start))
+            raise _Ended(MotionEnd(EndCause.SINGULAR_START, self._time, text, start))
         self._largest = self._last.margins
 
     def points(self) -> Iterator[Point]:
@@ -134,7 +134,7 @@ class _Pursuit:
         yield from self._integrate() if has_dynamics else self._continue()
 
     def _continue(self) -> Iterator[Point]:
-        """Goes on without zero dynamics, by a predictor and Newton's method."""
+        """Continues without zero dynamics, by a predictor and Newton's method."""
         step, change = np.inf, np.zeros(self._last.state.size)
         for end in self._times[1:]:
             interval = end - self._time
@@ -142,7 +142,7 @@ class _Pursuit:
                 step = min(step, end - self._time)
                 time = end if step == end - self._time else self._time + step
                 before = self._last
-                # Adams and Bashforth: x' and its change since the step before.
+                # Adams-Bashforth: x' and its change since the previous step.
                 predicted = before.state + step * (before.rate + 0.5 * step * change)
                 if self._reach(time, predicted):
                     change = (self._last.rate - before.rate) / step
@@ -153,7 +153,7 @@ class _Pursuit:
             yield self._last
 
     def _integrate(self) -> Iterator[Point]:
-        """Goes on with zero dynamics, by an implicit integrator, since they may be stiff."""
+        """Continues with zero dynamics, by an implicit integrator, since they may be stiff."""
         scale = self._pinned.system.scale
         bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
         integrator = None
@@ -168,8 +168,8 @@ class _Pursuit:
                 worst = int(np.argmax(np.abs(integrator.y) / scale))
                 if abs(integrator.y[worst]) > bound * scale[worst]:
                     raise self._stop(
-                        Cause.UNBOUNDED,
-                        f"{self._name}: {Cause.UNBOUNDED.value}: "
+                        EndCause.UNBOUNDED,
+                        f"{self._name}: {EndCause.UNBOUNDED.value}: "
                         f"{self._pinned.system.state_signals[worst].name} = "
                         f"{integrator.y[worst]:.3g} at t = {integrator.t:.6g} s",
                     )
@@ -212,8 +212,8 @@ class _Pursuit:
             given = result_of("reference", self._reference, time)
             goal = numbers(f"reference({time:g})", given).reshape(-1)
         except NonFiniteError as error:
-            ending = Ending(Cause.REFERENCE_NOT_FINITE, time, str(error))
-            raise _MotionEnd(ending) from error
+            ending = MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error))
+            raise _Ended(ending) from error
         if goal.size != layout.reference_size:
             raise ModelError(
                 f"{self._name}: the reference must have size {layout.reference_size} (each output "
@@ -221,18 +221,18 @@ class _Pursuit:
             )
         if not np.all(np.isfinite(goal)):
             text = f"{self._name}: the reference is not finite at t = {time:.6g} s"
-            raise _MotionEnd(Ending(Cause.REFERENCE_NOT_FINITE, time, text))
+            raise _Ended(MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, text))
         return goal
 
     def _reach(self, time: float, state: FloatArray) -> bool:
-        """Goes on to the point next to a state, unless it is on another branch than the last."""
+        """Continues to the point next to a state, unless it is on another branch than the last."""
         last = self._last
         self._remaining -= 1
         if self._remaining < 0:
             raise self._stop(
-                Cause.TOO_FAST,
-                f"{self._name}: after {STEPS} steps the motion is at t = {self._time:.6g} s; it is "
-                "too fast to be followed so far",
+                EndCause.TOO_FAST,
+                f"{self._name}: after {MOST_STEPS} steps the motion is at t = {self._time:.6g} s: "
+                "it is too fast to be followed",
             )
         goal, parameters = self._goal(time), self._parameters(time)
         found, converged = self._pinned.project(state, goal, parameters)
@@ -253,8 +253,8 @@ class _Pursuit:
         if step < SHORTEST * interval:
             raise self._end(0.1 * interval)
 
-    def _end(self, ahead: float) -> _MotionEnd:
-        """Why there is no way on from the last point, with a look at the goal ahead of it."""
+    def _end(self, ahead: float) -> _Ended:
+        """The reason why the motion ends at the last point, also from the reference ahead."""
         last, when = self._last, f"t = {self._time:.6g} s"
         shares = [
             now / largest if largest < np.inf else 1.0
@@ -266,7 +266,7 @@ class _Pursuit:
             if escape:
                 return escape
             return self._stop(
-                Cause.NO_WAY_ON,
+                EndCause.NO_WAY_ON,
                 f"{self._name}: no state that continues the motion is found beyond {when}, x = "
                 f"{show(last.state)}: the reference jumps, or the domain of the system ends",
             )
@@ -279,16 +279,16 @@ class _Pursuit:
         matrix, smallest = "AB"[which], f"smallest singular value {last.margins[which]:.2g}"
         singular = f"{matrix}(x) becomes singular, {smallest}"
         if beyond:
-            text = f"{self._name}: at {when} {singular}: {Cause.SINGULAR.value}"
-            return self._stop(Cause.SINGULAR, text, matrix)
-        text = f"{self._name}: {Cause.OUT_OF_REACH.value} at {when}: {singular}"
-        return self._stop(Cause.OUT_OF_REACH, text, matrix)
+            text = f"{self._name}: at {when} {singular}: {EndCause.SINGULAR.value}"
+            return self._stop(EndCause.SINGULAR, text, matrix)
+        text = f"{self._name}: {EndCause.OUT_OF_REACH.value} at {when}: {singular}"
+        return self._stop(EndCause.OUT_OF_REACH, text, matrix)
 
-    def _escape(self) -> _MotionEnd | None:
+    def _escape(self) -> _Ended | None:
         """The end where a state grows without bound within a finite time; None where none does.
 
-        At such an end a rate is as large as if the state had grown by `GROWN` in the time so far,
-        though the state itself may still be small, as that of x' = exp(x).
+        At such an end a rate is so large that the state would have grown by `GROWN` in the elapsed
+        time. The state itself may still be small, as for x' = exp(x).
         """
         system, last = self._pinned.system, self._last
         elapsed = max(self._time - self._times[0], SHORTEST * (self._times[-1] - self._times[0]))
@@ -298,12 +298,12 @@ class _Pursuit:
         if not rates[worst] > GROWN:
             return None
         return self._stop(
-            Cause.UNBOUNDED,
-            f"{self._name}: {Cause.UNBOUNDED.value}, within a finite time: "
+            EndCause.UNBOUNDED,
+            f"{self._name}: {EndCause.UNBOUNDED.value}, within a finite time: "
             f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g} at t = "
             f"{self._time:.6g} s",
         )
 
-    def _stop(self, cause: Cause, text: str, matrix: str = "") -> _MotionEnd:
+    def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _Ended:
         """The end of the motion at the last point."""
-        return _MotionEnd(Ending(cause, self._time, text, self._last.state, matrix))
+        return _Ended(MotionEnd(cause, self._time, text, self._last.state, matrix))

@@ -1,8 +1,8 @@
-"""Motions that return to where they were: what shows that one is bounded.
+"""Periodic motions, which prove that a motion is bounded.
 
-That small disturbances do not grow shows no bound: x' = 1 has none that do, and no bound. A motion
-that comes back to a state repeats itself for ever, and is bounded; motions next to it are drawn to
-it where all its multipliers, except that along the motion itself, are inside the unit circle.
+Decaying disturbances do not prove that a motion is bounded: those of x' = 1 do not grow, but x
+does. A motion that returns to a state is periodic and so bounded. It attracts neighbouring motions
+if all its multipliers, except that along the motion itself, are inside the unit circle.
 """
 
 from collections.abc import Iterator
@@ -16,38 +16,39 @@ from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, eigenvalues_of
 
 CLOSED = 1e-7
-"""A motion is closed if it comes back to this, relative to the scale of the states."""
+"""A motion is periodic if it returns to within this, relative to the scale of the states."""
 
 CARRIED = 1e-6
 """The error of a transition matrix, relative to its norm."""
 
 NEAR = 0.05
-"""A motion comes near to where it was at this part of the way that it goes about."""
+"""A motion is near its start within this fraction of its extent."""
 
 MULTIPLES = 6
-"""After so many periods of a reference a motion along it is looked for that repeats itself."""
+"""The multiples of the period of a reference that are tried for a periodic motion."""
 
 LEAST = 1e-4
-"""What goes about by less than this, relative to the scale of the states, is at rest."""
+"""A motion of smaller extent than this, relative to the scale of the states, is at rest."""
 
-STEPS = 12
-"""So many of Newton's steps are tried."""
+NEWTON_STEPS = 12
+"""The largest number of Newton steps."""
 
 CROSSINGS = 6
-"""So many times that a motion comes near to where it was are tried."""
+"""The largest number of near returns that are tried."""
 
 
 @dataclass(frozen=True, eq=False)
 class Return:
-    """A motion that comes back to where it was.
+    """A periodic motion.
 
     Attributes:
-        state: Where it begins, shape (n,).
-        period: After what time it is there again, in s.
-        monodromy: What that makes of disturbances, in the basis there, shape (d, d).
-        multipliers: Its eigenvalues, the largest first; without the one that is 1 along the motion
-            if nothing else gives the time.
-        errors: How far off each may be.
+        state: Its start, shape (n,).
+        period: Its period, in s.
+        monodromy: The transition matrix of disturbances over the period, in the basis at the start,
+            shape (d, d).
+        multipliers: Its eigenvalues, the largest first; for autonomous motions without the one that
+            is 1 along the motion.
+        errors: The error bound of each.
     """
 
     state: FloatArray
@@ -58,12 +59,12 @@ class Return:
 
     @property
     def attracts(self) -> bool:
-        """Whether motions beside it are drawn to it."""
+        """Whether it attracts neighbouring motions."""
         return bool(np.all(np.abs(self.multipliers) < 1.0 - self.errors))
 
     @property
     def repels(self) -> bool:
-        """Whether some motions beside it leave it."""
+        """Whether some neighbouring motions leave it."""
         return bool(np.any(np.abs(self.multipliers) > 1.0 + self.errors))
 
     def __str__(self) -> str:
@@ -82,20 +83,20 @@ def close(
     free: bool = False,
     patient: bool = False,
 ) -> Return | None:
-    """The motion near a state that comes back after a period; None if none is found.
+    """The periodic motion near a state for a period; None if none is found.
 
-    Newton's method for the way that is left after a period, along the tangent space.
+    Newton's method for the distance from the start after a period, along the tangent space.
 
     Args:
-        flow: Of a reference that repeats itself after the period, or is constant.
-        state: Where to begin, shape (n,).
-        begin: When, in s.
+        flow: The flow of a reference that has the period, or is constant.
+        state: The start, shape (n,).
+        begin: The start time, in s.
         period: In s.
-        free: Whether the period is found as well, where nothing depends on time.
-        patient: Whether to go on where what is left does not get less for a while.
+        free: Whether the period is unknown, as in autonomous systems.
+        patient: Whether to continue if the distance does not decrease for some steps.
     """
     scale, before = flow.scale, np.inf
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         basis = flow.basis(state, begin)
         try:
             passage = flow.carry(state, begin, begin + period)
@@ -111,7 +112,7 @@ def close(
         gap = scaled @ ((passage.state - state) / scale)
         missed = float(np.linalg.norm(gap))
         if not patient and missed > max(0.5 * before, CLOSED):
-            return None  # As where the motion drifts.
+            return None  # For example if the motion drifts.
         matrix, left, before = monodromy - np.eye(gap.size), -gap, missed
         if free:
             # A little later, and not along the motion.
@@ -142,14 +143,14 @@ def close(
 
 
 def find_return(flow: Flow, state: FloatArray, duration: float) -> Return | None:
-    """The closed motion that a motion is on, or next to, where nothing depends on time.
+    """The periodic motion on or near a motion of an autonomous system.
 
-    It is sought where the motion crosses a section near where it was: the plane across its rate.
+    Candidates are crossings of a section, the plane normal to its rate, near the start.
 
     Args:
-        flow: Of a constant reference.
+        flow: The flow of a constant reference.
         state: A state of the motion, shape (n,).
-        duration: How long to wait for it, in s.
+        duration: The longest time to follow, in s.
     """
     periods = islice(_near(flow, state, duration), CROSSINGS)
     found = (close(flow, state, 0.0, period, free=True) for period in periods)
@@ -157,13 +158,13 @@ def find_return(flow: Flow, state: FloatArray, duration: float) -> Return | None
 
 
 def find_multiple(flow: Flow, state: FloatArray, begin: float, period: float) -> Return | None:
-    """The motion near a state that comes back after some periods of the reference, and attracts."""
+    """The attracting motion near a state whose period is a multiple of the reference's."""
     found = (close(flow, state, begin, count * period) for count in range(1, MULTIPLES + 1))
     return next((one for one in found if one is not None and one.attracts), None)
 
 
 def _near(flow: Flow, state: FloatArray, duration: float) -> Iterator[float]:
-    """When a motion crosses the section at a state in the same direction, near the state."""
+    """The times at which a motion crosses the section at a state in the same direction, near it."""
     rate = flow.pinned.rate(state, flow.goal(0.0), flow.parameters(0.0)) / flow.scale
     if not np.any(rate):
         return

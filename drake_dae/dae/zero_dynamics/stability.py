@@ -11,19 +11,19 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 
 LINEARIZED = 1e-11
-"""The error of a linearization, relative to the terms that add up to each of its entries."""
+"""The error of a linearization, relative to the terms in each of its entries."""
 
 ROUNDED = 1e-15
 """The error of computed eigenvalues, relative to the norm of the matrix."""
 
 SHIFT = 1e-7
-"""How far off an equilibrium may be, relative to the size of the states."""
+"""The error of an equilibrium, relative to the size of the states."""
 
 ComplexArray = np.typing.NDArray[np.complex128]
 
 
 class Verdict(StrEnum):
-    """What is found of the zero dynamics."""
+    """The verdict on the zero dynamics."""
 
     STABLE = "exponentially stable"
     BOUNDED = "bounded, not asymptotically stable"
@@ -33,22 +33,21 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Whether the internal states stay near an equilibrium while the outputs are held.
+    """The stability of the internal states about an equilibrium, with constant outputs.
 
-    The verdict is local: it is about states near this equilibrium and outputs near its outputs.
-    What suffices for Assumption 2.2 everywhere, (i) and (ii) below (36), is not examined.
+    The verdict is local: for states near this equilibrium and outputs near its outputs. The global
+    sufficient conditions (i) and (ii) below (36) are not examined.
 
     Attributes:
         verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
-            one; bounded if what leaves an unstable equilibrium is seen to come to a limit cycle,
-            which returns and attracts; undecided if an eigenvalue is on the imaginary axis up to
-            round-off, if no equilibrium is found, or if what leaves it draws its neighbours to it
-            and is not seen to return. Without zero dynamics: stable, or undecided if A(x) or B(x)
-            is singular.
+            one; bounded if motions that leave an unstable equilibrium converge to an attracting
+            limit cycle; undecided if an eigenvalue is on the imaginary axis up to round-off, if no
+            equilibrium is found, or if motions that leave it attract their neighbours but do not
+            return. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
         eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
             (dimension,); empty if no equilibrium is found.
         state: The equilibrium, shape (n,); None if none is needed, or found.
-        reason: What decided, in words.
+        reason: The reason for the verdict, in words.
     """
 
     verdict: Verdict
@@ -66,8 +65,8 @@ def linearized_eigenvalues(
 ) -> tuple[ComplexArray, FloatArray]:
     """The eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), and their errors.
 
-    They are off by the round-off of what cancels in the derivative, and by what a shift of the
-    equilibrium changes, which is not known better where Newton's method converges slowly.
+    The errors come from round-off in the derivative, and from the error of the equilibrium, which
+    is large if Newton's method converges slowly.
 
     Args:
         pinned: Z(R).
@@ -81,11 +80,11 @@ def linearized_eigenvalues(
     """
     slopes, _ = pinned.slopes(state, reference, parameters)
     free, moved = pinned.coordinates(state, parameters, scale)
-    # What moves with a coordinate is known to round-off, relative to the scale of the states.
+    # The tangent directions are known to round-off, relative to the scale of the states.
     least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
     sizes = pinned.sizes_of_slopes(state, reference, parameters)
     off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
-    # The numbers of a model are rounded too, such as the cosine of a right angle.
+    # The numbers of a model are rounded as well, such as the cosine of a right angle.
     units = scale[free][:, None] / scale[free]
     matrix = (slopes @ moved)[free] / units
     off = off / units + ROUNDED * np.linalg.norm(matrix, 2)
@@ -106,10 +105,9 @@ def linearized_eigenvalues(
 def stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) -> bool:
     """Whether no eigenvalue of a matrix can cross the imaginary axis, within its error.
 
-    Single eigenvalues of a defective matrix are uncertain, by the root of its error, though all of
-    them may be far from the axis. A matrix E that moves one to i w is no smaller than the smallest
-    singular value of A - i w; that is e at some w only if i w is an eigenvalue of
-    [[A, -e], [e, -A^T]] (Byers 1988).
+    Eigenvalues of a defective matrix have errors of the root of its error, even if all are far from
+    the axis. A perturbation that moves one to i w is at least the smallest singular value of A - i
+    w; this equals e for some w only if i w is an eigenvalue of [[A, -e], [e, -A^T]] (Byers 1988).
 
     Args:
         matrix, error, rounded: As for `eigenvalues_of`.
@@ -123,12 +121,12 @@ def stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) ->
         return False
     away = off * np.eye(size)
     values = np.linalg.eigvals(np.block([[balanced, -away], [away, -balanced.T]]))
-    # The eigenvalues of this one are known to the root of a rounding, where they meet on the axis.
+    # Its eigenvalues have an error of the root of round-off where they meet on the axis.
     return bool(np.min(np.abs(values.real)) > np.sqrt(ROUNDED) * norm)
 
 
 def balanced_norm(matrix: FloatArray) -> float:
-    """The norm of a matrix without the units of its state."""
+    """The norm of a matrix after balancing, independent of units."""
     with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
         return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
 
@@ -136,17 +134,17 @@ def balanced_norm(matrix: FloatArray) -> float:
 def eigenvalues_of(
     matrix: FloatArray, error: FloatArray, rounded: float = 0.0
 ) -> tuple[ComplexArray, FloatArray]:
-    """Eigenvalues, largest real part first, and how far off each may be.
+    """Eigenvalues, largest real part first, and their error bounds.
 
-    To first order an error E of the matrix moves an eigenvalue by at most
-    |y|^H |E| |x| / |y^H x|, with its left and right eigenvectors y and x. So in a triangular matrix
-    a small eigenvalue is as certain as its own entry. Balancing takes the units out first.
+    To first order an error E of the matrix moves an eigenvalue by at most |y|^H |E| |x| / |y^H x|,
+    with its left and right eigenvectors y and x. So in a triangular matrix a small eigenvalue is as
+    accurate as its own entry. Balancing removes the units first.
 
     Args:
         matrix: The matrix, shape (d, d).
-        error: How far off its entries may be, shape (d, d).
-        rounded: How far off any entry of the balanced matrix may be; that of the eigenvalues'
-            computation is added.
+        error: The error bounds of its entries, shape (d, d).
+        rounded: The error bound of the entries of the balanced matrix; that of the computation is
+            added.
     """
     if not matrix.size:
         return np.zeros(0, dtype=complex), np.zeros(0)
@@ -162,7 +160,7 @@ def eigenvalues_of(
 
 
 def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: str) -> Stability:
-    """What the eigenvalues at an equilibrium say.
+    """The verdict by the eigenvalues at an equilibrium.
 
     Args:
         values, errors: What `linearized_eigenvalues` returns; at least one eigenvalue.

@@ -18,10 +18,10 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.along import StabilityAlong, judge_along
 from drake_dae.dae.zero_dynamics.disturbances import Flow
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
+from drake_dae.dae.zero_dynamics.long_term import judge_at_rest, judge_without_rest
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import Reference, follow
-from drake_dae.dae.zero_dynamics.settling import judge_at_rest, judge_without_rest
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     Stability,

@@ -1,4 +1,4 @@
-"""What stands between the control and the joints: a chain of stages toward the motor."""
+"""Actuation: a chain of stages between the control and the joints."""
 
 from drake_dae.robots.actuation.dc_motors import DcMotors
 from drake_dae.robots.actuation.flexible_joints import FlexibleJoints

@@ -20,7 +20,7 @@ class ActuationChain:
         stages: The stages from the joints toward the motor; none for rigid joints.
         joint_force: tau(q, v, s), the forces of the stages on the joints, shape (p, 1); 0 for rigid
             joints.
-        direct: How u acts on the joints at once, shape (p, p): 1 for rigid joints, otherwise 0.
+        direct: The direct action of u on the joints, shape (p, p): 1 for rigid joints, otherwise 0.
         state: The states of all stages, shape (k, 1).
         mass, drift, drive: E s' = drift + drive u, shapes (k, k), (k, 1), (k, p).
         control_signals: Names and units of u.
@@ -39,7 +39,7 @@ class ActuationChain:
 
     @property
     def carries_rotors(self) -> bool:
-        """Whether the rotors turn with a stage, and not with the links."""
+        """Whether the rotors move with a stage instead of the links."""
         return any(stage.carries_rotors for stage in self.stages)
 
     @property
@@ -56,9 +56,8 @@ def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
         links: The robot.
 
     Raises:
-        ModelError: There are no actuators, a stage stands behind one that nothing can drive, or two
-            stages carry the rotors; or the actuators do not drive derivatives of positions, each
-            its own.
+        ModelError: There are no actuators, a stage follows one without a shaft, two stages carry
+            the rotors, or the actuators do not each drive their own joint velocity.
     """
     if not stages:
         return _rigid_joints(links)
@@ -131,7 +130,7 @@ def _actuated(links: Links) -> tuple[ca.SX, ca.SX]:
 
 
 def _check_rotors(names: Sequence[str], attached: Sequence[AttachedStage]) -> None:
-    """Refuses rotors that turn with more than one stage: they would count twice."""
+    """Refuses rotors in more than one stage, since they would count twice."""
     carriers = [n for n, own in zip(names, attached, strict=True) if own.carries_rotors]
     if len(carriers) > 1:
         raise ModelError(

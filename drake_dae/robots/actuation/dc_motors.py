@@ -20,15 +20,15 @@ class DcMotors(Stage):
 
         M(q) q'' + H = J^T lambda + N K_m I_a,    L I_a' + R I_a + K_m N q' = u.
 
-    Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
-    positions and 1 for forces. The law needs positions and velocities, and the currents.
-    Their port is `motor_current`, I_a in A, shape (p,).
+    After `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
+    positions and 1 for forces. The law needs positions and velocities, and the currents. The plant
+    has the port `motor_current`, I_a in A, shape (p,).
 
     Attributes:
         torque_constant: K_m in N m/A, a number or shape (p,), not 0.
         inductance: L in H, positive.
         resistance: R in ohm, not negative.
-        gear_ratio: N; what the URDF declares if None.
+        gear_ratio: N; that of the URDF if None.
     """
 
     torque_constant: ArrayLike
@@ -58,10 +58,10 @@ class DcMotors(Stage):
             state=current,
             state_signals=tuple(Signal(f"{name}.current", "A") for name in names),
             mass=ca.diag(l),
-            drift=lambda position, velocity: -r * current - k_m * n * velocity,
+            drift=lambda position, velocity: -r * current - k_m * n * velocity,  # (75)
             drive_matrix=ca.SX.eye(p),
             drive_signals=tuple(Signal(f"{name}.voltage", "V") for name in names),
-            force=lambda position, velocity: n * k_m * current,
+            force=lambda position, velocity: n * k_m * current,  # (74)
             ports={"motor_current": slice(0, p)},
             parameters=(constant, inductance, resistance, gears),
         )

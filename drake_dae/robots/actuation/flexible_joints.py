@@ -22,27 +22,26 @@ class FlexibleJoints(Stage):
         M(q_1) q_1'' + H = J^T lambda + K_2 (q_2 - q_1) + D (q_2' - q_1'),
         M_2 q_2'' + K_2 (q_2 - q_1) + D (q_2' - q_1') = u.
 
-    A law that is late by tau (its delay, and half a sample) cancels the springs late as well. Of a
-    single joint, which swings freely with W_0^2 = K_2 (1 / M + 1 / M_2), two poles at -w and two at
-    -W are stable for 2 (W + w) (W^2 + 3 W w + w^2) > W_0^2 tau W w: four alike for
-    20 w > W_0^2 tau, faster ones beside slow ones from less on. And the law takes accelerations of
-    the links from its model. Where friction holds a tool, the model has one that is not there, for
-    which a'' + K_i4 a' + (K_i3 - kappa) a = 0, with the gains of (32) and the eigenvalues kappa of
-    P M^-1 K_2 M^-1 P^T (P M^-1 P^T)^-1 for the Jacobian P of what is held; so
-    K_i3 = W^2 + 4 W w + w^2 must be above kappa. Springs that are stiffer than samples allow are
-    better taken for rigid.
+    A law with the total delay tau (its delay and half a sample) compensates the springs late. For a
+    single joint with the natural frequency W_0^2 = K_2 (1 / M + 1 / M_2), two poles at -w and two
+    at -W are stable if 2 (W + w) (W^2 + 3 W w + w^2) > W_0^2 tau W w: four equal ones if 20 w >
+    W_0^2 tau. The law takes accelerations of the links from its model. If friction holds a tool,
+    the model has an acceleration a that the tool does not have, with a'' + K_i4 a' + (K_i3 - kappa)
+    a = 0, the gains of (32) and the eigenvalues kappa of P M^-1 K_2 M^-1 P^T (P M^-1 P^T)^-1 for
+    the Jacobian P of the held directions; so K_i3 = W^2 + 4 W w + w^2 must be above kappa. Model
+    springs that are too stiff for the sample time as rigid joints.
 
-    The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4
-    for positions and 2 for forces; 3 and 1 with damping. Damping leaves p zero dynamics, which the
-    law does not move: K_2 d + D d' = tau for the deflections d, with the rates of D^-1 K_2. They
-    are stable, but bound the step of an explicit integrator. The law needs positions and
-    velocities of links and shafts. Their port is `motor_state`, (q_2, q_2'), shape (2p,).
+    The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4 for
+    positions and 2 for forces; 3 and 1 with damping. Damping adds zero dynamics of dimension p,
+    which the law does not change: K_2 d + D d' = tau for the deflections d, with the rates of D^-1
+    K_2. They are stable, but limit the step of an explicit integrator. The law needs positions and
+    velocities of links and shafts. The plant has the port `motor_state`, (q_2, q_2'), shape (2p,).
 
     Attributes:
-        stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite. None is
-            infinite: of rigid joints beside flexible ones B(x) of Assumption (5) is singular, as
-            the control reaches the outputs at different orders. Give a high stiffness instead.
-        inertia: M_2 in kg m^2 (kg), likewise; what the URDF declares if None.
+        stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite. All are
+            finite: with rigid joints among flexible ones B(x) of Assumption (5) is singular, since
+            the control reaches the outputs at different orders. Use a high stiffness instead.
+        inertia: M_2 in kg m^2 (kg), likewise; that of the URDF if None.
         damping: D in N m s/rad (N s/m), likewise positive definite; 0 for none.
     """
 
@@ -80,7 +79,7 @@ class FlexibleJoints(Stage):
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
 
         def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
-            return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)
+            return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)  # (64)
 
         kinds = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
         positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, kinds, strict=True)]
@@ -89,7 +88,7 @@ class FlexibleJoints(Stage):
             state=ca.vertcat(q_2, rate),
             state_signals=(*positions, *rates),
             mass=ca.diagcat(ca.SX.eye(p), m_2),
-            drift=lambda position, velocity: ca.vertcat(rate, -force(position, velocity)),
+            drift=lambda position, velocity: ca.vertcat(rate, -force(position, velocity)),  # (65)
             drive_matrix=ca.vertcat(ca.SX(p, p), ca.SX.eye(p)),
             drive_signals=tuple(links.actuator_signals),
             force=force,

@@ -25,15 +25,16 @@ class ElectrohydraulicServos(Stage):
 
         M(q) q'' + H = J^T lambda + G(q) f_a,    K_h^-1 f_a' + G_p f_a + G(q)^T q' = u.
 
-    Behind `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
-    positions and 1 for forces. The law needs positions and velocities, and the actuator forces.
-    Their port is `actuator_force`, f_a in N, shape (p,).
+    After `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
+    positions and 1 for forces. The law needs positions and velocities, and the actuator forces. The
+    plant has the port `actuator_force`, f_a in N, shape (p,).
 
     Attributes:
         stiffness: K_h of the fluid in N/m, a number or shape (p,), positive.
         leakage: G_p in m/(N s), a number, shape (p,) or (p, p), positive semidefinite.
-        geometry: G of the actuated positions, a CasADi column of shape (p, 1); returns shape
-            (p, p) in m. Or a number, shape (p,) or (p, p); 1 if left out.
+        geometry: The function G of the actuated positions, a CasADi column of shape (p, 1), with
+            values of shape (p, p) in m; or a constant: a number, shape (p,) or (p, p). 1 by
+            default.
     """
 
     stiffness: ArrayLike

@@ -1,8 +1,8 @@
-"""What a stage of actuation, between the control and the joints, says of itself.
+"""The contract of a stage of actuation, between the control and the joints.
 
-No stage is rigid joints (37), where the control is the joint torque. A stage delivers a force to
-its load, the joints or the shaft of the stage before it, and is driven by the stage after it or by
-the control. All positions, velocities and forces are on the joints' side of the gears.
+Without stages the joints are rigid (37), and the control is the joint torque. A stage applies a
+force to its load, the joints or the shaft of the previous stage, and is driven by the next stage or
+by the control. All positions, velocities and forces are on the joints' side of the gears.
 """
 
 from abc import ABC, abstractmethod
@@ -24,14 +24,13 @@ class AttachedStage:
         state_signals: Names and units of s.
         mass: E, shape (k, k), symmetric positive definite.
         drift: Takes the load's position and velocity, each of shape (p, 1); returns shape (k, 1).
-        drive_matrix: How the drive acts on s, shape (k, p).
+        drive_matrix: The input matrix of the drive, shape (k, p).
         drive_signals: Names and units of the drive, p of them.
-        force: Takes the load's position and velocity; returns what the load gets, shape (p, 1).
+        force: Takes the load's position and velocity; returns the force on the load, shape (p, 1).
         parameters: The parameters of these expressions.
-        ports: Output port of the plant -> the entries of s that it shows.
-        shaft: Position and velocity of what a next stage drives; None if nothing can drive it.
-        carries_rotors: Whether the rotors that the plant declares turn with it, not with the
-            links.
+        ports: Output port of the plant -> its entries of s.
+        shaft: Position and velocity of the shaft that a next stage drives; None without a shaft.
+        carries_rotors: Whether the plant's rotors move with it instead of the links.
     """
 
     state: ca.SX
@@ -48,19 +47,18 @@ class AttachedStage:
 
 
 class Stage(ABC):
-    """One kind of actuation: what it is made of, to be attached to a robot.
+    """One kind of actuation, to be attached to a robot.
 
     1. `attach` gives equations for the p actuators of the given links, in new symbols for the
        state; the stage itself does not change and can be attached to many robots.
     2. Numbers are `parameters` of these equations, with names that begin with the kind, as
-       "dc_motors.resistance". What does not fit raises ModelError with the name and the value.
+       "dc_motors.resistance". An invalid value raises ModelError with the name and the value.
     3. E is symmetric positive definite. `drift` and `force` are smooth, and depend on s, on
        parameters, and on the load's position and velocity, not on the drive: so the control does
        not reach the joints in the same instant.
-    4. The drive is a force, driven by the stage behind it, if and only if there is a `shaft`.
-    5. At rest, a drive can hold the load against any force: s' = 0 has a solution (s, drive).
-    6. A name of a state or a port stands once in a chain. The rotors that the plant declares turn
-       with one stage at most.
+    4. Another stage can drive it exactly if there is a `shaft`; its drive is then a force.
+    5. At rest, the drive can balance any force on the load: s' = 0 has a solution (s, drive).
+    6. Names of states and ports are unique in a chain. At most one stage carries the rotors.
     """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""What a robot touches or holds: constraints, and the surfaces that they are about."""
+"""Constraints of a robot: contacts, grasps, loops and couplings."""
 
 from drake_dae.robots.constraints.alignment import AxisNormalToSurface
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint

@@ -1,4 +1,4 @@
-"""Axes that keep a direction to a surface."""
+"""Axes with a fixed direction relative to a surface."""
 
 from dataclasses import dataclass, field
 
@@ -28,23 +28,23 @@ class AxisNormalToSurface(Constraint):
         phi(q) = 2 / (1 + a . n) (c . n, -b . n),
 
     with the axis a, the two axes b, c across it so that b x c = a, and the unit normal n(p) toward
-    the free side. Both rows are zero where a = n alone: where a = -n they are infinite. The
-    constraint forces are the moments in N m, about b and c, that the surface exerts on the frame;
-    where a = n, phi' = (b . w, c . w) with the angular velocity w relative to the normal. On a
-    curved surface, where the normal turns as the point moves, the surface exerts a force at the
-    point as well, which follows from the moments. Whatever stands still gets the opposite.
+    the free side. Both rows are zero only for a = n; for a = -n they are infinite. The constraint
+    forces are the moments in N m, about b and c, that the surface exerts on the frame; where a = n,
+    phi' = (b . w, c . w) with the angular velocity w relative to the normal. On a curved surface
+    the normal turns as the point moves, so the surface also exerts a force at the point, which
+    follows from the moments. The environment gets the opposite.
 
-    It holds a direction and no distance: the point may leave the surface, and the frame may turn
-    about the axis. With a `PointOnSurface` at the same point a disk lies flush; with a tool whose
-    axis points out of it, give the axis with a minus. The parameter "<name>.position" is where the
-    surface stands: a study that moves the one of the `PointOnSurface` moves it too.
+    It restricts the direction only: the point may leave the surface, and the frame may turn about
+    the axis. With a `PointOnSurface` at the same point a disk lies flush. For a tool whose axis
+    points towards the surface, give the negative axis. The parameter "<name>.position" is the
+    position of the surface; move it together with that of the `PointOnSurface`.
 
     Attributes:
         frame: Name of the frame.
-        surface: A surface that stands in the world.
+        surface: A surface fixed in the world.
         axis: The axis in the frame, of any length, shape (3,).
         point: The point in the frame, m, shape (3,).
-        name: The name of the constraint, before those of its forces and its parameter.
+        name: The name of the constraint, the prefix of its forces and its parameter.
     """
 
     frame: str
@@ -90,7 +90,7 @@ class AxisNormalToSurface(Constraint):
         return a, b, c
 
     def _normal(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
-        """n, shape (3, 1), and how it changes with the point, dn/dp in 1/m, shape (3, 3)."""
+        """n, shape (3, 1), and its derivative by the point, dn/dp in 1/m, shape (3, 3)."""
         p = ca.SX.sym("p", 3)
         gradient = self.surface.unit_normal(p)
         normal = gradient / length_of(gradient)

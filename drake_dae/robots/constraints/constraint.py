@@ -1,4 +1,4 @@
-"""What a constraint says of itself.                                             (38)"""
+"""The contract of a constraint.                                                 (38)"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container
@@ -21,19 +21,19 @@ from drake_dae.robots.surfaces.surface import Vector
 
 @dataclass(frozen=True, eq=False)
 class Application:
-    """Where constraint forces act: F = force_axes @ lambda and M = moment_axes @ lambda.
+    """The action of constraint forces: F = force_axes @ lambda and M = moment_axes @ lambda.
 
     All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
     opposite on A at the same point.
 
-    With `drag`, F has that force besides.
+    With `drag`, F also contains that force.
 
     Attributes:
-        point: Where F acts, in m, shape (3, 1).
+        point: The point of application of F, in m, shape (3, 1).
         force_axes: The force in N for a unit of each constraint force, shape (3, m).
         moment_axes: The moment in N m for a unit of each constraint force, shape (3, m).
-        frame_b: Name of frame B, which feels F and M.
-        frame_a: Name of frame A, which feels the opposite.
+        frame_b: Name of frame B, on which F and M act.
+        frame_a: Name of frame A, on which the opposite acts.
         drag: The part of F in N that acts without constraint forces, shape (3, 1); None if none.
     """
 
@@ -52,13 +52,13 @@ class Application:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Where a point of a robot touches something that has a free side.
+    """A contact of a point of a robot with an object that has a free side.
 
     Attributes:
         frame: Name of the frame of the point.
         point: The point in the frame, m, shape (3,).
         normal: The unit normal toward the free side there, in the world, shape (3, 1).
-        clearance: A point in the world, shape (3, 1) -> how far it is on the free side, in m.
+        clearance: A point in the world, shape (3, 1) -> its distance into the free side, in m.
     """
 
     frame: str
@@ -69,7 +69,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What a joint has along its coordinate c.
+    """The spring, damper, limits and motor of a joint along its coordinate c.
 
     Attributes:
         force: (c, c') -> the force of its spring and damper, in N m (N), positive toward larger c.
@@ -89,47 +89,47 @@ class Joint:
 
 @checked(ModelError)
 class Constraint(ABC):
-    """m equations that a robot keeps, and the m constraint forces lambda that make it keep them.
+    """m constraint equations of a robot, and the m constraint forces lambda that enforce them.
 
-    1. A constraint is written in `Kinematics` (its position part in `Frames`) and the symbols of
-       its own `parameters`; it is smooth wherever the robot may be, and has no state.
-    2. `residual` is phi(q), shape (k, 1), zero where the constraint holds. Positions are kept by
-       the first k of the m rows; the others restrict velocities alone (nonholonomic, r = 1).
-    3. `rate` is linear in velocities, shape (m, 1), and stays zero; its first k rows are the
-       derivative of `residual`. One with k < m gives a `rate` of its own. Where the constraint
-       holds, lambda . rate is the power of the constraint forces without friction: lambda is a
-       force in N where the rate is a velocity in m/s.
+    1. A constraint is an expression of `Kinematics` (its position part of `Frames`) and of the
+       symbols of its own `parameters`. It is smooth in the whole workspace, and has no state.
+    2. `residual` is phi(q), shape (k, 1), zero if the constraint holds. The first k of the m rows
+       are holonomic; the others restrict velocities alone (nonholonomic, r = 1).
+    3. `rate` is linear in velocities, shape (m, 1), and zero; its first k rows are the derivative
+       of `residual`. A constraint with k < m defines `rate` itself. If the constraint holds, lambda
+       . rate is the power of the constraint forces without friction: lambda is a force in N if the
+       rate is a velocity in m/s.
     4. `reaction` is linear in lambda: the gradient of that power with respect to the velocities.
-       What lambda does besides, as friction, is added to it.
-    5. Where `can_only_push` says that the constraint cannot pull, a positive lambda pushes.
+       Further forces proportional to lambda, such as friction, are added.
+    5. `is_unilateral` marks unilateral rows: lambda >= 0 pushes the robot to the free side.
     6. `applications` are the forces and moments of `reaction`, each on one frame, and the opposite
-       on another: of these the plant's port `constraint_wrenches` is made. There are none where
-       nobody knows at which frames they act, as between two angles in textbook equations. Pictures
-       show the first.
-    7. `coordinates` tell where the robot is along what the constraint leaves free, one row for
-       each of `coordinate_signals`; there may be none.
-    8. `picture` is what there is to see where the robot touches, if there is anything; `placement`
-       tells where its parameters put it.
-    9. Where the constraint holds and stands still, the power of its wrenches on both frames
-       together is zero; it may be negative where `is_ideal` is false, as with friction.
-    10. Its parameters may move (see `RobotModel`) if k = m; `rate` is then that part of the
-        derivative which velocities make. What needs to know how fast they move, as friction does,
-        takes `Parameter.rate`.
-    11. `joint` tells what it has along its one coordinate, if it is a joint that closes a loop;
-        `coordinate_rate` is linear in velocities, and the derivative of `coordinates` where the
-        constraint holds. A force along the coordinate has the power of force times rate.
-    12. `drag` is what it does without constraint forces, as viscous friction; `applications` hold
-        it too.
-    13. Where what lambda does besides grows with one of its parameters, a coefficient of friction,
-        `friction_parameter` names that, and `sliding` is the velocity along which it rubs.
-    14. `solid` is what its one force comes from where Drake's own contact is the plant: what stands
-        in the world and pushes frame B of its first application at the point there.
-    15. `touch` tells at which point it touches what has a free side, if it does; `residual` is then
-        the clearance of that point.
+       on another: the plant's port `constraint_wrenches` consists of these. There are none if the
+       frames are not known, as for two angles in textbook equations. Pictures show the first.
+    7. `coordinates` are the free coordinates along the constraint, one row for each of
+       `coordinate_signals`; there may be none.
+    8. `picture` is the visible object in contact, if any; `placement` is its pose for given
+       parameters.
+    9. If the constraint holds and does not move, the total power of its wrenches on both frames is
+       zero; with `is_ideal` false, as with friction, it may be negative.
+    10. Its parameters may move (see `RobotModel`) if k = m; `rate` is then the part of the
+        derivative from velocities. Terms that depend on the rates of parameters, such as friction,
+        use `Parameter.rate`.
+    11. `joint` has the spring, damper, limits and motor along its coordinate, if it is a joint that
+        closes a loop. `coordinate_rate` is linear in velocities, and the derivative of
+        `coordinates` if the constraint holds. The power of a force along the coordinate is force
+        times rate.
+    12. `drag` are forces independent of lambda, such as viscous friction; `applications` contain
+        them as well.
+    13. `friction_parameter` is the name of its coefficient of friction, if it has one, and
+        `sliding` is the sliding velocity.
+    14. `solid` is the geometry for Drake's own contact: an object in the world that acts on frame B
+        of its first application at the point there.
+    15. `touch` describes the contact point, if there is a free side; `residual` is then the
+        clearance of that point.
 
     Attributes:
-        name: Stands before the names of its forces, residuals and parameters.
-        parameters: Its numbers that change without tracing again.
+        name: The prefix of the names of its forces, residuals and parameters.
+        parameters: Its numbers, which can change without tracing again.
     """
 
     name: str
@@ -137,7 +137,7 @@ class Constraint(ABC):
 
     @property
     def is_ideal(self) -> bool:
-        """Whether its forces take no power."""
+        """Whether its forces do no work."""
         return True
 
     @property
@@ -146,9 +146,9 @@ class Constraint(ABC):
         return None
 
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
-        """The velocity at which it slides, relative to what it rubs on, m/s, shape (3, 1).
+        """The sliding velocity relative to the other object, m/s, shape (3, 1).
 
-        None where it does not rub, or in a way of its own, which impacts then know nothing of.
+        None without friction, or with friction of its own that impacts do not include.
         """
         return None
 
@@ -160,26 +160,26 @@ class Constraint(ABC):
     @property
     @abstractmethod
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of phi, and then of the rows of the rate that are none of phi."""
+        """Names and units of phi, then of the nonholonomic rows of the rate."""
 
     def residual(self, frames: Frames) -> ca.SX:
         """phi(q), shape (k, 1) with k <= m; k = 0 if velocities alone are restricted."""
         return ca.SX(0, 1)
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
-        """phi'(q, v), or what else must stay zero and is linear in velocities, shape (m, 1)."""
+        """phi'(q, v), and nonholonomic rows linear in velocities, shape (m, 1)."""
         return kinematics.derivative(self.residual(kinematics))
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
-        """The forces that the constraint forces, shape (m, 1), make on the robot."""
+        """The reaction on the robot of the constraint forces, shape (m, 1)."""
         return kinematics.reaction(ca.dot(constraint_force, self.rate(kinematics)))
 
     def drag(self, kinematics: Kinematics) -> Reaction | None:
-        """The forces that it makes without constraint forces; None if there are none."""
+        """The forces on the robot independent of constraint forces; None if there are none."""
         return None
 
     def moving(self, names: Container[str]) -> Self:
-        """The same constraint, of whose parameters those with some names move."""
+        """The same constraint; parameters of the given names are exogenous."""
         if not any(parameter.name in names for parameter in self.parameters):
             return self
         found = copy(self)  # Its class may be frozen.
@@ -187,13 +187,13 @@ class Constraint(ABC):
         return found
 
     @property
-    def can_only_push(self) -> tuple[bool, ...]:
-        """Whether each constraint force must not be negative."""
+    def is_unilateral(self) -> tuple[bool, ...]:
+        """Whether each constraint force is unilateral (not negative)."""
         return (False,) * len(self.force_signals)
 
     @abstractmethod
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        """Where and on what the constraint forces act."""
+        """The points and frames on which the constraint forces act."""
 
     @property
     def coordinate_signals(self) -> tuple[Signal, ...]:
@@ -201,7 +201,7 @@ class Constraint(ABC):
         return ()
 
     def coordinates(self, frames: Frames) -> ca.SX:
-        """Coordinates along what the constraint leaves free, shape (k, 1).
+        """The free coordinates along the constraint, shape (k, 1).
 
         Raises:
             ModelError: The constraint has none.
@@ -216,45 +216,45 @@ class Constraint(ABC):
 
     @property
     def joint(self) -> Joint | None:
-        """What it has along its one coordinate; None if it is no joint."""
+        """The joint along its coordinate; None if it is not a joint."""
         return None
 
     def touch(self, frames: Frames) -> Touch | None:
-        """Where it touches what has a free side; None if there is no such side."""
+        """The contact point; None without a free side."""
         return None
 
     @property
     def remark(self) -> str:
-        """What of what it touches is approximate, and how much; empty if nothing is."""
+        """The approximations of its surface, as text; empty if there are none."""
         return ""
 
     @property
     def extent(self) -> FloatArray | None:
-        """The least and the largest coordinates for which it is meant, shape (2, k), or None."""
+        """The range of coordinates in which it is defined, shape (2, k), or None."""
         return None
 
     def placement(self, values: FloatArray) -> RigidTransform:
-        """Where what the robot touches stands in the world.
+        """The pose of the object in contact, in the world.
 
         Args:
-            values: The values of its parameters, below each other.
+            values: The values of its parameters in one vector.
         """
         return RigidTransform()
 
     def solid(self, values: FloatArray) -> Picture | None:
-        """What Drake's own contact takes in its place; None where there is no such thing.
+        """The geometry for Drake's own contact; None if there is none.
 
         Args:
-            values: The values of its parameters, below each other.
+            values: The values of its parameters in one vector.
         """
         return None
 
     def picture(self, values: FloatArray, point: FloatArray, size: float) -> Picture | None:
-        """What is to be seen where the robot touches, or None.
+        """The visible object in contact, or None.
 
         Args:
-            values: The values of its parameters, below each other.
-            point: Where its forces act now, in the world, m, shape (3,).
-            size: How large a piece is of interest, m.
+            values: The values of its parameters in one vector.
+            point: The present point of application, in the world, m, shape (3,).
+            size: The size of the piece to draw, m.
         """
         return None

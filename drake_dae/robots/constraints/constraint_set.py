@@ -1,4 +1,4 @@
-"""All constraints of a robot at once, as the model and the pictures need them.      (37), (38)"""
+"""All constraints of a robot together.                                              (37), (38)"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from drake_dae.robots.links.links import Links
 
 @dataclass(frozen=True)
 class ConstraintSet:
-    """The constraints of a robot, one below the other.
+    """The constraints of a robot, stacked.
 
     Attributes:
         constraints: The constraints, in the order of their constraint forces.
@@ -36,7 +36,7 @@ class ConstraintSet:
 
     @property
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of what stays zero."""
+        """Names and units of the residuals."""
         return tuple(s for c in self.constraints for s in c.residual_signals)
 
     @property
@@ -45,7 +45,7 @@ class ConstraintSet:
         return tuple(p for c in self.constraints for p in c.parameters)
 
     def place(self, name: str) -> int:
-        """Where the constraint force with a name stands in lambda.
+        """The index of a constraint force in lambda.
 
         Raises:
             ModelError: There is no such force.
@@ -56,7 +56,7 @@ class ConstraintSet:
         return names.index(name)
 
     def parts(self) -> Iterator[tuple[Constraint, slice]]:
-        """Each constraint, and where its constraint forces stand."""
+        """Each constraint, and the slice of its constraint forces."""
         start = 0
         for constraint in self.constraints:
             stop = start + len(constraint.force_signals)
@@ -65,7 +65,7 @@ class ConstraintSet:
 
     def residual(self, frames: Frames) -> ca.SX:
         """phi(q) of the rows that restrict positions, shape (k, 1)."""
-        return ca.vertcat(ca.SX(0, 1), *[c.residual(frames) for c in self.constraints])
+        return ca.vertcat(ca.SX(0, 1), *[c.residual(frames) for c in self.constraints])  # (38)
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
         """phi'(q, v), and the rates of rows that restrict velocities alone, shape (m, 1)."""
@@ -82,16 +82,16 @@ class ConstraintSet:
         return kinematics.value(ca.vertcat(*rows))
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
-        """The forces that the constraint forces, shape (m, 1), make on the robot."""
+        """The reaction on the robot of the constraint forces, shape (m, 1)."""
         total = Reaction(ca.SX(kinematics.v.numel(), 1))
         for constraint, part in self.parts():
             total += constraint.reaction(kinematics, constraint_force[part])
         return total
 
     def acting(self, kinematics: Kinematics) -> list[tuple[Constraint, slice, Application]]:
-        """The constraints that act at a point, where their forces stand, and where they act first.
+        """The constraints that act at a point, the slices of their forces, and their first points.
 
-        A constraint that acts at several points is shown, and felt, at the first of them.
+        Of a constraint that acts at several points, only the first is shown and measured.
         """
         return [
             (constraint, part, application)
@@ -102,12 +102,12 @@ class ConstraintSet:
     def force_on(
         self, frame: str, name: str, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """Where a constraint pushes on a frame, and its force on that frame, both in the world.
+        """The point and force of a constraint on a frame, both in the world.
 
         Args:
             frame: The name of the frame.
             name: The name of the constraint.
-            kinematics: What the constraints are written in.
+            kinematics: The kinematics that constraints use.
             constraint_force: lambda, shape (m, 1).
 
         Returns:
@@ -135,13 +135,13 @@ class ConstraintSet:
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, tuple[Signal, ...]]:
-        """What each constraint does to each of its frames, and names and units of that.
+        """The wrench of each constraint on each of its frames, with names and units.
 
         A wrench is a moment in N m and a force in N, as in Drake's SpatialForce, both in the world,
         the force at the frame's origin. Those of one constraint on one frame are added.
 
         Args:
-            kinematics: What the constraints are written in.
+            kinematics: The kinematics that constraints use.
             constraint_force: lambda, shape (m, 1).
 
         Returns:
@@ -168,12 +168,13 @@ class ConstraintSet:
     def force_matrix(self, links: Links) -> ca.SX:
         """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""
         kinematics, force = links.kinematics(), ca.SX.sym("force", self.size)
+        # (41)
         columns = self.reaction(kinematics, force).map(lambda part: ca.jacobian(part, force))
         return links.generalized_force(kinematics, columns)
 
     @property
     def joints(self) -> tuple[tuple[Constraint, Joint], ...]:
-        """The joints that close loops, and what each has along its coordinate."""
+        """The joints that close loops, with their properties along the coordinate."""
         found = ((constraint, constraint.joint) for constraint in self.constraints)
         return tuple((constraint, joint) for constraint, joint in found if joint is not None)
 
@@ -199,7 +200,7 @@ class ConstraintSet:
         return links.generalized_force(kinematics, columns)
 
     def drag(self, links: Links) -> ca.SX:
-        """What constraints do without constraint forces, a generalized force, shape (nv, 1)."""
+        """The generalized force of constraints independent of lambda, shape (nv, 1)."""
         total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
         for constraint in self.constraints:
             reaction = constraint.drag(kinematics)
@@ -209,12 +210,12 @@ class ConstraintSet:
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """The constraint forces that can only push, if friction acts on one of them."""
+        """The unilateral constraint forces, if friction acts on one of them."""
         found = [
             Contact(signal.name, constraint.friction_parameter)
             for constraint in self.constraints
             for signal, pushes in zip(
-                constraint.force_signals, constraint.can_only_push, strict=True
+                constraint.force_signals, constraint.is_unilateral, strict=True
             )
             if pushes
         ]

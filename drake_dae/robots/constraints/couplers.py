@@ -17,7 +17,7 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics, position_index
 @checked(ModelError)
 @dataclass(frozen=True)
 class JointCoupler(Constraint):
-    """A joint follows another one, as by gears without play, or as a mimic joint of a URDF:
+    """A joint follows another one, by gears without backlash, or as a mimic joint of a URDF:
 
         phi(q) = q_follower - ratio q_leader - offset.
 
@@ -26,21 +26,20 @@ class JointCoupler(Constraint):
     pinion of radius r has r, in m/rad, with the unit "m" of the follower.
 
     The constraint force is the generalized force on the follower, in N m (N with the unit "m"):
-    positive pushes the follower toward larger positions, and the leader gets -ratio times it. The
-    child of each joint feels it along the joint's axis, and the parent the opposite, so the
-    housing of a gear carries what the shafts do not balance. The parameters "<name>.ratio" and
-    "<name>.offset" are its numbers.
+    positive pushes the follower toward larger positions, and the leader gets -ratio times it. It
+    acts on the child of each joint along the joint's axis, and the opposite on the parent, so the
+    housing of a gear carries the difference. The parameters "<name>.ratio" and "<name>.offset" are
+    its numbers.
 
-    Backlash, belts that stretch, and what drives only one way are no couplers. A joint that shall
-    not move at all is welded.
+    Backlash, elastic belts and one-way drives are not covered. Weld a joint that must not move.
 
     Attributes:
         follower: Name of the position that follows, as in the links' `position_signals`.
         leader: Name of the position that it follows.
-        ratio: How far the follower goes for a unit of the leader; not zero.
-        offset: The follower's position where the leader's is zero, in rad or m.
+        ratio: The motion of the follower per unit of the leader; not zero.
+        offset: The follower's position for a leader at zero, in rad or m.
         unit: The unit of the follower's position, "rad" or "m".
-        name: The name of the constraint, before those of its force and its parameters.
+        name: The name of the constraint, the prefix of its force and its parameters.
     """
 
     follower: str

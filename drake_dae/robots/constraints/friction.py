@@ -1,4 +1,4 @@
-"""Friction of a point on a surface: Coulomb's, made smooth, and viscous."""
+"""Friction of a point on a surface: regularized Coulomb friction and viscous friction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from drake_dae.dae.system.signals import Parameter
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """How a surface pulls at a point that slides on it: F_t = pull lambda + drag.
+    """The friction force on a point that slides on a surface: F_t = pull lambda + drag.
 
     Attributes:
         pull: -mu s, the force in N for a unit of the normal force, shape (3, 1).
@@ -43,7 +43,7 @@ class Friction:
 def friction_parameters(
     name: str, friction: float | None, stiction_tolerance: float, viscous_friction: float | None
 ) -> list[Parameter]:
-    """The parameters of friction, of those kinds that there are.
+    """The parameters of the given kinds of friction.
 
     Args:
         name: The name of the constraint.

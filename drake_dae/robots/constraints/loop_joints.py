@@ -1,4 +1,4 @@
-"""Joints that close a loop: constraints that keep what a joint of the tree has."""
+"""Joints that close a loop, as constraints."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
@@ -24,38 +24,40 @@ LETTERS = "xyz"
 
 @dataclass(frozen=True)
 class LoopJoint(Constraint):
-    """A joint between frames A and B where a loop is cut, with its damping, limits and motor.
+    """A joint between frames A and B at which a loop is cut, with damping, limits and motor.
 
-    It connects a frame F, fixed in A at a place, with a frame M, fixed in B: at the coordinate 0
-    they coincide, so that c counts as in a joint of the tree from the parent A to the child B.
-    Beside the constraint forces, which take no power, A exerts along the coordinate on B
+    It connects a frame F, fixed in A, with a frame M, fixed in B. They coincide at the coordinate c
+    = 0, as in a joint of the tree from the parent A to the child B. Besides the constraint forces,
+    which do no work, A exerts along the coordinate on B
 
         -damping c' - stiffness (c - rest) + u,
 
     and B the opposite on A, where u is the motor's force, if it has a motor: a control of the
-    robot, behind those of its other actuators. None of this is on the port `constraint_wrenches`.
-    c and c' are on the port `loop_state` of `RobotPlant`, and c can be an output, by
-    `SurfaceCoordinates`. Limits are no stops: reports and summaries tell where c leaves them.
+    robot, after those of its other actuators. These forces are not on the port
+    `constraint_wrenches`. c and c' are on the port `loop_state` of `RobotPlant`, and c can be an
+    output, by `SurfaceCoordinates`. Limits are not enforced: reports and summaries say where c
+    exceeds them.
 
-    A motor in it is rigid and has no rotor inertia; for others cut the loop at another joint.
+    Its motor is rigid and has no rotor inertia; otherwise cut the loop at another joint.
 
     Attributes:
-        frame_a: Name of frame A, of the parent; "world" is one.
+        frame_a: Name of frame A, of the parent; it may be "world".
         frame_b: Name of frame B, of the child, on another body.
         axis: The joint's axis, an axis of F and M.
-        point_a: Where F stands in A, m, shape (3,).
-        rpy_a: Roll, pitch and yaw by which F is turned in A, rad, shape (3,).
-        point_b: Where M stands in B, m, shape (3,).
-        rpy_b: Roll, pitch and yaw by which M is turned in B, rad, shape (3,).
-        damping: Of the joint, in N m s/rad (N s/m), not negative; the parameter "<name>.damping" if
-            not zero.
-        stiffness: Of a spring, in N m/rad (N/m), not negative; the parameter "<name>.stiffness".
-        rest: Where the spring is slack, rad (m).
+        point_a: The origin of F in A, m, shape (3,).
+        rpy_a: Roll, pitch and yaw of F in A, rad, shape (3,).
+        point_b: The origin of M in B, m, shape (3,).
+        rpy_b: Roll, pitch and yaw of M in B, rad, shape (3,).
+        damping: The damping of the joint in N m s/rad (N s/m), not negative; the parameter
+            "<name>.damping" if not zero.
+        stiffness: The stiffness of its spring in N m/rad (N/m), not negative; the parameter
+            "<name>.stiffness".
+        rest: The rest position of the spring, rad (m).
         lower, upper: The limits of c, rad (m); none if None.
         velocity_limit: The largest |c'|, rad/s (m/s); none if None.
         motor: Whether it has a motor, the control "<name>.motor".
         effort_limit: The largest |u|, N m (N); none if None.
-        name: The name of the constraint, before those of its forces and parameters.
+        name: The name of the constraint, the prefix of its forces and parameters.
     """
 
     frame_a: str
@@ -76,9 +78,9 @@ class LoopJoint(Constraint):
     name: str = "loop"
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
     units: ClassVar[tuple[str, str]]
-    """Of c, and of its force."""
+    """The units of c and of its force."""
     coordinate: ClassVar[str]
-    """What c is called."""
+    """The name of c."""
 
     def __post_init__(self) -> None:
         check_letter("axis", self.axis)
@@ -103,7 +105,7 @@ class LoopJoint(Constraint):
     @property
     @abstractmethod
     def held_axes(self) -> tuple[str, str]:
-        """The axes of F along which M is held, and those about which it is, as letters."""
+        """The axes of F along which M cannot move, and about which it cannot turn, as letters."""
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -181,7 +183,7 @@ class LoopJoint(Constraint):
 class RevoluteLoopJoint(LoopJoint):
     """A revolute joint that closes a loop.
 
-    See `LoopJoint` for its frames, and for what it has along its angle. The origins of F and M
+    See `LoopJoint` for its frames and its properties along the angle. The origins of F and M
     coincide, and so do their axes a:
 
         phi(q) = (p_FM, 2 / (1 + a . a_M) (b . (a x a_M), c . (a x a_M))),
@@ -190,15 +192,15 @@ class RevoluteLoopJoint(LoopJoint):
     what A exerts on B: a force in N at M, in the axes of F, and the moments in N m about b and c;
     where phi = 0, phi' is the velocity and the angular velocity of M in F.
 
-    In a mechanism that moves in the plane across the axis anyway, the three rows that hold M in it
-    say nothing new, so that the constraints are redundant: `planar` leaves the two of the plane.
+    In a planar mechanism the three rows out of the plane are redundant: `planar` keeps only the two
+    in the plane.
 
-    The angle counts from the middle of the limits, or from zero where there are not both, by half
-    a turn either way, where it jumps. A joint that goes round has a damper and a motor, but no
-    limits and no spring.
+    The angle is measured within half a turn from the middle of the limits (from zero without both
+    limits), and jumps beyond. A joint with full turns may have a damper and a motor, but no limits
+    and no spring.
 
     Attributes:
-        planar: Whether only the positions across the axis are held.
+        planar: Whether only the two positions normal to the axis are constrained.
     """
 
     planar: bool = False
@@ -218,7 +220,7 @@ class RevoluteLoopJoint(LoopJoint):
 
     @property
     def _middle(self) -> float:
-        """Where the angle counts from."""
+        """The middle of the range of the angle."""
         low, high = self._limits
         return (low + high) / 2 if np.isfinite(low) and np.isfinite(high) else 0.0
 
@@ -252,7 +254,7 @@ class RevoluteLoopJoint(LoopJoint):
 class PrismaticLoopJoint(LoopJoint):
     """A prismatic joint that closes a loop.
 
-    See `LoopJoint` for its frames, and for what it has along its travel. M does not turn in F, and
+    See `LoopJoint` for its frames and its properties along the travel. M does not turn in F, and
     its origin stays on the axis a of F:
 
         phi(q) = (b . p_FM, c . p_FM, 2 tan(theta / 2) n),    R_FM = turn by theta about n,
@@ -261,8 +263,8 @@ class PrismaticLoopJoint(LoopJoint):
     N at M along b and c, and a moment in N m, in the axes of F; where phi = 0, phi' is the velocity
     of M across the axis and its angular velocity in F. The travel is a . p_FM.
 
-    In a mechanism that moves in a plane anyway, two rows say what is not said yet: with the
-    `normal` of that plane, the position across axis and normal, and the turn about the normal.
+    In a planar mechanism only two rows are independent: with the `normal` of the plane, the
+    position normal to axis and normal, and the rotation about the normal.
 
     Attributes:
         normal: The axis of F that is the normal of the plane; None in space.
@@ -305,7 +307,7 @@ class PrismaticLoopJoint(LoopJoint):
 
 
 def check_letter(what: str, letter: str) -> None:
-    """Refuses what is no axis of a frame.
+    """Refuses a name that is not an axis of a frame.
 
     Raises:
         ModelError: It is none of "x", "y", "z".
@@ -315,5 +317,5 @@ def check_letter(what: str, letter: str) -> None:
 
 
 def _rotation(rpy: Vector) -> ca.SX:
-    """Turned by roll, pitch and yaw; what is zero but for round-off is structurally so."""
+    """The rotation by roll, pitch and yaw; entries that are only round-off are structural zeros."""
     return ca.SX(ca.sparsify(ca.DM(clean(RollPitchYaw(rpy).ToRotationMatrix().matrix()))))

@@ -1,4 +1,4 @@
-"""Constraints that a MultibodyPlant has already: mimic joints, couplers, rods."""
+"""Constraints of a MultibodyPlant itself: mimic joints, couplers, rods."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from drake_dae.robots.surfaces.surface import triple
 
 
 def plant_constraints(links: Links) -> tuple[Constraint, ...]:
-    """The constraints of the plant that links come from; none if they come from none.
+    """The constraints of the plant of the links; none without a plant.
 
     Couplers, which mimic joints are, become a `JointCoupler` "<follower>_coupler", and rods of
-    AddDistanceConstraint a `FixedDistance` "rod0", "rod1", ... Drake's plants keep them in discrete
-    time alone; these keep them in continuous time too.
+    AddDistanceConstraint a `FixedDistance` "rod0", "rod1", ... Drake enforces them only in discrete
+    plants; here they hold in continuous time as well.
 
     Raises:
-        ModelError: The plant has others, or a rod with a stiffness.
+        ModelError: The plant has other constraints, or a rod with a stiffness.
     """
     plant = links.plant
     if plant is None or plant.num_constraints() == 0:
@@ -53,10 +53,10 @@ class Coupling:
 
 
 def couplings_of(plant: MultibodyPlant) -> list[Coupling]:
-    """The couplings of a finalized plant, each a row of a mathematical program as Drake tells it.
+    """The couplings of a finalized plant, read from a mathematical program of Drake.
 
     Raises:
-        ModelError: The plant has a constraint of which Drake tells nothing.
+        ModelError: The plant has a constraint that Drake does not describe.
     """
     program = MathematicalProgram()
     q = program.NewContinuousVariables(plant.num_positions(), "q")
@@ -76,7 +76,7 @@ def couplings_of(plant: MultibodyPlant) -> list[Coupling]:
             continue
         names = [joints[index[variable.get_id()]] for variable in binding.variables()]
         factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
-        # The follower has the factor 1. Where both have it, either may; nobody follows twice.
+        # The follower has the factor 1. If both have it, either may be; no joint follows twice.
         able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
         place = next((i for i in able if names[i] not in followers), able[0])
         followers.add(names[place])

@@ -1,4 +1,4 @@
-"""Points that stay on a surface, on each other, or at a distance from each other."""
+"""Points on a surface, coincident points, and points at a fixed distance."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -24,40 +24,38 @@ from drake_dae.trace.smoothness import length_of
 class PointOnSurface(Constraint):
     """A point of a frame stays on a surface: phi(q) = signed distance of p_W(q).
 
-    The constraint force is the normal force of the surface on the robot in N; positive pushes the
-    robot to the free side, and a unilateral contact can only push. The parameter "<name>.position"
-    is where the surface stands, and "<name>.rpy" how it is turned about that place; where they are
-    exogenous (see `RobotModel`), the surface moves. Numbers of the surface's `shape` are parameters
-    "<name>.<number>".
+    The constraint force is the normal force of the surface on the robot in N, positive towards the
+    free side; the contact is unilateral. The parameters "<name>.position" and "<name>.rpy" are the
+    position and orientation of the surface; if they are exogenous (see `RobotModel`), the surface
+    moves. Numbers of the surface's `shape` are parameters "<name>.<number>".
 
-    With friction the surface also pulls the point back as it slides, by the velocity v_t in m/s
-    relative to the surface, which may move:
+    With friction the surface also exerts a tangential force, with the sliding velocity v_t in m/s
+    relative to the surface:
 
         F_t = -(mu lambda s + d v_t),    s = v_t / sqrt(|v_t|^2 + v_s^2),
 
-    Coulomb's friction, made smooth by the speed v_s, and viscous friction. So at rest it does not
-    hold: below v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance"
-    and "<name>.viscous_friction" are mu, v_s and d; plant and law may have them different, where
-    both have them: 0 is a smooth surface that has. Where the friction that lambda makes turns phi''
-    around, the contact jams (Painleve): see `dae.contacts`.
+    regularized Coulomb friction with the speed v_s, and viscous friction. It does not stick: below
+    v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance" and
+    "<name>.viscous_friction" are mu, v_s and d; plant and law may have different values if both
+    have these parameters; use 0 for a surface that has them but no friction. If friction reverses
+    the effect of lambda on phi'', the Painleve paradox occurs: see `dae.system.contacts`.
 
-    Behind springs, motors and valves a law differentiates s, whose slopes are 1 / v_s. With error
-    control it follows the prediction for v_s of 0.001 m/s with all of them; but where the sliding
-    turns around it then asks for 3 to 18 times the control behind springs and valves, which a v_s
-    of 0.01 m/s does without (0.03 m/s behind valves). Fixed steps of 5 ms behind springs take 0.03
-    m/s; at 0.01 m/s they leave 0.01 to 0.4 N, and at 0.003 m/s they fail. With rigid joints v_s
-    does not matter to the law.
+    With flexible joints, motors or hydraulics the law differentiates s, whose slopes are 1 / v_s.
+    With error control the prediction holds for all of them down to v_s = 0.001 m/s. At reversals of
+    the sliding direction the control then rises by a factor of 3 to 18 with flexible joints and
+    hydraulics; v_s = 0.01 m/s avoids this (0.03 m/s with hydraulics). With flexible joints and
+    fixed steps of 5 ms use 0.03 m/s: errors are 0.01 to 0.4 N at 0.01 m/s, and at 0.003 m/s the
+    steps fail. With rigid joints v_s does not affect the law.
 
     Attributes:
         frame: Name of the frame.
         surface: A surface in the world.
         point: The point in the frame, m, shape (3,).
-        name: The name of the constraint, before those of its force and its parameters.
-        rpy: Roll, pitch and yaw by which the surface is turned, rad, shape (3,): about the fixed
-            axes x, y, z in this order, as in Drake. None for a surface that nobody turns, which
-            has no such parameter.
-        friction: mu, not negative; None for a smooth surface, which has no such parameters.
-        stiction_tolerance: v_s in m/s, the name of it in Drake; only with friction.
+        name: The name of the constraint, the prefix of its force and its parameters.
+        rpy: Roll, pitch and yaw of the surface, rad, shape (3,): about the fixed axes x, y, z in
+            this order, as in Drake. None for no rotation and no such parameter.
+        friction: mu, not negative; None for no friction and no such parameters.
+        stiction_tolerance: v_s in m/s, Drake's stiction tolerance; only with friction.
         viscous_friction: d in N s/m, not negative; None for none, without a parameter.
 
     Raises:
@@ -73,19 +71,19 @@ class PointOnSurface(Constraint):
     stiction_tolerance: float = 1e-3
     viscous_friction: float | None = None
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
-    can_only_push: ClassVar[tuple[bool, ...]] = (True,)
+    is_unilateral: ClassVar[tuple[bool, ...]] = (True,)
 
     def __post_init__(self) -> None:
         position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
         turns = []
         if self.rpy is not None:
             turns.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
-        rubbing = friction_parameters(
+        frictional = friction_parameters(
             self.name, self.friction, self.stiction_tolerance, self.viscous_friction
         )
         surface, shape = with_parameters(self.name, self.surface)
         object.__setattr__(self, "surface", surface)
-        object.__setattr__(self, "parameters", (position, *turns, *rubbing, *shape))
+        object.__setattr__(self, "parameters", (position, *turns, *frictional, *shape))
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -101,7 +99,7 @@ class PointOnSurface(Constraint):
         return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in own)
 
     def offset(self, frames: Frames) -> ca.SX:
-        """The point relative to the surface as it stands, in its axes, m, shape (3, 1)."""
+        """The point relative to the surface, in its axes, m, shape (3, 1)."""
         return self._offset(frames.position(self.frame, self.point))
 
     def _offset(self, point: ca.SX) -> ca.SX:
@@ -110,7 +108,7 @@ class PointOnSurface(Constraint):
         return ca.mtimes(self._rotation().T, offset) if self.rpy is not None else offset
 
     def _rotation(self) -> ca.SX:
-        """How the surface is turned, shape (3, 3)."""
+        """The orientation of the surface, shape (3, 3)."""
         return rotation_of(self.parameters[1].symbol)
 
     def _normal(self, frames: Frames) -> ca.SX:
@@ -119,7 +117,7 @@ class PointOnSurface(Constraint):
         return normal if self.rpy is None else ca.mtimes(self._rotation(), normal)
 
     def _friction(self, kinematics: Kinematics) -> Friction | None:
-        """How the point rubs; None where it does not."""
+        """The friction on the point; None without friction."""
         sliding = self.sliding(kinematics)
         return None if sliding is None else Friction.of(self.name, self.parameters, sliding)
 
@@ -149,16 +147,16 @@ class PointOnSurface(Constraint):
 
     def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
         pushed = super().reaction(kinematics, constraint_force)
-        rubbing = self._friction(kinematics)
-        if rubbing is None or self.friction is None:
+        frictional = self._friction(kinematics)
+        if frictional is None or self.friction is None:
             return pushed
-        return pushed + kinematics.push(self.frame, rubbing.pull * constraint_force, self.point)
+        return pushed + kinematics.push(self.frame, frictional.pull * constraint_force, self.point)
 
     def drag(self, kinematics: Kinematics) -> Reaction | None:
-        rubbing = self._friction(kinematics)
-        if rubbing is None or rubbing.drag is None:
+        frictional = self._friction(kinematics)
+        if frictional is None or frictional.drag is None:
             return None
-        return kinematics.push(self.frame, rubbing.drag, self.point)
+        return kinematics.push(self.frame, frictional.drag, self.point)
 
     def coordinates(self, frames: Frames) -> ca.SX:
         return self.surface.coordinates(self.offset(frames))
@@ -172,9 +170,9 @@ class PointOnSurface(Constraint):
         )
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        push, drag, rubbing = self._normal(kinematics), None, self._friction(kinematics)
-        if rubbing is not None:
-            push, drag = push + rubbing.pull, rubbing.drag
+        push, drag, frictional = self._normal(kinematics), None, self._friction(kinematics)
+        if frictional is not None:
+            push, drag = push + frictional.pull, frictional.drag
         point = kinematics.position(self.frame, self.point)
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
 
@@ -204,11 +202,11 @@ class PointOnSurface(Constraint):
 @checked(ModelError)
 @dataclass(frozen=True)
 class CoincidentPoints(Constraint):
-    """A point of frame B stays on a point of frame A: phi(q) = p_WB(q) - p_WA(q).
+    """A point of frame B coincides with a point of frame A: phi(q) = p_WB(q) - p_WA(q).
 
-    A ball joint that closes a loop; a pin, in a mechanism that moves in a plane and so needs the
-    axes of that plane alone. The constraint force is the force in N, in world axes, that A exerts
-    on B at the point; B exerts the opposite on A.
+    A ball joint that closes a loop; in a planar mechanism, with the axes of the plane, a pin. The
+    constraint force is the force in N, in world axes, that A exerts on B at the point; B exerts the
+    opposite on A.
 
     Attributes:
         frame_a: Name of frame A, for example "world".
@@ -216,7 +214,7 @@ class CoincidentPoints(Constraint):
         frame_b: Name of frame B, on another body.
         point_b: The point in frame B, m, shape (3,).
         axes: The axes of the world along which they coincide, for example "xz".
-        name: The name of the constraint, before those of its forces.
+        name: The name of the constraint, the prefix of its forces.
     """
 
     frame_a: str
@@ -259,13 +257,12 @@ class FixedDistance(Constraint):
 
         phi(q) = |p_WB(q) - p_WA(q)| - length.
 
-    The constraint force is the thrust in N: positive pushes the points apart, so that A exerts it
-    on B away from A, and B the opposite on A; negative is the pull of the rod. The parameter
+    The constraint force is the force in the rod in N: positive pushes the points apart, so that A
+    exerts it on B away from A, and B the opposite on A; negative is tension. The parameter
     "<name>.length" is its length.
 
-    It is no way to keep two points together: at length zero phi has no gradient. Use
-    `CoincidentPoints` there, and `PointOnSurface` for a point that moves on a sphere that stands in
-    the world. A rope, which can only pull, is no rod.
+    The length must not be zero, since phi then has no gradient: use `CoincidentPoints`. For a point
+    on a sphere in the world use `PointOnSurface`. A rope, which can only pull, is not covered.
 
     Attributes:
         frame_a: Name of frame A, for example "world".
@@ -273,7 +270,7 @@ class FixedDistance(Constraint):
         frame_b: Name of frame B, on another body.
         point_b: The point in frame B, m, shape (3,).
         length: The distance of the points, m, positive.
-        name: The name of the constraint, before those of its force and its parameter.
+        name: The name of the constraint, the prefix of its force and its parameter.
     """
 
     frame_a: str

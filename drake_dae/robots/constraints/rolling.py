@@ -1,4 +1,4 @@
-"""What rolls, or glides along a blade: constraints of velocities."""
+"""Blades, wheels and balls: nonholonomic constraints."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -20,22 +20,22 @@ from drake_dae.trace.smoothness import length_of
 @checked(ModelError)
 @dataclass(frozen=True)
 class Blade(Constraint):
-    """A blade, or a wheel that turns freely: a point of a frame does not move along an axis of it:
+    """A blade or a free wheel: a point of a frame has no velocity along an axis of it:
 
         0 = s(q) . p_W'(q, v),
 
-    with the axis s in the world. No equation of positions says this (r = 1, nonholonomic): the
-    point gets everywhere, by detours. The constraint force is the side force in N that the ground
-    exerts on the frame at the point, positive along the axis; the ground gets the opposite.
+    with the axis s in the world. It is nonholonomic (r = 1): all positions can be reached. The
+    constraint force is the side force in N that the ground exerts on the frame at the point,
+    positive along the axis; the ground gets the opposite.
 
-    It keeps no height: a joint, or a `PointOnSurface`, does. At rest it holds wherever the robot
-    is, and a start in motion must not move sideways. Two blades on one axle say the same twice.
+    It does not restrict the height; use a joint or a `PointOnSurface` for that. A start in motion
+    must not have a sideways velocity. Two blades on one axle are redundant.
 
     Attributes:
         frame: Name of the frame.
         axis: The axis in the frame along which the point does not move, of any length, shape (3,).
         point: The point in the frame, m, shape (3,).
-        name: The name of the constraint, before those of its force and its speed.
+        name: The name of the constraint, the prefix of its force and its speed.
     """
 
     frame: str
@@ -68,31 +68,30 @@ class Blade(Constraint):
 @checked(ModelError)
 @dataclass(frozen=True)
 class RollingWheel(Constraint):
-    """A wheel rolls on level ground: the rim where it touches has no velocity along the ground:
+    """A wheel rolls on level ground: its contact point has no velocity along the ground:
 
         0 = f . v_c,  0 = s . v_c,    v_c = p_W' - radius (w x u),
 
-    with the center p_W, the wheel's angular velocity w, the unit vector u from where it touches to
+    with the center p_W, the wheel's angular velocity w, the unit vector u from the contact point to
     the center, in the wheel's plane, the heading f = axle x n / |axle x n|, and s = n x f, which is
     the axle of an upright wheel (r = 1, nonholonomic). The constraint forces are the traction and
-    the side force in N that the ground exerts on the wheel where it touches, positive along f and
-    s; the ground gets the opposite. A wheel that turns by positive angles about its axle goes
-    forward. The parameter "<name>.radius" is the radius.
+    the side force in N that the ground exerts on the wheel at the contact point, positive along f
+    and s; the ground gets the opposite. Positive rotation about the axle moves the wheel forward.
+    The parameter "<name>.radius" is the radius.
 
-    It keeps no height, so that robots whose joints keep it stay regular: on a base that is free to
-    fall, hold the centers of the wheels at their height by a `PointOnSurface` each. A second wheel
-    on the same axle would say again that the axle does not move sideways: give that one
-    holds_side = False.
+    It does not restrict the height, so that it is not redundant to joints that do. For a floating
+    base, keep the center of each wheel at its height by a `PointOnSurface`. For a second wheel on
+    the same axle set holds_side = False, since its side constraint is redundant.
 
     Attributes:
         frame: Name of a frame on the wheel.
         radius: Its radius, m, positive.
-        axle: The axle in the frame, of any length, toward the left of where the wheel goes,
-            shape (3,).
+        axle: The axle in the frame, of any length, toward the left of the forward direction, shape
+            (3,).
         center: Its center in the frame, m, shape (3,).
         normal: The normal n of the ground, in the world, up, of any length, shape (3,).
-        holds_side: Whether the wheel keeps from moving sideways.
-        name: The name of the constraint, before those of its forces and its parameter.
+        holds_side: Whether sideways motion of the wheel is constrained.
+        name: The name of the constraint, the prefix of its forces and its parameter.
     """
 
     frame: str
@@ -140,7 +139,7 @@ class RollingWheel(Constraint):
         return 2 if self.holds_side else 1
 
     def _directions(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX]:
-        """u, shape (3, 1), and f beside s as far as it is held, shape (3, m)."""
+        """u, shape (3, 1), and the constrained directions f and s, shape (3, m)."""
         n = ca.SX(self.normal)
         axle = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axle))
         along = ca.cross(axle, n)
@@ -152,31 +151,31 @@ class RollingWheel(Constraint):
 @checked(ModelError)
 @dataclass(frozen=True)
 class RollingBall(Constraint):
-    """A ball rolls on a surface without slip, and stays on it:
+    """A ball rolls on a surface without slip or separation:
 
         phi(q) = distance(p_W) - radius,    0 = t_1 . v_c,  0 = t_2 . v_c,
         v_c = p_W' - radius (w x n),
 
     with the center p_W, the angular velocity w, the unit normal n at the center, and the tangents
-    t_1, which is `along` less what it has of n, made one long, and t_2 = n x t_1. The first row
-    restricts positions (r = 2), the others velocities alone (r = 1): together the ball's material
-    point at the contact rests. The constraint forces are the normal force and the two rolling
-    frictions in N that the surface exerts on the ball at the contact; the normal force can only
-    push, and the surface gets the opposite. Nothing hinders the ball from turning about n. The
-    parameters "<name>.position" and "<name>.radius" are where the surface stands and the radius.
+    t_1, which is `along` projected onto the tangent plane and normalized, and t_2 = n x t_1. The
+    first row restricts positions (r = 2), the others velocities alone (r = 1): together the ball's
+    material point at the contact rests. The constraint forces are the normal force and the two
+    rolling frictions in N that the surface exerts on the ball at the contact; the normal force is
+    unilateral, and the surface gets the opposite. The ball can spin about n. The parameters
+    "<name>.position" and "<name>.radius" are the position of the surface and the radius.
 
-    The center is kept at a distance, so the surface must know distances beside it as well: planes,
-    spheres, cylinders and tori do. Whether friction can bear what rolling takes is for the user to
-    check: the forces are on the port. A point that sticks is no ball of radius zero: use
-    `CoincidentPoints` with the world.
+    The surface must have an exact distance function, as planes, spheres, cylinders and tori do.
+    Check that friction can provide the rolling forces, which are on the port. For a sticking point
+    use `CoincidentPoints` with the world instead of a ball of radius zero.
 
     Attributes:
         frame: Name of a frame on the ball.
-        surface: A surface that stands in the world, and knows distances beside it.
+        surface: A surface fixed in the world with an exact distance function.
         radius: The ball's radius, m, positive.
         center: Its center in the frame, m, shape (3,).
-        along: A direction in the world that is nowhere along the normal, of any length, shape (3,).
-        name: The name of the constraint, before those of its forces and its parameters.
+        along: A direction in the world that is never parallel to the normal, of any length, shape
+            (3,).
+        name: The name of the constraint, the prefix of its forces and its parameters.
     """
 
     frame: str
@@ -186,7 +185,7 @@ class RollingBall(Constraint):
     along: Vector = (1.0, 0.0, 0.0)
     name: str = "ball"
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
-    can_only_push: ClassVar[tuple[bool, ...]] = (True, False, False)
+    is_unilateral: ClassVar[tuple[bool, ...]] = (True, False, False)
 
     def __post_init__(self) -> None:
         if not self.surface.has_exact_distance:
@@ -240,11 +239,11 @@ class RollingBall(Constraint):
         return None if picture is None else picture.moved(values[:3])
 
     def _offset(self, frames: Frames) -> ca.SX:
-        """The center relative to where the surface stands, m, shape (3, 1)."""
+        """The center relative to the surface's position, m, shape (3, 1)."""
         return frames.position(self.frame, self.center) - self.parameters[0].symbol
 
     def _directions(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
-        """n, shape (3, 1), and t_1 beside t_2, shape (3, 2)."""
+        """n, shape (3, 1), and t_1, t_2, shape (3, 2)."""
         n, along = self.surface.unit_normal(self._offset(frames)), ca.SX(self.along)
         across = along - n * ca.dot(n, along)
         first = across / length_of(across)

@@ -1,4 +1,4 @@
-"""Frames that keep their pose in each other."""
+"""Frames with a fixed relative pose."""
 
 from dataclasses import dataclass, field
 
@@ -16,7 +16,7 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class WeldedFrames(Constraint):
-    """Frame B keeps a pose (R, p) in frame A, as with Drake's WeldFrames and AddWeldConstraint:
+    """Frame B has a fixed pose (R, p) in frame A, as with Drake's AddWeldConstraint:
 
         phi(q) = (p_AB(q) - p, 2 tan(theta / 2) n),    R_AB(q) R^T = turn by theta about n,
 
@@ -28,11 +28,11 @@ class WeldedFrames(Constraint):
         r = 2 tan(theta / 2) n = 2 vee(E - E^T) / (1 + tr E)
 
     has r' = w + w x r / 2 + (w . r) r / 4, which is w at r = 0. It is smooth up to half a turn,
-    where it is infinite: unlike the sine of theta it has no other zero than the pose itself. The
-    parameter "<name>.position" is p.
+    where it is infinite. Unlike the sine of theta its only zero is the pose itself. The parameter
+    "<name>.position" is p.
 
     Attributes:
-        frame_a: Name of frame A; "world" holds B in place.
+        frame_a: Name of frame A; it may be "world".
         frame_b: Name of frame B, on another body.
         pose: X_AB, the pose of B in A; by default the frames coincide.
         name: The name of the constraint, before those of its forces and its parameter.

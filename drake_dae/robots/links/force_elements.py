@@ -1,6 +1,6 @@
 """The springs and dampers of a MultibodyPlant.
 
-Each makes a generalized force and has an energy. A new kind of force element is added here alone.
+Each has a generalized force and an energy. A new kind of force element is added only here.
 """
 
 from functools import cached_property

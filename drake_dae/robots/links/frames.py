@@ -26,7 +26,7 @@ class OneJoint:
     Attributes:
         child, parent: Names of its bodies' frames.
         frame: Its frame on the child.
-        elementary: What it is made of; directions are the same in its frames on both bodies.
+        elementary: Its elementary joints; directions are the same in its frames on both bodies.
     """
 
     child: str
@@ -56,7 +56,7 @@ class PlantFrames:
         self._poses: dict[int, tuple[ca.SX, ca.SX]] = {}
 
     def find(self, frame: str | Frame) -> Frame:
-        """A frame of the plant by its name; "instance::name" if several have that name.
+        """A frame of the plant by name; "instance::name" if several have that name.
 
         Raises:
             ModelError: No frame, or more than one, has that name; or it belongs to another plant.
@@ -86,7 +86,7 @@ class PlantFrames:
         return link_poses(self._links)
 
     def joint_at(self, position: int) -> "OneJoint | None":
-        """The joint whose only position stands at an index of q; None if it has several."""
+        """The joint whose only position has an index in q; None if it has several."""
         plant = self._plant
         for index in plant.GetJointIndices():
             joint = plant.get_joint(index)
@@ -115,7 +115,7 @@ def frame_named(plant: MultibodyPlant, name: str) -> Frame:
     if matches:
         scoped = ", ".join(scoped_name(plant, frame) for frame in matches)
         raise ModelError(f"the plant has several frames '{name}'; say which: {scoped}")
-    # Drake's parser adds frames of its own at joints whose axis it has to turn.
+    # Drake's parser adds frames at joints whose axis it must rotate.
     names = [n for n in unique_names(plant, frames) if not n.endswith(("_parent_F", "_M"))]
     raise ModelError(unknown_name("frame", name, names))
 
@@ -152,7 +152,7 @@ def frame_name(plant: MultibodyPlant, frame: Frame) -> str:
 
 
 def scoped_name(plant: MultibodyPlant, item: Any) -> str:
-    """The name of a joint, body, frame or actuator behind that of its model instance."""
+    """The name of a joint, body, frame or actuator, preceded by its model instance."""
     return f"{plant.GetModelInstanceName(item.model_instance())}::{item.name()}"
 
 

@@ -1,4 +1,4 @@
-"""The joints of a MultibodyPlant as turns about coordinate axes and shifts, read as links."""
+"""The joints of a MultibodyPlant as rotations about coordinate axes and translations."""
 
 from dataclasses import dataclass
 
@@ -49,7 +49,7 @@ class ElementaryJoints:
 
 
 def check_joint(joint: Joint) -> None:
-    """Refuses a joint that is no sequence of turns and shifts.
+    """Refuses a joint that is not a sequence of rotations and translations.
 
     Raises:
         ModelError: It is a quaternion joint, or of a type that is not supported.
@@ -188,9 +188,9 @@ def clean(values: FloatArray) -> FloatArray:
 
 
 def _snap(rotation: FloatArray) -> FloatArray:
-    """Makes entries of a rotation within 1e-13 of -1, 0, 1 exact, so that expressions fold.
+    """Makes entries of a rotation within 1e-13 of -1, 0, 1 exact, so that expressions simplify.
 
-    Files write pi with 14 digits: its error must not fill a rotation that has two zeros in a row.
+    Files write pi with 14 digits; its error must not fill the zeros of a rotation.
     """
     nearest = np.rint(rotation)
     return np.where(np.abs(rotation - nearest) < 1e-13, nearest, rotation)

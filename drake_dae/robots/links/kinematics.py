@@ -1,4 +1,4 @@
-"""Where the frames of a robot are, how they move, and the forces that act on them."""
+"""The frames of a robot, their motion, and the forces that act on them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -16,10 +16,9 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 class Frames(Protocol):
-    """Where frames are, as expressions. A frame goes by its name; "world" is one.
+    """The poses of frames, as expressions. Frames are given by name; "world" is one.
 
-    `Links` and `Kinematics` are both of this kind, so that what depends on positions alone takes
-    either.
+    `Links` and `Kinematics` are both of this kind, so functions of positions accept either.
     """
 
     @property
@@ -34,11 +33,11 @@ class Frames(Protocol):
         """R_WF, shape (3, 3): the orientation of a frame in the world."""
 
     def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W in m, shape (3, 1): where a point that is fixed in a frame is in the world."""
+        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
 
 
 def position_index(frames: Frames, name: str) -> int:
-    """Where a name stands among the generalized positions.
+    """The index of a name among the generalized positions.
 
     Raises:
         ModelError: There is none of that name.
@@ -51,14 +50,14 @@ def position_index(frames: Frames, name: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class JointAxis:
-    """What a unit of the generalized force of a joint is, in the world.
+    """The force and moment of a unit generalized force of a joint, in the world.
 
     Attributes:
-        child, parent: Names of the bodies' frames: the child feels the force and the moment, the
-            parent the opposite.
-        point: Where the force acts, in m, shape (3, 1).
-        force: In N for a unit of the generalized force, shape (3, 1); zero of a joint that turns.
-        moment: In N m for a unit of the generalized force, shape (3, 1).
+        child, parent: Names of the bodies' frames: force and moment act on the child, the opposite
+            on the parent.
+        point: The point of application of the force, in m, shape (3, 1).
+        force: In N per unit of generalized force, shape (3, 1); zero for a rotational joint.
+        moment: In N m per unit of generalized force, shape (3, 1).
     """
 
     child: str
@@ -97,19 +96,19 @@ class Reaction:
 
 
 class Kinematics(ABC):
-    """The frames of a robot in motion: what constraints are written in.
+    """The frames of a robot in motion, in which constraints are expressed.
 
-    1. Its expressions hold q, v, the robot's parameters, and symbols of its own that may stand for
-       poses and velocities of frames; `value` replaces these by what they stand for.
+    1. Its expressions contain q, v, the robot's parameters, and symbols of its own for poses and
+       velocities of frames; `value` replaces these by their expressions.
     2. `position` and `rotation` are functions of positions, `velocity` and `angular_velocity` are
        linear in velocities, all of them in the world: R' = w x R, and `velocity(frame, point)` is
        the time derivative of `position(frame, point)`.
     3. `derivative(e)` is the time derivative along q' = N(q) v, v' = `acceleration`, of an
        expression e of positions and velocities.
-    4. `reaction(power)` are the forces whose power that is: for a power that is linear in
-       velocities, tau . v = power with the generalized force tau that `Links` makes of them.
-    5. `joint_axis` of a position is how the joint pushes that it belongs to; None where the joint
-       has several positions, or where nobody knows.
+    4. `reaction(power)` are the forces with a given power, linear in velocities: tau . v = power
+       with the generalized force tau that `Links` computes from them.
+    5. `joint_axis` of a position is the force and moment of its joint; None if the joint has
+       several positions, or if it is not known.
 
     Attributes:
         q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
@@ -128,15 +127,15 @@ class Kinematics(ABC):
 
     @abstractmethod
     def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W in m, shape (3, 1): where a point that is fixed in a frame is in the world."""
+        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
 
     @abstractmethod
     def angular_velocity(self, frame: Any) -> ca.SX:
-        """w in rad/s, shape (3, 1): how fast a frame turns, in the world."""
+        """w in rad/s, shape (3, 1): the angular velocity of a frame, in the world."""
 
     @abstractmethod
     def velocity(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W' in m/s, shape (3, 1): how fast a point that is fixed in a frame moves."""
+        """p_W' in m/s, shape (3, 1): the velocity of a point that is fixed in a frame."""
 
     @abstractmethod
     def derivative(self, expression: ca.SX) -> ca.SX:
@@ -144,14 +143,14 @@ class Kinematics(ABC):
 
     @abstractmethod
     def reaction(self, power: ca.SX) -> Reaction:
-        """The forces whose power in W is an expression that is linear in velocities."""
+        """The forces with a given power in W, an expression linear in velocities."""
 
     @abstractmethod
     def value(self, expression: ca.SX) -> ca.SX:
         """The expression in terms of q, v, `acceleration` and parameters alone."""
 
     def joint_axis(self, position: str) -> JointAxis | None:
-        """How the joint of a position pushes, by the position's name."""
+        """The force and moment of the joint of a position, by the position's name."""
         return None
 
     def push(

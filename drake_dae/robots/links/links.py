@@ -11,23 +11,23 @@ from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
 class Links(Frames, Protocol):
-    """Rigid links and nothing that they touch: M(q) v' + H(q, v) = B u + R, q' = N(q) v.
+    """Rigid links without contact: M(q) v' + H(q, v) = B u + R, q' = N(q) v.
 
-    R is the generalized force of a reaction. `MultibodyExpressions` takes links from a
-    MultibodyPlant, `LinkExpressions` from equations.
+    R is the generalized force of a reaction. `MultibodyExpressions` are links of a MultibodyPlant,
+    `LinkExpressions` of given equations.
 
     1. Expressions depend on `q`, `v` and the symbols of `parameters` alone, poses of frames on `q`
        and parameters. `q` and `v` are columns of symbols.
-    2. M is symmetric, and positive definite wherever the robot can be; v^T M v / 2 is its kinetic
-       energy, with the rotors of `reflected_inertia` in it.
+    2. M is symmetric and positive definite in all configurations; v^T M v / 2 is the kinetic
+       energy, including the rotors of `reflected_inertia`.
     3. `rotation` is a rotation, and `position(frame, point)` = `position(frame)` + R_WF point. The
-       frame "world" stands still at the origin. A frame that is not known raises ModelError, which
-       names those that are.
-    4. `kinematics(acceleration)` keeps the rules of `Kinematics`, with the same frames.
+       frame "world" is fixed at the origin. An unknown frame raises ModelError, which lists the
+       known ones.
+    4. `kinematics(acceleration)` follows the rules of `Kinematics`, with the same frames.
     5. `generalized_force` of a reaction is tau with tau . v = its power.
     6. `inverse_dynamics` of a reaction is M v' + H - tau.
-    7. Signals, limits and numbers of actuators have the sizes of what they are about; a name stands
-       once in `position_signals` and `velocity_signals` together.
+    7. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
+       and `velocity_signals` together.
     """
 
     @property
@@ -76,7 +76,7 @@ class Links(Frames, Protocol):
 
     @property
     def reflected_inertia(self) -> FloatArray:
-        """What of M is the rotor of each actuator, kg m^2 (kg), shape (nu,)."""
+        """The part of M from the rotor of each actuator, kg m^2 (kg), shape (nu,)."""
 
     @property
     def gear_ratios(self) -> FloatArray:
@@ -84,7 +84,7 @@ class Links(Frames, Protocol):
 
     @property
     def default_positions(self) -> FloatArray:
-        """A usual configuration, shape (nq,)."""
+        """A typical configuration, shape (nq,)."""
 
     @property
     def position_limits(self) -> tuple[FloatArray, FloatArray]:
@@ -96,17 +96,17 @@ class Links(Frames, Protocol):
 
     @property
     def plant(self) -> MultibodyPlant | None:
-        """The plant that they come from, for Drake's picture of them; None if there is none."""
+        """Their MultibodyPlant, for Drake's visualization; None without one."""
 
     def landmarks(self) -> ca.SX:
-        """Points of the robot that show where it is, in m, shape (3, k): for a view of it."""
+        """Points of the robot for views of it, in m, shape (3, k)."""
 
     @property
     def landmark_names(self) -> tuple[str, ...]:
         """The names of the frames whose origins the landmarks are, k of them."""
 
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
-        """The frames in motion, in which constraints are written.
+        """The frames in motion, in which constraints are expressed.
 
         Args:
             acceleration: v', shape (nv, 1); a symbol of its own if None.
@@ -116,7 +116,7 @@ class Links(Frames, Protocol):
         """tau of each column of a reaction, shape (nv, k).
 
         Args:
-            kinematics: What the reaction is written in, made by these links.
+            kinematics: The kinematics of the reaction, made by these links.
             reaction: Forces that act on the links.
         """
 
@@ -124,6 +124,6 @@ class Links(Frames, Protocol):
         """M(q) v' + H(q, v) - tau of (37), shape (nv, 1), with v' of the kinematics.
 
         Args:
-            kinematics: What the reaction is written in, made by these links.
+            kinematics: The kinematics of the reaction, made by these links.
             reaction: Forces that act on the links, one column.
         """

@@ -41,10 +41,10 @@ class MultibodyExpressions:
 
     as CasADi SX expressions, by the composite rigid body and the recursive Newton-Euler algorithm
     in link frames (Featherstone, Rigid Body Dynamics Algorithms, 2008). H holds the Coriolis and
-    centrifugal forces, gravity, joint damping, and the springs RevoluteSpring, PrismaticSpring
-    and LinearSpringDamper; M holds the reflected inertia of the rotors. Contact, locked joints
-    and the PD controllers of actuators are no part of them: u is what the joints feel. Nor are the
-    plant's constraints, as mimic joints: `RobotModel` takes these from the plant.
+    centrifugal forces, gravity, joint damping, and the springs RevoluteSpring, PrismaticSpring and
+    LinearSpringDamper; M holds the reflected inertia of the rotors. Contact, locked joints and PD
+    controllers of actuators are not included: u acts on the joints. The plant's constraints, such
+    as mimic joints, are not included either: `RobotModel` reads them from the plant.
 
     All data comes from the plant and is in SI units (m, kg, s, rad, N, N m); q, v and u have
     Drake's order. On construction M, N and every part of H are compared with the plant's own
@@ -54,7 +54,7 @@ class MultibodyExpressions:
         plant: The plant.
         q, v: Symbols, shapes (nq, 1) and (nv, 1), with nq = nv.
         parameters: The mass in kg of every body that has one, "<body>.mass". As in
-            RigidBody.SetMass, centre of mass and unit inertia stay when it changes.
+            RigidBody.SetMass, center of mass and unit inertia do not change with it.
         position_signals, velocity_signals: Names and units of q ("joint1", "base_qx") and of v
             ("joint1_w", "base_wx"), unique in both together; a joint name that several model
             instances use is written "instance::joint1".
@@ -63,9 +63,9 @@ class MultibodyExpressions:
         mass_matrix: M, shape (nv, nv), structurally zero between branches.
         bias: H, shape (nv, 1).
         actuation_matrix: B, shape (nv, nu).
-        effort_limits: The largest |u|, shape (nu,), inf where there is none. Drake's plant clips u
-            to them; these equations do not.
-        reflected_inertia: What of M the rotors are, in kg m^2 (kg), shape (nu,).
+        effort_limits: The largest |u|, shape (nu,), inf without a limit. Drake's plant clips u to
+            them; these equations do not.
+        reflected_inertia: The part of M from the rotors, in kg m^2 (kg), shape (nu,).
         gear_ratios: Motor turns per joint turn, shape (nu,).
         position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,).
         default_positions: The plant's default configuration, shape (nq,).
@@ -115,7 +115,7 @@ class MultibodyExpressions:
         return self._frames.pose(self._frames.find(frame))[0]
 
     def position(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W in m, shape (3, 1): where a point fixed in a frame is in the world.
+        """p_W in m, shape (3, 1): the position in the world of a point fixed in a frame.
 
         Args:
             frame: A frame of the plant, or its name; "instance::name" if several have that name.
@@ -226,7 +226,7 @@ class MultibodyExpressions:
                     f"the gear ratio of '{actuator.name()}' is {ratio:g}; it must be another number"
                 )
         self.reflected_inertia = np.array([a.default_reflected_inertia() for a in actuators])
-        # As in Drake, where a joint has several actuators the last one counts.
+        # As in Drake, the last of several actuators of a joint is used.
         self._rotors = np.zeros(plant.num_velocities())
         for index in plant.GetJointActuatorIndices():
             actuator = plant.get_joint_actuator(index)
@@ -239,7 +239,7 @@ class MultibodyExpressions:
         return any(joint.position_start() + k in e.positions for e in sequence if e.is_turn)
 
     def _read_masses(self) -> tuple[Parameter, ...]:
-        """Makes a parameter of every mass, and adds the bodies' inertias to their links."""
+        """Makes every mass a parameter, and adds the bodies' inertias to their links."""
         bodies = [body for body in _bodies(self.plant) if body.default_mass() > 0.0]
         parameters = []
         for body, name in zip(bodies, unique_names(self.plant, bodies), strict=True):
@@ -281,7 +281,7 @@ class MultibodyExpressions:
 
 
 def _check_support(plant: MultibodyPlant) -> None:
-    """Refuses a plant that has no equations here."""
+    """Refuses a plant that is not supported."""
     if not plant.is_finalized():
         raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
     for index in plant.GetJointIndices():

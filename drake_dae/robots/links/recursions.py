@@ -19,7 +19,7 @@ def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
 
     Args:
         links: The tree, parents before children; the world is link 0.
-        reflected_inertia: What the rotors add to the diagonal, shape (nv,).
+        reflected_inertia: The addition of the rotors to the diagonal, shape (nv,).
     """
     M = ca.SX(ca.diag(reflected_inertia))
     composite = [link.inertia for link in links]
@@ -46,12 +46,12 @@ def mass_matrix(links: Sequence[Link], reflected_inertia: FloatArray) -> ca.SX:
 
 
 def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) -> ca.SX:
-    """How a frame moves in the world for a unit of each entry of v.
+    """The Jacobian of a frame: its motion in the world per unit of each entry of v.
 
     Args:
         links: The tree, parents before children; the world is link 0.
         index: The index of the link that carries the frame.
-        origin: Where the frame's origin is, p_W in m, shape (3, 1).
+        origin: The position of the frame's origin, p_W in m, shape (3, 1).
         size: The number of velocities, nv.
 
     Returns:
@@ -71,14 +71,14 @@ def frame_jacobian(links: Sequence[Link], index: int, origin: ca.SX, size: int) 
 
 @dataclass(frozen=True, eq=False)
 class LinkKinematics:
-    """How a link moves, in its own axes; vectors have shape (3, 1).
+    """The motion of a link, in its own axes; vectors have shape (3, 1).
 
     Attributes:
         spin: The angular velocity in rad/s.
         spin_rate: The derivative of the spin in rad/s^2.
-        velocity: How fast the origin moves, in m/s.
-        acceleration: The acceleration of the origin less gravity, in m/s^2: the world is
-            accelerated upward, which pulls every body down.
+        velocity: The velocity of the origin, in m/s.
+        acceleration: The acceleration of the origin minus gravity, in m/s^2: gravity is represented
+            by an upward acceleration of the world.
         gradient: A point r of the link has the acceleration `acceleration` + gradient r, in 1/s^2,
             shape (3, 3).
     """
@@ -93,7 +93,7 @@ class LinkKinematics:
 def link_kinematics(
     links: Sequence[Link], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
 ) -> list[LinkKinematics]:
-    """How every link moves.
+    """The motion of every link.
 
     Args:
         links: The tree, parents before children; the world is link 0.
@@ -138,7 +138,7 @@ def inverse_dynamics(
 
     Args:
         links: The tree, parents before children; the world is link 0.
-        moving: How each link moves.
+        moving: The motion of each link.
         gravity: Gravity in the world, m/s^2, shape (3,).
         size: The number of velocities, nv.
         wrenches: Index of a link -> moment about its origin in N m and force in N that act on it,

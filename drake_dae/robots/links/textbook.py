@@ -19,7 +19,7 @@ from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class LinkExpressions:
-    """Links given by their own M(q) and H(q, v), as in a textbook; see `Links`.
+    """Links with given M(q) and H(q, v), as in a textbook; see `Links`.
 
     Attributes:
         q: Generalized positions, SX symbols, shape (nq, 1).
@@ -32,9 +32,9 @@ class LinkExpressions:
         parameters: The parameters of the expressions.
         position_signals, velocity_signals, actuator_signals: Names and units; made up if empty.
         effort_limits: The largest |u|, shape (nu,); infinite if None.
-        reflected_inertia: What of M(q) is rotors, kg m^2 (kg), shape (nu,); 0 if None.
+        reflected_inertia: The part of M(q) from rotors, kg m^2 (kg), shape (nu,); 0 if None.
         gear_ratios: Motor turns per joint turn, shape (nu,); 1 if None.
-        default_positions: A usual configuration, shape (nq,); zero if None.
+        default_positions: A typical configuration, shape (nq,); zero if None.
         position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,); none
             if None.
 
@@ -160,7 +160,7 @@ class LinkExpressions:
 
 
 class TextbookKinematics(Kinematics):
-    """Frames whose poses are plain expressions of q, and differentiated as such."""
+    """Frames whose poses are expressions of q and are differentiated directly."""
 
     def __init__(self, links: LinkExpressions, acceleration: ca.SX) -> None:
         self.q, self.v, self.acceleration = links.q, links.v, acceleration
@@ -178,7 +178,7 @@ class TextbookKinematics(Kinematics):
     def angular_velocity(self, frame: str) -> ca.SX:
         rotation = self._links.rotation(frame)
         rate = ca.reshape(self.derivative(ca.vec(rotation)), 3, 3)
-        # R' = w x R, so that w stands in R' R^T.
+        # R' = w x R, so that R' R^T contains w.
         return ca.vertcat(
             ca.mtimes(rate[2, :], rotation[1, :].T),
             ca.mtimes(rate[0, :], rotation[2, :].T),

@@ -21,7 +21,7 @@ def zeros(rows: int, columns: int = 1) -> ca.SX:
 
 @dataclass(frozen=True, eq=False)
 class ElementaryJoint:
-    """X_FM(q) of one elementary joint: a turn about a coordinate axis of F, or a shift.
+    """X_FM(q) of one elementary joint: a rotation about a coordinate axis of F, or a translation.
 
     A joint of a plant is a sequence of these; each starts from the frame where the one before ends.
 
@@ -114,17 +114,17 @@ class Link:
         return cls(parent, fixed, joint.axis, turn, ca.SX(offset), turning)
 
     def force_to_parent(self, moment: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """A moment about L's origin and a force, moved to P's origin and expressed in P."""
+        """A moment about L's origin and a force, transformed to P's origin and axes."""
         force = self.rotation @ force
         return self.rotation @ moment + ca.cross(self.offset, force), force
 
     def generalized_force(self, moment: ca.SX, force: ca.SX) -> list[tuple[int, ca.SX]]:
-        """What a moment about L's origin and a force do on this joint: index in v, scalar."""
+        """The generalized force of a moment about L's origin and a force: index in v, scalar."""
         turning = [(j, ca.dot(d, moment)) for j, d in self.turning.items()]
         return turning + [(j, ca.dot(self.rotation.T @ d, force)) for j, d in self.shifting.items()]
 
     def inertia_to_parent(self, inertia: Inertia) -> Inertia:
-        """An inertia in L, moved to P's origin and expressed in P."""
+        """An inertia in L, transformed to P's origin and axes."""
         first = self.rotation @ inertia.first
         fixed = ca.SX(self.fixed)
         second = symmetric(fixed @ self._turn_second(inertia.second) @ fixed.T)

@@ -1,7 +1,7 @@
 """The frames of a tree of links in motion, with symbols for their poses and velocities.
 
-Constraints are differentiated by these few symbols, and not through the joints: what the frames
-do, the recursions of `recursions` know in far fewer operations.
+Constraints are differentiated by these few symbols and not through the joints; the algorithms of
+`recursions` provide the motion of the frames in far fewer operations.
 """
 
 from collections.abc import Sequence
@@ -23,15 +23,13 @@ from drake_dae.robots.links.kinematics import (
 )
 from drake_dae.robots.links.recursions import LinkKinematics
 
-Wrench = tuple[ca.SX, ca.SX]
-
 
 @dataclass(frozen=True, eq=False)
 class _FrameSymbols:
-    """What stands for a frame F that can move, all in the world W.
+    """The symbols of a moving frame F, all in the world W.
 
-    R_WF' stands beside w, although R_WF' = w x R_WF: so a constraint on orientations is
-    differentiated without products that the recursions have formed already.
+    R_WF' is a symbol besides w, although R_WF' = w x R_WF. So orientation constraints are
+    differentiated without products that the recursions have already computed.
     """
 
     rotation: ca.SX = field(default_factory=lambda: ca.SX.sym("R", 3, 3))
@@ -121,7 +119,7 @@ class TreeKinematics(Kinematics):
         joint = self._frames.joint_at(position_index(self, position))
         if joint is None:
             return None
-        last = joint.elementary.sequence[-1]  # Of a screw, the turn.
+        last = joint.elementary.sequence[-1]  # The rotation of a screw joint.
         along = self.rotation(joint.frame) @ ca.SX(joint.elementary.rotation @ last.directions)
         none = ca.SX(3, 1)
         axes = (none, along) if last.is_turn else (along, none)
@@ -133,7 +131,7 @@ class TreeKinematics(Kinematics):
         return ca.substitute(expression, ca.vertcat(*symbols), ca.vertcat(*values))
 
     def _values(self, frame: Frame, own: _FrameSymbols) -> list[tuple[ca.SX, ca.SX]]:
-        """Each symbol of a frame, and what it stands for."""
+        """Each symbol of a frame, and its expression."""
         index, turn, lever = self._frames.on_link(frame)
         R_WL, link = self._frames.link_poses[index][0], self.moving[index]
         R_WF, p_WF = self._frames.pose(frame)

@@ -1,4 +1,4 @@
-"""Tables of heights, from files and as they are given."""
+"""Tables of heights, from files and from arrays."""
 
 import csv
 import struct
@@ -15,7 +15,7 @@ from drake_dae.errors import ModelError, describe_os_error
 from drake_dae.files import read_bytes
 
 MOST_HEIGHTS = 10_000_000
-"""A map has no more heights: a fit to them takes a gigabyte."""
+"""The largest number of heights: a fit to them takes a gigabyte."""
 
 
 def read_heights(file: Path) -> FloatArray:
@@ -27,14 +27,14 @@ def read_heights(file: Path) -> FloatArray:
         rows = readers[file.suffix.lower()](read_bytes(file))
     except OSError as error:
         raise ModelError(describe_os_error(error)) from None
-    except Exception as error:  # Those of NumPy, whose headers are Python, and of Pillow are many.
+    except Exception as error:  # NumPy (whose headers are Python) and Pillow raise many kinds.
         text = " ".join(str(error).split())[:200]
         raise ModelError(f"'{file.name}' has no table of heights: {text}") from None
     return height_table(f"'{file.name}'", rows)
 
 
 def _read_csv(data: bytes) -> FloatArray:
-    """Rows of numbers; semicolons, tabs, commas or blanks between them, whichever comes first here.
+    """Rows of numbers, separated by semicolons, tabs, commas or blanks, tried in this order.
 
     Raises:
         ValueError: A cell is no number, or the rows have different lengths.
@@ -45,7 +45,7 @@ def _read_csv(data: bytes) -> FloatArray:
     rows = csv.reader(lines, delimiter=between) if between else map(str.split, lines)
     cells = [[cell.strip() for cell in row] for row in rows]
     if cells and all(not row[-1] for row in cells):
-        cells = [row[:-1] for row in cells]  # A separator behind the last number, in each row.
+        cells = [row[:-1] for row in cells]  # A separator after the last number of each row.
     heights = [
         [_height(cell, row, column) for column, cell in enumerate(line, start=1)]
         for row, line in enumerate(cells, start=1)
@@ -72,7 +72,7 @@ def _read_npy(data: bytes) -> NDArray[Any]:
     """The array of an .npy file.
 
     Raises:
-        ValueError: It holds something else, or claims more than there is.
+        ValueError: It contains something else, or is shorter than its header says.
     """
     file = BytesIO(data)
     if not data.startswith(b"\x93NUMPY"):
@@ -109,7 +109,7 @@ def height_table(what: str, rows: ArrayLike) -> FloatArray:
     """Rows as an array.
 
     Raises:
-        ModelError: They are no table of numbers, or too few.
+        ModelError: They are not a table of numbers, or too few.
     """
     heights = numbers(f"{what}: heights", rows)
     if heights.ndim != 2 or min(heights.shape) < 2:

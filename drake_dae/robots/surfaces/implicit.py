@@ -28,7 +28,7 @@ _TAKEN = (
     "stiction_tolerance",
     "viscous_friction",
 )
-"""What constraints call parameters and signals of their own."""
+"""Names that constraints use for their own parameters and signals."""
 
 
 @checked(ModelError)
@@ -36,19 +36,19 @@ _TAKEN = (
 class ImplicitSurface(Surface):
     """Any smooth surface F(p) = 0: phi = F / |grad F|, the distance to first order.
 
-    The gradient has length one on the surface itself.
+    The gradient has length one on the surface.
 
     Attributes:
         function: F relative to `point` in the world's axes, positive on the free side, of any
-            scale, with a gradient that does not vanish on the surface. A formula of x, y, z in m,
-            pi and the parameters, as "z - a*sin(x)**2" (see `parse_formula`); or a function of a
-            CasADi column p of shape (3, 1), and of a namespace of the parameters if there are any.
-        point: Where the origin of p stands in the world, m, shape (3,).
-        parameters: Name -> number in F, in the unit that F takes it in. A constraint has them as
-            its parameters "<constraint>.<name>".
+            scale, with a nonzero gradient on the surface. A formula of x, y, z in m, pi and the
+            parameters, as "z - a*sin(x)**2" (see `parse_formula`); or a function of a CasADi column
+            p of shape (3, 1), and of a namespace of the parameters if there are any.
+        point: The origin of p in the world, m, shape (3,).
+        parameters: Name -> number in F, in the unit of F. They become parameters
+            "<constraint>.<name>" of a constraint.
 
     Raises:
-        ModelError: The formula cannot be read; the message tells where.
+        ModelError: The formula cannot be read; the message has the place.
     """
 
     function: Callable[..., ca.SX] | str

@@ -1,4 +1,4 @@
-"""Surfaces given by data, as heights over a plane: a height map, a mesh."""
+"""Surfaces from data, as heights over a plane: height maps and meshes."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from drake_dae.robots.surfaces.surface import Surface, Vector, tangents, triple,
 Pair = tuple[float, float]
 
 MOST_LENGTH = 1e9
-"""No height and no vertex is farther away, in m."""
+"""The largest height and distance of a vertex, in m."""
 
 
 class _Map(Surface):
@@ -59,7 +59,7 @@ class _Map(Surface):
     @property
     @abstractmethod
     def remark(self) -> str:
-        """How far it is off its data."""
+        """The deviation from its data, as text."""
 
     def picture(self, center: ArrayLike, size: float) -> Picture:
         sides = self.relief.x, self.relief.y
@@ -81,21 +81,21 @@ class _Map(Surface):
 @checked(ModelError)
 @dataclass(frozen=True)
 class HeightMap(_Map):
-    """Heights on a grid over a plane, from a table or a file, made smooth.
+    """Heights on a grid over a plane, from a table or a file, smoothed.
 
-    The surface is the sum of a plane and of bell curves that is closest to the heights: it has
-    derivatives of all orders, which laws behind springs and motors need, and is off the heights by
-    what `remark` says. Beyond the edges it goes over to the plane. Its coordinates are along
-    `tangents(normal)` in m: for the normal z along x and y, for a wall sideways and upward.
+    The surface is a least-squares fit of a plane and bell curves to the heights: it has derivatives
+    of all orders, which laws for flexible joints and motors need; `remark` has its deviation.
+    Beyond the edges it approaches the plane. Its coordinates are along `tangents(normal)` in m: for
+    the normal z along x and y, for a wall sideways and upward.
 
     Attributes:
         size: The lengths of the map along its coordinates, m, shape (2,).
-        heights: Heights in m above the plane through `point`, row by row: a row goes along the
-            first coordinate, the rows follow along the second; shape (r, c).
-        file: A file with the heights instead: .csv, or .npy, or .png, where black is 0 and white is
-            1, and which is seen from above, its second coordinate upward.
+        heights: Heights in m above the plane through `point`, row by row: a row is along the first
+            coordinate, and the rows follow each other along the second; shape (r, c).
+        file: A file with the heights instead: .csv, .npy, or .png (black is 0, white is 1, seen
+            from above with the second coordinate upward).
         point: The middle of the map, m, shape (3,).
-        normal: The direction of the heights, which is the free side, of any length, shape (3,).
+        normal: The direction of the heights and of the free side, of any length, shape (3,).
         scale: The length of a unit of the heights, m.
         resolution: What is finer is smoothed away, m: the distance of the bell curves. If None, a
             sixteenth of the longer side, but no less than the heights are apart.
@@ -133,19 +133,17 @@ class HeightMap(_Map):
 @checked(ModelError)
 @dataclass(frozen=True)
 class MeshSurface(_Map):
-    """The side of a mesh that is seen along a normal, as heights over a plane, made smooth.
+    """The side of a mesh visible along a normal, as heights over a plane, smoothed.
 
-    Rays against the normal sample the mesh over a rectangle, and a smooth surface is fitted to what
-    they hit; see `HeightMap`. So the mesh must cover the rectangle, and must not lie over itself
-    there: an overhang has no single height. A steep step is smoothed over; `remark` tells by how
-    much. To meet a mesh from several sides take several surfaces.
+    Rays against the normal sample the mesh over a rectangle, and a smooth surface is fitted to the
+    hits; see `HeightMap`. So the mesh must cover the rectangle without overhangs. Steep steps are
+    smoothed; `remark` has the deviation. For contact from several sides use several surfaces.
 
     Attributes:
         file: A mesh: .obj, or .stl and others that the package trimesh reads.
-        point: Where the origin of the mesh stands in the world, m, shape (3,); its axes are the
-            world's.
-        normal: The free side, and where the rays come from, of any length, shape (3,).
-        middle: The middle of the rectangle along `tangents(normal)` from the origin of the mesh, m,
+        point: The origin of the mesh in the world, m, shape (3,); its axes are the world's.
+        normal: The direction of the free side, from which the rays come, of any length, shape (3,).
+        middle: The center of the rectangle along `tangents(normal)` from the origin of the mesh, m,
             shape (2,); that of the mesh if None.
         size: The lengths of the rectangle, m, shape (2,); those of the mesh if None.
         scale: The length of a unit of the mesh, m: 0.001 for millimetres.
@@ -194,7 +192,7 @@ def _check(surface: Any) -> None:
 
 
 _Source = tuple[str, int, int]
-"""A file, when it was changed last, and how long it is: a fit is kept as long as these stay."""
+"""A file, its modification time and its size: a fit is kept while these do not change."""
 
 
 def _stamp(file: Path) -> _Source:
@@ -237,7 +235,7 @@ def _mesh_relief(
     _check_lengths("vertices", scale * vertices)
     seen = scale * vertices @ axes
     if np.linalg.det(axes) < 0.0:
-        triangles = triangles[:, ::-1]  # A mirror shows their backs.
+        triangles = triangles[:, ::-1]  # A reflection would show the back sides.
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
     middle = (low + high) / 2 if rectangle[0] is None else np.array(rectangle[0])
     size = high - low if rectangle[1] is None else np.array(rectangle[1])

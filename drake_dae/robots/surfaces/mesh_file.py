@@ -1,4 +1,4 @@
-"""Meshes from files, and what rays along an axis see of them."""
+"""Meshes from files, and their heights along an axis."""
 
 import re
 from pathlib import Path
@@ -22,7 +22,7 @@ def read_mesh(file: Path) -> tuple[FloatArray, Triangles]:
         ModelError: It cannot be read.
     """
     try:
-        read_bytes(file)  # A pipe or a device would hold up those that read it next.
+        read_bytes(file)  # A pipe or a device would block the readers below.
     except OSError as error:
         raise ModelError(describe_os_error(error)) from None
     is_obj = file.suffix.lower() == ".obj"
@@ -39,11 +39,11 @@ def read_mesh(file: Path) -> tuple[FloatArray, Triangles]:
 
 
 def _read_obj(file: Path) -> tuple[FloatArray, Triangles]:
-    """What Drake reads of an .obj file."""
+    """An .obj file, read by Drake."""
     check_obj(file)
     try:
         mesh = ReadObjToTriangleSurfaceMesh(str(file))
-    except (RuntimeError, SystemExit) as error:  # SystemExit for an assertion of Drake's own.
+    except (RuntimeError, SystemExit) as error:  # SystemExit for an assertion in Drake.
         raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
     vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())], dtype=float)
     corners = [[triangle.vertex(i) for i in range(3)] for triangle in mesh.triangles()]
@@ -51,12 +51,12 @@ def _read_obj(file: Path) -> tuple[FloatArray, Triangles]:
 
 
 def check_obj(file: Path) -> None:
-    """Refuses an .obj file which Drake would read as another one, or not survive.
+    """Refuses an .obj file that Drake would read wrongly or crash on.
 
-    Drake takes a coordinate that is no number for zero, and follows an index to wherever it leads.
+    Drake reads an invalid coordinate as zero, and does not check the range of indices.
 
     Raises:
-        ModelError: A coordinate is no finite number, or a face names no vertex.
+        ModelError: A coordinate is not a finite number, or a face has an invalid vertex.
     """
     lines = read_bytes(file).decode("utf-8", errors="replace").split("\n")
     rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
@@ -76,14 +76,14 @@ def check_obj(file: Path) -> None:
 
 
 def _is_vertex(word: str, before: int, total: int) -> bool:
-    """Whether a face's word is a number from 1, or counts back from -1."""
+    """Whether a vertex of a face is a valid index, from 1 or back from -1."""
     if not re.fullmatch(r"-?[0-9]{1,9}", word):
         return False
     return 1 <= int(word) <= total or -before <= int(word) <= -1
 
 
 def _read_other(file: Path) -> tuple[FloatArray, Triangles]:
-    """What the package trimesh reads of a file."""
+    """A file, read by the package trimesh."""
     try:
         import trimesh
     except ImportError:
@@ -94,7 +94,7 @@ def _read_other(file: Path) -> tuple[FloatArray, Triangles]:
     try:
         found: Any = trimesh.load(file, force="mesh")
         return np.array(found.vertices), np.array(found.faces)
-    except Exception as error:  # It has no exceptions of its own.
+    except Exception as error:  # trimesh has no exceptions of its own.
         raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
 
 
@@ -106,18 +106,18 @@ def heights_of_mesh(
     Args:
         vertices: Vertices in m, the last coordinate upward, shape (n, 3).
         triangles: The vertices of each triangle, shape (k, 3).
-        x: Where the columns are, m, increasing.
-        y: Where the rows are, m, increasing.
+        x: The coordinates of the columns, m, increasing.
+        y: The coordinates of the rows, m, increasing.
 
     Raises:
-        ModelError: The mesh is not there, or lies over itself.
+        ModelError: The mesh does not cover a point, or has an overhang.
     """
     corners = vertices[triangles]
     edges = corners[:, 1:, :2] - corners[:, :1, :2]
     areas = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     extent = float(np.max(np.ptp(vertices, axis=0)))
     upward = areas > 1e-12 * extent**2
-    if not upward.any():  # A sheet whose triangles go the other way round.
+    if not upward.any():  # A sheet with triangles of the opposite orientation.
         upward = areas < -1e-12 * extent**2
     lowest = np.full((len(y), len(x)), np.inf)
     highest = -lowest

@@ -1,4 +1,4 @@
-"""What there is to see of a surface."""
+"""The visible form of a surface."""
 
 from dataclasses import dataclass
 
@@ -11,18 +11,18 @@ from drake_dae.arrays import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A form that stands in the world.
+    """A form with a pose in the world.
 
     Attributes:
         form: A shape or a mesh of Drake.
-        pose: Where the form's own frame stands.
+        pose: The pose of the form's own frame.
     """
 
     form: Shape | TriangleSurfaceMesh
     pose: RigidTransform
 
     def moved(self, pose: RigidTransform) -> "Picture":
-        """The same elsewhere: as if what is the world to it stood at a pose."""
+        """The same form with its world frame moved to a pose."""
         return Picture(self.form, pose @ self.pose)
 
 

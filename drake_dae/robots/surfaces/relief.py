@@ -1,4 +1,4 @@
-"""Heights over a plane as a smooth function: fitted to a grid of data, written in SX."""
+"""Heights over a plane as a smooth SX function, fitted to a grid of data."""
 
 from dataclasses import dataclass
 from math import ceil
@@ -11,26 +11,26 @@ from numpy.typing import NDArray
 from drake_dae.arrays import FloatArray
 
 CELLS = 16
-"""How many bells stand along the longer side, unless asked otherwise."""
+"""The default number of bells along the longer side."""
 
 _BEYOND = 3
-"""How many bells stand beyond each edge, so that the edge is fitted as well as the middle."""
+"""The number of bells beyond each edge, so that the edge is fitted as well as the middle."""
 
 _LEAST = np.logspace(-8, -2, 7)
-"""Singular values below this, relative to the largest, are those of heights that no data show. The
-rougher the data, the more are: the least is taken by which the surface stays calm beyond its edges.
+"""Thresholds for singular values, relative to the largest, whose components the data do not
+determine. The smallest is taken for which the surface stays near the plane beyond its edges.
 """
 
 _CALM = 1.5
-"""How far off the plane it may be there, relative to the range of the heights over the plane."""
+"""The allowed distance from the plane there, relative to the range of the heights."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Bells:
     """Bell curves g_j(x) = exp(-(x - x_j)^2 / 2 d^2) whose distance d is their width.
 
-    At this width they span all polynomials to 1e-8 of their size, and are still far from being
-    alike: the fit is well conditioned.
+    At this width they span polynomials to 1e-8 of their size and are still distinct, so that the
+    fit is well conditioned.
 
     Attributes:
         places: x_j in m, shape (k,).
@@ -42,14 +42,14 @@ class _Bells:
 
     @classmethod
     def between(cls, low: float, high: float, distance: float) -> "_Bells":
-        """Bells over an interval, no further apart than a distance."""
+        """Bells over an interval, with at most a given spacing."""
         count = max(ceil((high - low) / distance - 1e-9), 1)
         width = float((high - low) / count)
         return cls(low + width * np.arange(-_BEYOND, count + _BEYOND + 1), width)
 
     @property
     def around(self) -> FloatArray:
-        """Places from well before the first bell to well behind the last, m, shape (l,)."""
+        """Places from well before the first bell to well beyond the last, m, shape (l,)."""
         return np.linspace(
             self.places[0] - 3 * self.width, self.places[-1] + 3 * self.width, 3 * self.places.size
         )
@@ -71,9 +71,9 @@ class Relief:
 
         h(x, y) = c_0 + c_1 x + c_2 y + sum_r a_r(x) b_r(y),
 
-    a plane, and sums a_r and b_r of bell curves along x and y. SX has no branches, which a spline
-    needs to find its cell; bells reach the same accuracy without any. Beyond the rectangle h goes
-    over to the plane, off it by no more than 1.5 times the range of the heights.
+    a plane, and sums a_r and b_r of bell curves along x and y. A spline needs branches to find its
+    cell, which SX does not have; bells reach the same accuracy without. Beyond the rectangle h
+    approaches the plane, with a distance of at most 1.5 times the range of the heights.
 
     Attributes:
         x: The sides of the rectangle along x, m, shape (2,).
@@ -82,7 +82,7 @@ class Relief:
         bells: Those along x and along y.
         factors: The factors of the bells in a_r, shape (kx, r), and b_r, shape (ky, r).
         largest: The largest distance of a height in the data from h, m.
-        rms: The root of the mean of its square, m.
+        rms: The root mean square of this distance, m.
     """
 
     x: FloatArray
@@ -110,13 +110,13 @@ class Relief:
 
 
 def fit_relief(x: FloatArray, y: FloatArray, heights: FloatArray, resolution: float) -> Relief:
-    """The relief closest to a grid of heights, by least squares.
+    """The least-squares fit to a grid of heights.
 
     Args:
-        x: Where the columns are, m, shape (c,), increasing.
-        y: Where the rows are, m, shape (r,), increasing.
+        x: The coordinates of the columns, m, shape (c,), increasing.
+        y: The coordinates of the rows, m, shape (r,), increasing.
         heights: Heights in m, shape (r, c), finite.
-        resolution: How far apart the bells stand at most, m: what is finer is smoothed away.
+        resolution: The largest spacing of the bells, m: finer details are smoothed away.
     """
     flat = np.stack([np.ones_like(heights), 0 * heights + x, 0 * heights + y[:, None]], axis=-1)
     plane = np.linalg.lstsq(flat.reshape(-1, 3), heights.ravel())[0].astype(float)
@@ -130,13 +130,13 @@ def fit_relief(x: FloatArray, y: FloatArray, heights: FloatArray, resolution: fl
         factors = to_y @ shares @ to_x.T
         if np.max(np.abs(beyond_y @ factors @ beyond_x.T)) <= _CALM * np.ptp(rest):
             break
-    # In heights and not in factors, which hold the round-off of the data a million times larger.
+    # In heights and not in factors, which magnify the round-off of the data a million times.
     left, sizes, right = np.linalg.svd(shares, full_matrices=False)
     a, b = to_x @ right.T, to_y @ (left * sizes)
     terms_a, terms_b = at_x @ a, at_y @ b
 
-    # A few terms often do: a wave along one axis takes one. What the others add is less than how
-    # far the data are from the fit, or less than a double tells.
+    # A few terms are often enough: a wave along one axis takes one. The others are smaller than the
+    # residual of the fit, or than round-off.
     rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
     negligible = max(0.1 * rms, 1e-10 * float(np.ptp(rest)))
     added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
@@ -154,7 +154,7 @@ def fit_relief(x: FloatArray, y: FloatArray, heights: FloatArray, resolution: fl
 
 
 def _spanned(bells: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
-    """What bells can tell apart: orthonormal values at the data, and the bells' factors for them.
+    """The space that bells span: orthonormal values at the data, and the bells' factors for them.
 
     Args:
         bells: The bells at the data, shape (data, bells).

@@ -1,4 +1,4 @@
-"""What a surface says of itself, and how any surface is drawn."""
+"""The contract of a surface, and the drawing of any surface."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -17,39 +17,37 @@ from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import Picture, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 from drake_dae.trace.smoothness import length_of
 
 Vector = tuple[float, float, float]
 
 CELLS = 24
-"""How many cells a mesh has along each side."""
+"""The number of cells of a mesh along each side."""
 
 
 @checked(ModelError)
 class Surface(ABC):
-    """A smooth surface that stands in the world.
+    """A smooth surface in the world.
 
-    Points are given as offsets from its reference point, so that where it stands can be a
-    parameter.
+    Points are given as offsets from its reference point, so that its position can be a parameter.
 
-    1. `position` is where the reference point stands by default.
+    1. `position` is the default position of the reference point.
     2. `distance` is the signed distance of a point, to first order around the surface: zero on it,
        positive on the free side, with a gradient of length one on the surface. So the constraint
        force of `PointOnSurface` is the normal force in newtons. It is smooth around the surface.
-    3. `coordinates` tell where on the surface a point is, one row for each of
-       `coordinate_signals`; with the distance they tell the point, but for poles. A surface may
-       have none.
-    4. `has_exact_distance` where the distance is so beside the surface, too: its gradient is one
-       long there. Balls roll on such surfaces alone.
-    5. `picture` is the surface around a point. Any surface is drawn from its distance alone; one
-       with a shape of its own gives that.
-    6. `shape` are numbers of its form that a study may change, by names; most surfaces have none.
-       `shaped` is the same surface with others, numbers or symbols.
-    7. `solid` is what fills the side that is not free, as a shape of Drake, for its own contact. A
-       surface may have none.
-    8. `remark` says what of it is approximate, if anything is, and `extent` up to which coordinates
-       it is given, if it has an end.
+    3. `coordinates` are coordinates along the surface, one row for each of `coordinate_signals`;
+       with the distance they determine a point, except at poles. A surface may have none.
+    4. `has_exact_distance` says whether the distance is exact also off the surface: its gradient
+       has length one there. Balls roll only on such surfaces.
+    5. `picture` is the surface around a point. By default it is drawn from its distance; surfaces
+       with a known shape return that.
+    6. `shape` are named numbers of its form that may vary; most surfaces have none. `shaped` is the
+       same surface with other values, numbers or symbols.
+    7. `solid` is a Drake shape that fills the side opposite to the free one, for Drake's own
+       contact. A surface may have none.
+    8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
+       which it is defined, if that is bounded.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
@@ -58,7 +56,7 @@ class Surface(ABC):
     @property
     @abstractmethod
     def position(self) -> Vector:
-        """Where the reference point stands in the world by default, m, shape (3,)."""
+        """The default position of the reference point in the world, m, shape (3,)."""
 
     @abstractmethod
     def distance(self, offset: ca.SX) -> ca.SX:
@@ -90,27 +88,27 @@ class Surface(ABC):
 
     @property
     def remark(self) -> str:
-        """What of it is approximate, and how much; empty if nothing is."""
+        """Its approximations, as text; empty if there are none."""
         return ""
 
     @property
     def extent(self) -> FloatArray | None:
-        """The least and the largest coordinates up to which it is given, shape (2, 2), or None."""
+        """The range of coordinates in which it is defined, shape (2, 2), or None."""
         return None
 
     def unit_normal(self, offset: ca.SX) -> ca.SX:
-        """The gradient of the distance at such a point, shape (3, 1): one long on the surface."""
+        """The gradient of the distance at such a point, shape (3, 1): the normal on the surface."""
         p = ca.SX.sym("p", 3)
         return ca.substitute(ca.gradient(self.distance(p), p), p, offset)
 
     def picture(self, center: ArrayLike, size: float) -> Picture | None:
-        """What is to be seen of the surface, standing with its reference point at the origin.
+        """The visible form of the surface, with its reference point at the origin.
 
-        Warns where Newton's method finds nothing of it near the center: it is then not drawn.
+        Warns if Newton's method finds no point of it near the center; then it is not drawn.
 
         Args:
             center: A point of interest, relative to the reference point, m, shape (3,).
-            size: How large a piece of it to draw if it has no end, m.
+            size: The size of the piece to draw if it is unbounded, m.
         """
         grid = self._patch(np.asarray(center, float), size)
         if np.all(np.isfinite(grid), axis=2).sum() < 3:
@@ -123,14 +121,13 @@ class Surface(ABC):
         return Picture(mesh_of_grid(grid), RigidTransform())
 
     def solid(self) -> Picture | None:
-        """What lies below the surface, standing with its reference point at the origin."""
+        """The solid below the surface, with its reference point at the origin."""
         return None
 
     def _patch(self, center: FloatArray, size: float) -> FloatArray:
         """A grid of points on the surface, shape (k, k, 3); NaN where there is none.
 
-        It is a grid of the tangent plane below `center`, each point brought onto the surface by
-        Newton's method.
+        A grid of the tangent plane below `center`, projected onto the surface by Newton's method.
         """
         p = ca.SX.sym("p", 3)
         distance = self.distance(p)
@@ -140,7 +137,7 @@ class Surface(ABC):
             {"distance": distance, "gradient": ca.gradient(distance, p)},
         )
 
-        def linearize(point: FloatArray) -> Linearization | None:
+        def linearize(point: FloatArray) -> NewtonModel | None:
             gradient = function(point)[1]
             return shortest_steps(gradient[None], lambda x: function(x)[0])
 
@@ -154,7 +151,7 @@ class Surface(ABC):
             middle = center
         normal = function(middle)[1]
         if not (np.all(np.isfinite(normal)) and normal.any()):
-            # A tip or an axis, where the distance has no gradient; beside it there is one.
+            # A tip or an axis, where the distance has no gradient; there is one next to it.
             normal = function(middle + size * np.array([0.07, 0.11, 0.13]))[1]
         if not (np.all(np.isfinite(normal)) and normal.any()):
             return np.full((1, 1, 3), np.nan)
@@ -164,7 +161,7 @@ class Surface(ABC):
 
 
 def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Parameter, ...]]:
-    """A surface whose numbers of shape are symbols, and these as parameters "<name>.<number>".
+    """A surface with symbols for its shape numbers, and these as parameters "<name>.<number>".
 
     Args:
         name: The name of the constraint that has the parameters.
@@ -179,7 +176,7 @@ def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Paramet
 
 
 def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors across a unit vector, upright where possible.
+    """Two unit vectors normal to a unit vector, the second upward if possible.
 
     For a vertical wall the first is horizontal and the second points up; for a horizontal plane
     they are x and y.
@@ -217,14 +214,14 @@ def triple(name: str, value: ArrayLike) -> Vector:
     """Three finite numbers as a tuple.
 
     Raises:
-        ModelError: They are not.
+        ModelError: They are not three finite numbers.
     """
     array = vector(name, value, 3)
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
 def unit_vector(name: str, value: ArrayLike) -> Vector:
-    """A direction of any length, made one long.
+    """A direction of any length, normalized.
 
     Raises:
         ModelError: It is not three finite numbers, or zero.
@@ -233,7 +230,7 @@ def unit_vector(name: str, value: ArrayLike) -> Vector:
     length = float(np.linalg.norm(array))
     if length == 0.0:
         raise ModelError(f"{name} must not be zero")
-    # A unit vector stays as it is, so that what was saved reads back equal.
+    # A unit vector is not changed, so that saved values are read back equal.
     return triple(name, array if abs(length - 1.0) < 1e-15 else array / length)
 
 

@@ -123,8 +123,8 @@ class Cylinder(Surface):
         axis: The direction of the axis, of any length, shape (3,).
         radius: Its radius, m.
         inside: Whether the free side is the inside.
-        zero: Across the axis, where the angle is 0; None for the first of `tangents(axis)`. On the
-            other side the angle jumps, so that it is best where the robot is.
+        zero: The direction of angle 0, normal to the axis; None for the first of `tangents(axis)`.
+            The angle jumps on the opposite side, so choose it towards the robot.
     """
 
     point: Vector
@@ -262,7 +262,7 @@ class Torus(Surface):
 def _components(
     axis: Vector, offset: ca.SX, zero: Vector | None = None
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Components along tangents(axis), or where zero points across the axis, and along the axis."""
+    """Components along tangents(axis), or along `zero` and across it, and along the axis."""
     first, second = tangents(axis)
     if zero is not None:
         first = np.array(zero) - np.dot(zero, axis) * np.array(axis)

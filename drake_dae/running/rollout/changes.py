@@ -59,7 +59,7 @@ class _Changes:
         except SimulationError as error:
             return replace(begun, ending=Ending.STUCK, error=error), None
         state, held = compiled.start(self.context)
-        return begun, replace(problem, state=state, held=held)
+        return begun, replace(problem, state=state, held=held, context=self.context)
 
     def make(self, run: Run, piece: Problem) -> tuple[Run, Problem | None]:
         """What a run comes to with the change that ended it, and how it goes on, if it does.
@@ -210,9 +210,9 @@ def run_with_changes(
     changes = _Changes(fused, problem, tableau or _CONTROLLED, tableau is None)
     with _LOCK:
         run, piece = changes.begin()
-    rows, steps, count, mark = [run.rows], 0, 0, run.time
+    rows, steps, count, mark = list[FloatArray](), 0, 0, run.time
     while piece is not None:
-        run = take(piece)
+        run = take(replace(piece, earlier=tuple(rows)))
         steps += run.steps
         # A piece begins with a row; after a change that is none of the record's.
         rows.append(run.rows[min(count, 1) :])
@@ -229,4 +229,4 @@ def run_with_changes(
             mark = run.time
     with _LOCK:
         context = changes.ended(run)
-    return replace(run, rows=np.concatenate(rows), steps=steps, context=context)
+    return replace(run, rows=np.concatenate(rows or [run.rows]), steps=steps, context=context)

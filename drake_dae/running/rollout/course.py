@@ -138,6 +138,7 @@ class Course:
     held: FloatArray
     rows: list[Rows] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
+    done: list[FloatArray] = field(default_factory=list)
     event: int = 0
     steps: int = 0
     before: float = 0.0
@@ -264,14 +265,34 @@ class Course:
         end, events = float(self.problem.times[-1]), self.problem.events
         return min(end, float(events[self.event])) if self.event < events.size else end
 
-    def finish(self, ending: Ending) -> Run:
-        """What the run came to."""
+    def so_far(self) -> FloatArray:
+        """The rows of the record up to now, but for the last ones, which may still change."""
+        *whole, last = self.rows
+        self.rows[:] = whole
+        try:
+            self._compute()
+        finally:
+            self.rows.append(last)
+        return self.problem.whole(self._joined())
+
+    def _joined(self) -> FloatArray:
+        return np.concatenate([np.zeros((0, self.fused.program.width)), *self.done])
+
+    def _compute(self) -> None:
+        """Makes rows of the record of all that is kept.
+
+        Raises:
+            Ended: A row has no value.
+        """
         self.fill()
+        if not self.rows:
+            return
         counts = [len(rows.times) for rows in self.rows]
         times = np.concatenate([rows.times for rows in self.rows])
         states = np.concatenate([rows.states for rows in self.rows])
         held = np.repeat([rows.held for rows in self.rows], counts, axis=0)
         between = np.repeat([rows.between for rows in self.rows], counts)
+        self.rows.clear()
         parameters = self.problem.parameters
         if self.fused.program.compiled.projects and between.any():
             apart = np.flatnonzero(between)
@@ -282,11 +303,19 @@ class Course:
             states[apart] = found
         rows, valid = self.fused.rows(times, states, held, parameters)
         count = int(np.argmin(np.append(valid, False)))
+        self.done.append(rows[:count])
         if count < len(valid):
-            ending = Ending.INVALID
             self.time, self.state = self.trial_time, self.trial = times[count], states[count]
+            raise Ended(Ending.INVALID)
+
+    def finish(self, ending: Ending) -> Run:
+        """What the run came to."""
+        try:
+            self._compute()
+        except Ended as ended:
+            ending = ended.ending
         return Run(
-            rows[:count],
+            self._joined(),
             ending,
             self.time,
             self.state,

@@ -53,7 +53,7 @@ def _control(course: Course, settings: Settings) -> None:
     rate: FloatArray | None = None
     course.write(course.time, course.state)
     while course.time < moments[-1]:
-        if settings.stop():
+        if settings.look(course.so_far, course.problem.context):
             raise Ended(Ending.PAUSED)
         if course.update(is_on=rate is not None):
             rate = None
@@ -145,7 +145,7 @@ class _Steps:
     """Fixed steps, many in one call of CasADi."""
 
     def __init__(self, fused: Fused, tableau: Tableau, settings: Settings) -> None:
-        self._tableau, self._longest, self._stop = tableau, settings.longest, settings.stop
+        self._tableau, self._longest, self._look = tableau, settings.longest, settings.look
         self._one, self._many = fused.steps(tableau)
 
     def run(self, course: Course) -> None:
@@ -156,7 +156,7 @@ class _Steps:
             course.update()
             done = 0
             while done < len(block):
-                if self._stop():
+                if self._look(course.so_far, course.problem.context):
                     raise Ended(Ending.PAUSED)
                 done += self._advance(course, block[done : done + CHUNK])
         course.rows[-1] = course.rows[-1].without_last()

@@ -24,7 +24,7 @@ _PROJECTION, _ALL = 2, 7
 """What is pending before a step, as stepper.c has it."""
 
 BUDGET = 20_000
-"""So many steps are taken before Python looks for Ctrl-C: at most some tenths of a second."""
+"""So many steps are taken before Python looks at the run: at most some tenths of a second."""
 
 
 class _Run(ctypes.Structure):
@@ -80,7 +80,9 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
     given += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
     arguments = [_argument(value) for value in given]
     ending = Ending.PAUSED
-    while ending is Ending.PAUSED and not settings.stop():
+    while ending is Ending.PAUSED and not settings.look(
+        lambda: problem.whole(rows[: own.row]), problem.context
+    ):
         ending = Ending(step(ctypes.byref(own), *arguments, _argument(BUDGET)))
         if ending is Ending.OFF_MANIFOLD:
             try:

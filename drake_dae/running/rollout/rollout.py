@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +23,7 @@ from drake_dae.running.rollout.fused import Fused
 from drake_dae.running.rollout.problems import checked_times, problems_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, num_cores
-from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
@@ -51,15 +52,12 @@ class Rollout:
     @cached_property
     def record(self) -> Record:
         """Its signals at the given times, up to where it came."""
-        columns = self._program.signals
-        stops = np.cumsum([len(signals) for signals in columns.values()])
-        parts = np.split(self._rows, stops[:-1], axis=1)
-        signals = {
-            name: Recorded(part, tuple(columns[name]))
-            for name, part in zip(columns, parts, strict=True)
-        }
-        record = Record(self._times[: len(self._rows)], signals)
-        return self._program.complete(record, self.context)
+        return _record(self._program, self._times, self._rows, context=self.context)
+
+    def ended(self, failure: SimulationError) -> Self:
+        """The same where it ended with a failure; its record goes up to the failure's time."""
+        stop = int(np.searchsorted(self._times[: len(self._rows)], failure.time, side="right"))
+        return replace(self, failure=failure, _rows=self._rows[:stop])
 
 
 @checked(ModelError)
@@ -121,7 +119,7 @@ def run_loop(
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
     lasting: float | None = None,
-    stop: Callable[[], bool] = lambda: False,
+    look: Callable[[RecordAfter], bool] = lambda record: False,
 ) -> list[Rollout]:
     """`rollout`, where these runs may be some of many, and may be stopped.
 
@@ -129,7 +127,8 @@ def run_loop(
         lasting: How long all of them last together, in s. Then this alone decides on machine code,
             not what the cache has: the numbers are the same whenever they are computed. None if
             these are all.
-        stop: Whether to stop where a run is, looked at now and then; its record goes up to there.
+        look: Called now and then with a function from a time in s, or None, to what a run has
+            recorded later; whether to stop where it is. Its record goes up to there.
     """
     config = config or SimulatorConfig()
     check_config(config)
@@ -137,7 +136,11 @@ def run_loop(
     choice: Compiled = program.choice if compiled is None else compiled
     check_choice("rollout", choice)
     moments = checked_times(times)
-    settings = Settings.of(config, program.compiled.scale, stop)
+
+    def looked(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+        return look(lambda after: _record(program, moments, rows(), after, context))
+
+    settings = Settings.of(config, program.compiled.scale, looked)
     problems = problems_of(program, starts, parameters, moments, seeds)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
     kinds = [program.compiled.has_twins(problem.parameters) for problem in problems]
@@ -206,3 +209,22 @@ def _result(program: Program, problem: Problem, run: Run) -> Rollout:
     if run.ending not in (Ending.DONE, Ending.PAUSED, Ending.STOPPED):
         failure = failure_of(program, problem, run)
     return Rollout(run.steps, failure, program, problem.times, run.rows, run.context)
+
+
+def _record(
+    program: Program,
+    times: FloatArray,
+    rows: FloatArray,
+    after: float | None = None,
+    context: Context | None = None,
+) -> Record:
+    """The rows of a run as a record, or those that are later than a time in s."""
+    first = 0 if after is None else int(np.searchsorted(times[: len(rows)], after, side="right"))
+    columns = program.signals
+    stops = np.cumsum([len(signals) for signals in columns.values()])
+    parts = np.split(rows[first:], stops[:-1], axis=1)
+    signals = {
+        name: Recorded(part, tuple(columns[name]))
+        for name, part in zip(columns, parts, strict=True)
+    }
+    return program.complete(Record(times[first : len(rows)], signals), context)

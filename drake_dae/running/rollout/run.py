@@ -14,6 +14,8 @@ from scipy.integrate import RK23, RK45
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError, SimulationError
 
+Look = Callable[[Callable[[], FloatArray], Context | None], bool]
+
 SHARE = 1e-3
 """Of the accuracy that a step may use up: then what is read between long steps is as good."""
 
@@ -78,23 +80,24 @@ class Settings:
         tableau: The method of fixed steps; None for error control, by DOP853.
         absolute: The error that a step may make, for each state, shape (n,).
         relative: The same relative to the state.
-        stop: Whether to stop where the run is, looked at now and then.
+        look: Called now and then with what returns the rows written up to then, and with the
+            context of `Problem`; whether to stop where the run is.
     """
 
     longest: float
     tableau: Tableau | None
     absolute: FloatArray
     relative: float
-    stop: Callable[[], bool]
+    look: Look
 
     @classmethod
-    def of(cls, config: SimulatorConfig, scale: FloatArray, stop: Callable[[], bool]) -> Self:
+    def of(cls, config: SimulatorConfig, scale: FloatArray, look: Look) -> Self:
         """The settings of a scenario.
 
         Args:
             config: Drake's settings.
             scale: How large the states are, shape (n,).
-            stop: As the attribute.
+            look: As the attribute.
 
         Raises:
             ModelError: Its scheme has fixed steps, and is implicit.
@@ -110,7 +113,7 @@ class Settings:
         elif not scale.size:  # Without a state there is no error.
             tableau = FIXED["explicit_euler"]
         relative = max(SHARE * config.accuracy, SMALLEST)
-        return cls(config.max_step_size, tableau, relative * scale, relative, stop)
+        return cls(config.max_step_size, tableau, relative * scale, relative, look)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +130,9 @@ class Problem:
         noise: The random numbers of each of these, shape (len(events), number of entries).
         project: (time, state, held) -> the state on N*; raises InconsistentStateError.
         has_reacted: Whether blocks have reacted to how the run begins.
+        earlier: Where this is a piece of a run, the rows of those before; the first row of the
+            piece is then none of the record's.
+        context: A context of the diagram in which blocks changed so far, where they do.
     """
 
     times: FloatArray
@@ -138,6 +144,12 @@ class Problem:
     noise: FloatArray
     project: Callable[[float, FloatArray, FloatArray], FloatArray]
     has_reacted: bool = False
+    earlier: tuple[FloatArray, ...] = ()
+    context: Context | None = None
+
+    def whole(self, rows: FloatArray) -> FloatArray:
+        """All rows of a run, where a piece has some by now."""
+        return np.concatenate([*self.earlier, rows[1:]]) if self.earlier else rows
 
 
 @dataclass(frozen=True, eq=False)

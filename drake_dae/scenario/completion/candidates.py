@@ -25,7 +25,7 @@ from drake_dae.scenario.scenario import Scenario
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where a robot touches a surface: the constraint's name, the point, the tool's axis there."""
+    """A contact of a robot: the constraint's name, the point, and the tool's axis there."""
 
     constraint: str
     touch: Touch
@@ -33,18 +33,18 @@ class _Place:
 
 
 class Candidates:
-    """The rows that are given, and after them those that may complete them, one output each.
+    """The given rows, then those that may complete them, one output each.
 
     Args:
         scenario: The scenario.
         links: Its robot.
-        given: The outputs that it gives.
-        bound: What the robot touches.
+        given: The given outputs.
+        bound: The constraints.
 
     Attributes:
         signals: Names and units of all rows.
         expression: All rows, shape (c, 1).
-        outward: Where tools touch, and their outward axes in the world, shape (3, 1).
+        outward: The contacts of tools, with their outward axes in the world, shape (3, 1).
         tilts: The rows that are zero where tools are normal to their surfaces; none if `tool_axis`
             of the scenario is free.
         axes: The rows of the tools' directions that may be outputs, by `tool_axis`.
@@ -97,13 +97,13 @@ class Candidates:
         ]
 
     def form(self, row: int) -> Output:
-        """How a scenario writes a row that completes."""
+        """The form of a completed row in a scenario."""
         return self._forms[row - self._given]
 
 
 def _points(place: _Place, taken: set[str]) -> list[Output]:
     frame, point = place.touch.frame, place.touch.point
-    # A name stands once: that of the constraint is free where the frame's is taken.
+    # Names are unique: the constraint's name is used if the frame's is taken.
     named = ((axis, f"{frame}.{axis}" in taken) for axis in "xyz")
     return [
         PointCoordinates(frame, axis, point, f"{place.constraint}_point" if is_taken else "")

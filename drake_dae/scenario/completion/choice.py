@@ -1,4 +1,4 @@
-"""Which rows complete a task: those that are independent, and of the joints the best."""
+"""The rows that complete a task: independent ones, and the best joints."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -10,13 +10,13 @@ from drake_dae.arrays import FloatArray
 from drake_dae.scenario.completion.postures import Posture, Postures
 
 INDEPENDENT = 0.02
-"""Rows whose `independence` is less depend on each other, or nearly."""
+"""Rows with an `independence` below this are dependent or nearly so."""
 
 _SETS = 500
-"""So many sets of joints are compared at most; of more, joints are taken one by one."""
+"""The largest number of compared sets of joints; for more, joints are chosen one by one."""
 
 _SHORTLIST = 6
-"""So many of the best sets at the start are followed along the reference."""
+"""The number of best sets at the start that are evaluated along the reference."""
 
 
 def first_independent(
@@ -45,7 +45,7 @@ def best_joints(
 
     Args:
         postures: The robot.
-        posture: Where it starts.
+        posture: The start.
         rows: The rows of the task.
         joints: The rows of positions.
         count: How many to choose.
@@ -74,7 +74,7 @@ def best_joints(
     shortlist = sorted(sets, key=start_quality, reverse=True)[:_SHORTLIST]
     if len(shortlist) < 2:
         return shortlist[0] if shortlist else None
-    # Of equals along the path the best one at the start.
+    # Of equal ones along the path the best at the start.
     return max(shortlist, key=lambda one: _least(postures, posture, [*rows, *one], path))
 
 

@@ -1,4 +1,4 @@
-"""What a scenario leaves open: outputs that are missing, and where the robot starts."""
+"""Completion of a scenario: missing outputs, and the start."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,19 +22,19 @@ from drake_dae.scenario.parts.written import made
 from drake_dae.scenario.scenario import Scenario
 
 REGULAR = 1e-3
-"""A start whose `independence` is less is singular."""
+"""A start with an `independence` below this is singular."""
 
 _DIGITS = 4
-"""Decimals of m and rad with which a start is written."""
+"""The number of decimals of m and rad of a start."""
 
 
 @dataclass(frozen=True)
 class Completed:
-    """A scenario of which nothing is left open.
+    """A completed scenario.
 
     Attributes:
         scenario: The scenario.
-        notes: What was chosen, a line each; none if there was nothing to choose.
+        notes: The choices, a line each; empty if there were none.
     """
 
     scenario: Scenario
@@ -48,13 +48,10 @@ def complete(
     of_plant: Sequence[Constraint],
     guess: FloatArray,
 ) -> Completed:
-    """Chooses the outputs that a scenario leaves out, and where the robot starts.
+    """Chooses the missing outputs of a scenario, and the start.
 
-    Outputs are missing where they are, with the force outputs, fewer than the actuators. Those that
-    complete them are, as far as each is independent of the ones before: the world coordinates along
-    the surface of each point that touches one; what `tool_axis` holds of the tool's direction; and
-    positions of joints, of which that set is taken that keeps B(x) best conditioned, and joints off
-    their limits, along the reference. What has no reference holds the value that it starts with.
+    Outputs are missing if there are fewer outputs than actuators. They are completed as described
+    for `complete_scenario`.
 
     The robot starts where its default configuration, with start.positions, leads by Newton's method
     within its limits; or else, of 60 tries for the positions that are not given, in the posture of
@@ -79,7 +76,7 @@ def complete(
     actuators = len(links.actuator_signals) + len(bound.motors)
     missing = actuators - size - S.shape[0]
     if not (size or S.shape[0] or scenario.references):
-        return Completed(scenario)  # It is only simulated.
+        return Completed(scenario)  # A robot that is only simulated.
     if scenario.task is not None:
         return Completed(scenario)
     if scenario.control_weights or scenario.compliances is not None:
@@ -94,7 +91,7 @@ def complete(
         postures = Postures(
             links, bound, candidates.expression, S, candidates.outward, _parameters(scenario)
         )
-    # Rows that references name are known before the posture is: by the normal near the guess.
+    # Rows named by references are known before the posture, from the normal near the guess.
     near = postures.at(postures.solve((), np.zeros(0), guess)) if missing else None
     if near is not None:
         check_independent(names, near)
@@ -104,7 +101,7 @@ def complete(
         referred = ReferredRows(scenario, candidates, size, missing, names, along)
     except ScenarioError:
         if missing == 0 and scenario.start.positions:
-            return Completed(scenario)  # Whoever wires the references tells more.
+            return Completed(scenario)  # The wiring of references reports more details.
         raise
     if missing == 0:
         return _with_start(scenario, referred, postures, guess)
@@ -120,14 +117,14 @@ def _with_start(
     wanted = referred.at_start(rows)
     near = near_posture(postures, rows, wanted, guess)
     is_given = bool(scenario.start.positions)
-    # The structure is found at the guess itself.
+    # The structure is evaluated at the guess.
     if near is not None and (
         is_given or all(p.independence(rows) > REGULAR for p in (near, postures.at(guess)))
     ):
         return Completed(scenario)
     if is_given:
         best = best_posture(postures, rows, wanted, list(_guesses(referred, postures, guess)))
-        if best is None:  # Whoever starts the robot tells it.
+        if best is None:  # The start reports it.
             return Completed(scenario)
         return Completed(_started(scenario, referred, best), (_start_note(referred, best),))
     found = _found(referred, postures, rows, wanted, guess)
@@ -144,7 +141,7 @@ def _with_outputs(
     """The scenario with all outputs and a start; `forces` names those of the constraints."""
     candidates, named = referred.candidates, referred.rows
     posture, is_normal = _posture(referred, postures, named, guess)
-    # What completes the outputs, in the order of their worth.
+    # The completing outputs, in order of preference.
     open_points = [row for row in candidates.points(posture) if row not in named]
     room = referred.missing - len(named) + referred.given
     along = first_independent(posture, named, open_points, room)
@@ -186,7 +183,7 @@ def _with_outputs(
 
 
 def _movable(postures: Postures) -> list[int]:
-    """The rows that move anywhere: an arm that moves in a plane has others."""
+    """The rows that can change: a planar arm has constant ones."""
     some = [postures.at(q).gradients for q in postures.guesses(4)]
     return np.flatnonzero(np.linalg.norm(some, axis=2).max(axis=0) > 1e-9).tolist()
 
@@ -197,7 +194,7 @@ def _posture(
     rows: Sequence[int],
     guess: FloatArray,
 ) -> tuple[Posture, bool]:
-    """Where the robot starts, and whether its tools are then normal to their surfaces."""
+    """The start, and whether the tools are normal to their surfaces there."""
     candidates, wanted = referred.candidates, referred.at_start(rows)
     both = [*rows, *candidates.tilts]
     goal = np.concatenate([wanted, np.zeros(len(candidates.tilts))])
@@ -214,7 +211,7 @@ def _posture(
 
 
 def _guesses(referred: ReferredRows, postures: Postures, guess: FloatArray) -> FloatArray:
-    """Configurations to try: random where start.positions give nothing, shape (TRIES, nq)."""
+    """Configurations to try: random for joints without start.positions, shape (TRIES, nq)."""
     names = [referred.candidates.signals[row].name for row in referred.candidates.joints]
     given = [name in referred.scenario.start.positions for name in names]
     return np.where(given, guess, postures.guesses(TRIES))
@@ -230,7 +227,7 @@ def _found(
     """The best posture with wanted values of rows.
 
     Raises:
-        ScenarioError: There is none; by how much each row misses its value at the nearest.
+        ScenarioError: There is none; the message has the remaining errors of the nearest.
     """
     guesses = [guess, *_guesses(referred, postures, guess)]
     found = best_posture(postures, rows, wanted, guesses)

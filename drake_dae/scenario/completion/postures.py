@@ -1,4 +1,4 @@
-"""Where a robot can stand, and how well it can move from there."""
+"""Postures of a robot, and their quality for a task."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,38 +14,38 @@ from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
 EXACT = 1e-9
-"""Equations in m, rad or 1 of which less than this is left are satisfied."""
+"""The allowed residual of equations in m, rad or 1."""
 
 NEAR_LIMIT = 0.1
-"""A joint within this part of its range from a limit counts as close to it."""
+"""A joint within this fraction of its range from a limit counts as close to it."""
 
-_STEPS = 25
-"""After so many steps another guess is better; a good one takes six."""
+_NEWTON_STEPS = 25
+"""The largest number of Newton steps from a guess; a good guess takes six."""
 
 _BELOW = 0.02
-"""A body this far behind a surface, relative to the size of the robot, runs into it."""
+"""A body this far behind a surface, relative to the size of the robot, collides with it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """A configuration, and what is known of it.
+    """A configuration with its properties.
 
     Attributes:
         q: The configuration, shape (nq,).
         rows: The values of all rows that may be outputs, shape (c,).
-        left: What is left of the constraints, shape (k,).
+        left: The residual of the constraints, shape (k,).
         slopes: The gradients of the rows with respect to q, shape (c, nq).
         constraint_slopes: Those of the constraints, shape (k, nq).
         gradients: The rates of the rows per unit of v, shape (c, nv).
         constraints: The rates of the constraints per unit of v, shape (m, nv).
         forces: S of the force outputs, shape (s, m).
         mass: M(q), shape (nv, nv).
-        actuation: What a unit of each control does, shape (nv, nu).
-        clearances: How far each body is on the free side of each surface, in m.
-        normals: The unit normal of each surface where it is touched, below each other.
+        actuation: The generalized force per unit of each control, shape (nv, nu).
+        clearances: The clearance of each body from each surface, in m.
+        normals: The unit normal of each surface at its contact, stacked.
         leans: The cosine between the outward axis of each tool and its surface's normal.
     """
 
@@ -64,12 +64,12 @@ class Posture:
     leans: FloatArray
 
     def independence(self, rows: Sequence[int]) -> float:
-        """How independently the controls move some rows and press with the force outputs.
+        """The independence of some rows and the force outputs under the controls.
 
         It is the smallest singular value of B(x) of (16) with M^(1/2) v and M^(-1/2) B_u in the
-        place of v and u, whose unit is that of kinetic energy: each row as long as it would be
-        without constraints, so that neither units nor the length of a lever count. It is 1 where no
-        row hinders another one, and 0 where the robot is singular.
+        place of v and u, whose unit is that of kinetic energy: each row is normalized to its length
+        without constraints, so that units and lever lengths do not matter. It is 1 for fully
+        independent rows, and 0 if the robot is singular.
         """
         lower = np.linalg.cholesky(self.mass)
 
@@ -99,26 +99,26 @@ def _value_of(parameter: Parameter, values: Mapping[str, FloatArray]) -> FloatAr
 
 
 def _one_long(rows: FloatArray, scaled: FloatArray) -> FloatArray:
-    """Rows divided by the lengths of others; zero where these are none."""
+    """Rows divided by given lengths; zero where these are zero."""
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     return scaled / np.where(length > 1e-9, length, np.inf)
 
 
 class Postures:
-    """The configurations of a robot that touches something.
+    """The configurations of a robot with constraints.
 
     Args:
         links: The robot.
-        bound: What it touches or holds.
-        rows: h(q), what may be outputs, shape (c, 1).
+        bound: The constraints.
+        rows: h(q), the possible outputs, shape (c, 1).
         forces: S of the force outputs, shape (s, m).
-        touches: Where it touches what has a free side, with the outward axis of the tool there in
-            the world, shape (3, 1).
+        touches: The contacts with a free side, with the outward axis of the tool in the world,
+            shape (3, 1).
         values: Parameter name -> value, where that is not the default.
 
     Attributes:
         low, high: The limits of q, shape (nq,) each.
-        size: How far its bodies are from each other at most, in m, in its default configuration.
+        size: The largest distance between its bodies, in m, in its default configuration.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Postures:
         return values
 
     def at(self, q: FloatArray) -> Posture:
-        """What is known of a configuration."""
+        """The posture of a configuration."""
         values = self._values(q)
         del values["bodies"]
         return Posture(q=q, **values)
@@ -190,7 +190,7 @@ class Postures:
             guess: Where Newton's method starts, shape (nq,).
 
         Returns:
-            q, shape (nq,); whether it is one `left` tells.
+            q, shape (nq,); check it with `left`.
         """
         chosen = list(rows)
 
@@ -198,18 +198,18 @@ class Postures:
             found = self._values(q)
             return np.concatenate([found["left"], found["rows"][chosen] - wanted])
 
-        def linearize(q: FloatArray) -> Linearization | None:
+        def linearize(q: FloatArray) -> NewtonModel | None:
             found = self._values(q)
             gradients = np.vstack([found["constraint_slopes"], found["slopes"][chosen]])
             return shortest_steps(gradients, residual)
 
-        q = newton(guess, linearize, _STEPS)[0]
+        q = newton(guess, linearize, _NEWTON_STEPS)[0]
         turned = self._turned_back(q)
-        # Where a row is the position of a joint, its turns count.
+        # If a row is the position of a joint, whole turns matter.
         return turned if np.max(np.abs(residual(turned)), initial=0.0) < EXACT else q
 
     def left(self, rows: Sequence[int], wanted: FloatArray, q: FloatArray) -> FloatArray:
-        """What is left of the constraints and of wanted values of rows, shape (k + len(rows),)."""
+        """The residual of the constraints and of wanted values of rows, shape (k + len(rows),)."""
         found = self._values(q)
         return np.concatenate([found["left"], found["rows"][list(rows)] - wanted])
 
@@ -224,7 +224,7 @@ class Postures:
         return np.where(is_fine, q, turned)
 
     def _room(self, q: FloatArray) -> FloatArray:
-        """How far each position is from its nearer limit, shape (nq,)."""
+        """The distance of each position from its nearer limit, shape (nq,)."""
         return np.minimum(q - self.low, self.high - q)
 
     def is_inside(self, q: FloatArray) -> bool:
@@ -232,16 +232,16 @@ class Postures:
         return bool(np.all(self._room(q) >= -1e-9))
 
     def margin(self, q: FloatArray) -> float:
-        """1 where no joint is close to a limit, 0 where one is at it or beyond."""
+        """1 if no joint is close to a limit, 0 if one is at it or beyond."""
         span = self.high - self.low
         bounded = np.isfinite(span) & (span > 0.0)
         share = self._room(q)[bounded] / (NEAR_LIMIT * span[bounded])
         return float(np.clip(np.min(share, initial=1.0), 0.0, 1.0))
 
     def quality(self, posture: Posture, rows: Sequence[int]) -> float:
-        """How good a posture is for a task: independence of the rows, less near limits.
+        """The quality of a posture for a task: independence of the rows, reduced near limits.
 
-        It counts little if a body is behind a surface, or a tool points away from its own.
+        It is low if a body is behind a surface, or a tool points away from its surface.
         """
         quality = posture.independence(rows) * self.margin(posture.q)
         if np.min(posture.clearances, initial=0.0) < -_BELOW * self.size:
@@ -255,7 +255,7 @@ class Postures:
         random = np.random.default_rng(0)
         reach = np.where(self._turns, np.pi, self.size)
         low, high = np.maximum(self.low, -reach), np.minimum(self.high, reach)
-        empty = low > high  # Limits beyond a turn.
+        empty = low > high  # Limits wider than a turn.
         low, high = np.where(empty, self.low, low), np.where(empty, self.high, high)
         inset = 0.5 * NEAR_LIMIT * (high - low)
         return random.uniform(low + inset, high - inset, (count, low.size))

@@ -1,4 +1,4 @@
-"""Which outputs, given or still to be chosen, the references of a scenario mean."""
+"""The outputs, given or still to be chosen, of the references of a scenario."""
 
 from collections.abc import Sequence
 
@@ -12,18 +12,17 @@ from drake_dae.scenario.completion.candidates import Candidates
 from drake_dae.scenario.scenario import Scenario
 
 _TIMES = 25
-"""At so many times along the reference choices are compared."""
+"""The number of times along the reference at which choices are compared."""
 
 
 class ReferredRows:
-    """Which rows have references, and their values.
+    """The rows with references, and their values.
 
     Attributes:
         scenario, candidates: The arguments.
-        given: How many rows the scenario gives.
+        given: The number of given rows.
         missing: How many are missing.
-        rows: The rows that have references: those that are given, and then those that complete
-            them and are named by references.
+        rows: The rows with references: given ones, then completing ones that references name.
     """
 
     def __init__(
@@ -40,13 +39,13 @@ class ReferredRows:
         Args:
             scenario: The scenario.
             candidates: Its rows.
-            given: How many of these it gives.
+            given: The number of given rows.
             missing: How many are missing.
             forces: The names of the force outputs.
             along: The rows along the surfaces, near the start.
 
         Raises:
-            ScenarioError: A name means none of them, or they are too many.
+            ScenarioError: A name has no row, or there are too many.
         """
         self.scenario, self.candidates = scenario, candidates
         self.given, self.missing = given, missing
@@ -64,7 +63,7 @@ class ReferredRows:
         self.rows = [*range(given), *beside]
 
     def _named(self, name: str) -> list[int | None]:
-        """The rows that a key of the references means; None for a force."""
+        """The rows of a key of the references; None for a force."""
         key, found = f"references.{name}", list[int | None]()
         for part in map(str.strip, name.split(",")):
             found += self._meant(part, key)
@@ -85,7 +84,7 @@ class ReferredRows:
                 raise ScenarioError((key, str(error))) from None
         else:
             return [place if place < self.given else None for place in places]
-        # A name of no output yet: of rows that may complete them.
+        # Not yet an output: one of the rows that may complete them.
         along = [signals[row] for row in self._along]
         beside = [*along, *(one for one in signals[self.given :] if one not in along)]
         own = [one for one in along if one.rpartition(".")[0] == name]

@@ -1,4 +1,4 @@
-"""Where a robot can start: inverse kinematics with any constraints, by many tries."""
+"""Search for a start: inverse kinematics with constraints, from many guesses."""
 
 from collections.abc import Sequence
 
@@ -8,16 +8,16 @@ from drake_dae.arrays import FloatArray
 from drake_dae.scenario.completion.postures import EXACT, Posture, Postures
 
 TRIES = 60
-"""How many guesses a search takes; an arm of seven joints has some forty solutions among them."""
+"""The number of guesses; an arm of seven joints has about forty solutions among them."""
 
 PATIENCE = 20
-"""After so many tries without any result a search ends: one that fails takes long."""
+"""A search ends after this many guesses without a result, since failed ones take long."""
 
 _CLOSEST = 3
-"""From so many of the guesses the nearest is sought of what is out of reach."""
+"""The number of guesses for the nearest posture of an unreachable target."""
 
 _HARD = 100.0
-"""By this factor constraints weigh more than outputs where not all can be had."""
+"""The weight of constraints relative to outputs if not all can be satisfied."""
 
 
 def near_posture(
@@ -39,11 +39,11 @@ def best_posture(
         postures: The robot.
         rows: The rows.
         wanted: Their values, shape (len(rows),).
-        guesses: Where to start.
+        guesses: The guesses.
 
     Returns:
-        That with the largest `quality`, the first of equals; None if the first `PATIENCE` guesses
-        lead to none.
+        The one with the largest `quality`, the first of equal ones; None if the first `PATIENCE`
+        guesses give none.
     """
     found: list[Posture] = []
     for count, guess in enumerate(guesses):
@@ -61,7 +61,7 @@ def nearest_posture(
 
     The arguments are those of `best_posture`.
     """
-    from scipy.optimize import least_squares  # Loads what no other run needs.
+    from scipy.optimize import least_squares  # Imported here, since few runs need it.
 
     chosen = list(rows)
     low = np.where(np.isfinite(postures.low), postures.low, -np.inf)

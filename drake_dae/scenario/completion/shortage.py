@@ -1,4 +1,4 @@
-"""Why positions cannot complete some outputs: dependent force outputs, or too few."""
+"""Reasons why outputs cannot be completed: dependent force outputs, or too few positions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from drake_dae.scenario.completion.choice import INDEPENDENT, first_independent
 from drake_dae.scenario.completion.postures import Posture
 
 _ZERO = 1e-6
-"""A singular value of S(q) below it, relative to the largest, is zero; rows are of order one."""
+"""A singular value of S(q) below this, relative to the largest, is zero."""
 
 
 def check_independent(names: Sequence[str], posture: Posture) -> None:
@@ -21,7 +21,7 @@ def check_independent(names: Sequence[str], posture: Posture) -> None:
         posture: A configuration on the constraints.
 
     Raises:
-        ScenarioError: They do; it names those that do, and how many are independent.
+        ScenarioError: They do; the message names them.
     """
     if not len(posture.forces):
         return
@@ -52,7 +52,7 @@ def why_none(
     given: int,
     forces: Sequence[str],
 ) -> tuple[str, str] | None:
-    """The key and the text for outputs that must be forces, since positions are too few.
+    """The key and text of the problem if outputs must be forces, for lack of positions.
 
     Args:
         posture: The start.
@@ -63,7 +63,7 @@ def why_none(
         forces: The names of the constraint forces.
 
     Returns:
-        None if there are positions enough.
+        None if there are enough positions.
     """
     ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
     lacking = given + missing - ways

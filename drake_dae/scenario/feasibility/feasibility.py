@@ -62,7 +62,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         scenario,
         plant=IdealConstraints(),
         plant_payloads=[],
-        plant_pushes=[],
+        plant_disturbances=[],
         encoders=None,
         observer=None,
         tolerances=None,

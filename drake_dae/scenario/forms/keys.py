@@ -49,7 +49,7 @@ _REMEDIES = {
     Cause.NUMBERS: (
         "The structure must be the same for all numbers that the robot may have. Give such a "
         "number another value where it is written, away from the one at which it changes, or "
-        "choose another output or constraint"
+        "say under bounds between which values it stays; or choose another output or constraint"
     ),
     Cause.CONTROL_RANK: (
         "An output may repeat a constraint or another output; choose others. Or the robot is in a "

@@ -76,3 +76,6 @@ Pair = Annotated[Row, pydantic.Field(min_length=2, max_length=2)]
 
 Triple = Annotated[Row, pydantic.Field(min_length=3, max_length=3)]
 """Three numbers."""
+
+Interval = Annotated[tuple[float | list[float], float | list[float]], pydantic.Strict(False)]
+"""A lowest and a highest value, each a number or a list of numbers."""

@@ -22,7 +22,7 @@ from drake_dae.scenario.feasibility.report import Feasibility
 from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.new.places import find_places
 from drake_dae.scenario.new.robot import NewRobot, new_robot
-from drake_dae.scenario.new.task import SurfaceKind, Task, circle
+from drake_dae.scenario.new.task import NewTask, SurfaceKind, circle
 from drake_dae.scenario.new.text import scenario_text
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.robot_file.links import robot_links
@@ -74,7 +74,7 @@ def new_scenario(
     robot = new_robot(file if is_url or not file else str(Path(file).resolve()), tip, point)
     links, _ = robot_links(robot.robot, SceneGraph())
     tried: list[str] = []
-    usable: tuple[Scenario, Task, Feasibility] | None = None
+    usable: tuple[Scenario, NewTask, Feasibility] | None = None
     places = find_places(links, robot.tip, robot.point)[:_PLACES]
     for share, place in product(_SHARES, places):
         task = circle(place, surface, share)
@@ -119,7 +119,7 @@ def _beside(found: Feasibility) -> tuple[str, ...]:
     return tuple(assumption.reason for assumption in rank)
 
 
-def _scenario(robot: NewRobot, task: Task, links: Links) -> Scenario:
+def _scenario(robot: NewRobot, task: NewTask, links: Links) -> Scenario:
     """The task of a robot, its outputs left open."""
     names = [signal.name for signal in links.position_signals]
     stem = Path(robot.robot.file).name.split(".")[0]

@@ -41,7 +41,7 @@ _SLOW = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class TipPlace:
     """A place for a surface.
 
     Attributes:
@@ -77,7 +77,7 @@ class Place:
         return (normal[0], normal[1], normal[2])
 
 
-def find_places(links: Links, tip: str, point: Vector) -> list[Place]:
+def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
     """The best place for each direction of a surface, the most liked first.
 
     Each is the best of some postures with the tool normal to the surface, where that can be had: by
@@ -131,7 +131,7 @@ class _Search:
         self._efforts = np.where(efforts > 0.0, efforts, np.inf)
         self._guesses = self._postures.guesses(_TRIES)
 
-    def best(self, axis: int, sign: float) -> Place | None:
+    def best(self, axis: int, sign: float) -> TipPlace | None:
         """The best place for a surface with a normal, None if none is any good."""
         tilts = [3 + 2 * axis, 4 + 2 * axis]
         aligned: list[Posture] = []
@@ -146,7 +146,7 @@ class _Search:
         good = [place for place in found if place is not None]
         return max(good, key=lambda one: one.quality * one.directions, default=None)
 
-    def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> Place | None:
+    def _place(self, axis: int, sign: float, posture: Posture, worth: float) -> TipPlace | None:
         """The place of a posture, None where the tip cannot move along the surface."""
         tilts = [3 + 2 * axis, 4 + 2 * axis]
         first = [k for k in range(3) if k != axis]
@@ -156,7 +156,7 @@ class _Search:
             return None
         quality = posture.independence(rows) * self._postures.margin(posture.q)
         quality *= worth * self._surroundings(posture, axis, sign)
-        return Place(
+        return TipPlace(
             posture.rows[:3],
             axis,
             sign,

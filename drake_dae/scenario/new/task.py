@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.dae.references import CircleReference, SinusoidReference
 from drake_dae.robots.surfaces.surface import Surface, Vector
 from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
-from drake_dae.scenario.new.places import Place
+from drake_dae.scenario.new.places import TipPlace
 
 SurfaceKind = Literal["plane", "cylinder", "sphere"]
 
@@ -23,7 +23,7 @@ _RADIUS, _BEND, _FORCE = 0.08, 0.4, 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class NewTask:
     """A circle on a surface.
 
     Attributes:
@@ -36,7 +36,7 @@ class Task:
         force: How hard the tip presses, N.
     """
 
-    place: Place
+    place: TipPlace
     name: str
     surface: Surface
     center: Vector
@@ -61,7 +61,7 @@ class Task:
         return "circle" if len(self.place.ways) > 1 else "line"
 
 
-def circle(place: Place, kind: SurfaceKind, share: float) -> Task:
+def circle(place: TipPlace, kind: SurfaceKind, share: float) -> NewTask:
     """A circle at a place, of a share of the usual radius and force."""
     decimals = 2 if place.size > 0.3 else 3
     x, y, z = (round(float(value), decimals) + 0.0 for value in place.point)
@@ -80,11 +80,11 @@ def circle(place: Place, kind: SurfaceKind, share: float) -> Task:
         if len(place.ways) == 1:
             axis = [float(k not in (place.axis, *place.ways)) for k in range(3)]
         surface: Surface = Cylinder(inner, (axis[0], axis[1], axis[2]), bend)
-        return Task(place, "pipe", surface, center, radius, period, force)
+        return NewTask(place, "pipe", surface, center, radius, period, force)
     if kind == "sphere":
-        return Task(place, "ball", Sphere(inner, bend), center, radius, period, force)
+        return NewTask(place, "ball", Sphere(inner, bend), center, radius, period, force)
     name = {1.0: "table", -1.0: "ceiling"}[place.sign] if place.axis == 2 else "wall"
-    return Task(place, name, Plane(center, place.normal), center, radius, period, force)
+    return NewTask(place, name, Plane(center, place.normal), center, radius, period, force)
 
 
 def _round_number(value: float) -> float:

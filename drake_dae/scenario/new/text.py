@@ -10,7 +10,7 @@ from typing import Any
 
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.new.robot import NewRobot
-from drake_dae.scenario.new.task import Task
+from drake_dae.scenario.new.task import NewTask
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
 _PLAIN = re.compile(r"[A-Za-z_][\w/-]*(?:\.[\w/-]+)*")
@@ -33,7 +33,7 @@ _WHY = {
 }
 
 
-def scenario_text(scenario: Scenario, robot: NewRobot, task: Task, folder: Path) -> str:
+def scenario_text(scenario: Scenario, robot: NewRobot, task: NewTask, folder: Path) -> str:
     """The text of a new scenario.
 
     Args:
@@ -49,7 +49,7 @@ def scenario_text(scenario: Scenario, robot: NewRobot, task: Task, folder: Path)
     return "\n".join(_lines(data, robot, task)) + "\n"
 
 
-def _lines(data: Mapping[str, Any], robot: NewRobot, task: Task) -> Iterator[str]:
+def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[str]:
     yield "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m."
     yield "# `drake-dae analyze FILE` tells how far limits and singularities are,"
     yield "# `drake-dae simulate FILE` runs it, and with --meshcat it is seen in a browser."

@@ -8,7 +8,7 @@ from casadi import SX
 from numpy.typing import ArrayLike
 
 from drake_dae.dae import references
-from drake_dae.robots import actuation, force_outputs, loads, outputs
+from drake_dae.robots import actuation, force_outputs, known_forces, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.surfaces import implicit, maps, surface, surfaces
 from drake_dae.scenario import plants
@@ -19,7 +19,7 @@ from drake_dae.scenario.parts import written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import pushes
+from drake_dae.systems.plants.contact import disturbance_forces
 from drake_dae.systems.sensing import encoders, tolerances
 from drake_dae.systems.task import phases
 
@@ -86,9 +86,9 @@ Reference = Annotated[
     | Annotated[references.TextReference, Form(tag="!Text")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
-Load = Annotated[loads.KnownForce, Form(_WRITTEN)]
+Load = Annotated[known_forces.KnownForce, Form(_WRITTEN)]
 Payload = Annotated[payloads.Payload, Form()]
-Push = Annotated[pushes.Push, Form(_WRITTEN)]
+DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     plants.IdealConstraints | plants.MultibodyPlant | plants.Unilateral | plants.OwnPlant,

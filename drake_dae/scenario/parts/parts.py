@@ -57,14 +57,14 @@ class MeasuredForce:
 
 @dataclass(frozen=True)
 class Observer(Observing):
-    """How a `systems.observer.DisturbanceObserver` observes what the law's model lacks.
+    """The settings of a `DisturbanceObserver` of model errors.
 
     Attributes:
-        friction: The names of constraints whose coefficient of friction is identified, from that
-            which they have here on: 0 where nothing is known.
+        identify_friction: The names of constraints whose coefficient of friction is identified;
+            identification starts at their own coefficient, 0 if it is unknown.
     """
 
-    friction: list[str] = field(default_factory=list)
+    identify_friction: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

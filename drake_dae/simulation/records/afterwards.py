@@ -24,7 +24,7 @@ class Estimate(Protocol):
         """The state that the controller gets."""
 
 
-class Loop(Protocol):
+class RecordedLoop(Protocol):
     """A diagram with named parts, as a `ClosedLoop`; see there."""
 
     @property
@@ -56,7 +56,7 @@ class Loop(Protocol):
         """What measured the state for the law, or None."""
 
 
-def completed(logged: Record, loop: Loop, context: Context) -> Record:
+def completed(logged: Record, loop: RecordedLoop, context: Context) -> Record:
     """A record with what follows from what was logged of a loop.
 
     Args:
@@ -84,7 +84,7 @@ def completed(logged: Record, loop: Loop, context: Context) -> Record:
 
 
 def _control_along(
-    loop: Loop, context: Context, times: FloatArray, given: dict[str, FloatArray]
+    loop: RecordedLoop, context: Context, times: FloatArray, given: dict[str, FloatArray]
 ) -> FloatArray:
     """The control of a law that acts at once: a function of what else is known."""
     plant, controller, law = loop.plant, loop.controller, loop.controller.law
@@ -114,7 +114,7 @@ def _control_along(
 
 
 def _parameters_along(
-    loop: Loop, block: Plant | Controller, context: Context, times: FloatArray
+    loop: RecordedLoop, block: Plant | Controller, context: Context, times: FloatArray
 ) -> FloatArray:
     """The parameters of a block at each time, those that move as they did."""
     values = block.parameters_along(block.GetMyContextFromRoot(context), times)
@@ -124,7 +124,7 @@ def _parameters_along(
     return values
 
 
-def _refuse_fixed_ports(loop: Loop, context: Context) -> None:
+def _refuse_fixed_ports(loop: RecordedLoop, context: Context) -> None:
     plant, taker = loop.plant, loop.controller
     own = taker.GetMyContextFromRoot(context)
     source = plant.GetOutputPort("state") if loop.encoders is None else loop.encoders.output

@@ -64,7 +64,7 @@ def end_at_once(number: signal.Signals) -> None:
     raise KeyboardInterrupt(number)
 
 
-class Ending:
+class Interruption:
     """Remembers the first signal, instead of an exception in the middle of a step.
 
     Attributes:

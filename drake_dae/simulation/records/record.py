@@ -4,7 +4,7 @@ import csv
 import html
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -112,6 +112,18 @@ class Record:
             return "empty"
         events = f", {len(self.events)} events" if self.events else ""
         return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s{events}"
+
+    def after(self, time: float | None) -> Self:
+        """What was recorded later than a time in s; all for None."""
+        if time is None:
+            return self
+        first = int(np.searchsorted(self.time, time, side="right"))
+        signals = {
+            name: Recorded(recorded.values[first:], recorded.signals)
+            for name, recorded in self.signals.items()
+        }
+        events = tuple(event for event in self.events if event.time > time)
+        return type(self)(self.time[first:], signals, events, self.about)
 
     def while_finite(self) -> Self:
         """The record up to the first moment at which some signal is not finite."""
@@ -260,6 +272,10 @@ class Record:
         except Exception as error:  # Those of zip files, of NumPy's headers and of JSON are many.
             text = getattr(error, "strerror", None) or error
             raise ModelError(f"{path} is not a record of a run: {text}") from None
+
+
+RecordAfter = Callable[[float | None], Record]
+"""From a time in s, or None, to what a run has recorded later."""
 
 
 def _label(signal: Signal) -> str:

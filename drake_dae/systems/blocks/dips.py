@@ -5,7 +5,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 
 TOUCHING = 1e-11
-"""A gap below this, in m, is none: such contacts touch at once."""
+"""A gap below this, in m, counts as closed."""
 
 
 def lowest(

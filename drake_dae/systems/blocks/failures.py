@@ -8,12 +8,12 @@ import numpy as np
 from drake_dae.arrays import FloatArray, show_state
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.contacts import jam
+from drake_dae.dae.system.contacts import painleve_outcome
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import (
     InconsistentStateError,
-    JammedContactError,
     NonFiniteError,
+    PainleveError,
     SimulationError,
     SingularityError,
 )
@@ -198,23 +198,23 @@ def jammed_contact(
     control: FloatArray,
     parameters: FloatArray,
     force: FloatArray,
-) -> JammedContactError | None:
-    """Where friction jams a contact, that, and whether any motion fits; None where it does not.
+) -> PainleveError | None:
+    """The error of a Painleve paradox with its outcome; None if there is none.
 
     Args:
-        structure: The structure of the system that rubs.
+        structure: The structure of the system.
         error: What says that A(x) is singular, with time and state.
         control: u, shape (p,).
         parameters: Values of all parameters.
         force: v there, shape (m,).
     """
     dae, elimination = structure.system, structure.elimination
-    rubbing, matrix = dae.rubbing, elimination.constraint_matrix
+    frictional, matrix = dae.frictional_contacts, elimination.constraint_matrix
     outputs = {
         "A": ca.densify(matrix),
-        "A_0": ca.densify(rubbing.without_friction(matrix)),
+        "A_0": ca.densify(frictional.without_friction(matrix)),
         "gradient": elimination.constraint_gradient,
-        "reserve": rubbing.reserve(matrix),
+        "reserve": frictional.reserve(matrix),
     }
     values = dae.trace("A(x)", outputs, often=False)(error.state, parameters)
     m, reserve = dae.num_constraints, values[3].item()
@@ -225,12 +225,12 @@ def jammed_contact(
     free = np.abs(fields["f"])
     if control.size:
         free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(control)
-    found = jam(A, A_0, force, np.abs(gradient) @ free, rubbing.rows)
-    names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in rubbing.rows)
+    found = painleve_outcome(A, A_0, force, np.abs(gradient) @ free, frictional.rows)
+    names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in frictional.rows)
     outcome = f". What becomes of it is {found.value}" if found else ""
-    return JammedContactError(
-        f"{dae.name}: friction jams the contact of {names} at t = {error.time:.6g} s, "
-        f"state {show_state(error.state)} (Painleve): a principal minor of A(x) has come to "
+    return PainleveError(
+        f"{dae.name}: Painleve paradox at the contact of {names} at t = {error.time:.6g} s, "
+        f"state {show_state(error.state)}: a principal minor of A(x) has come to "
         f"{reserve:.2g} of what it is without friction{outcome}. Lower the friction, slide the "
         "other way, or hold the robot less steeply to the surface",
         error.time,

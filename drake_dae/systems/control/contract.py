@@ -1,6 +1,6 @@
-"""What every controller of a loop keeps: the rules that wiring, records and starts use."""
+"""The contract of a controller: the rules for wiring, records and starts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,39 +22,44 @@ from drake_dae.systems.plants.contract import NOWHERE, Plant
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
 else:
-    System = object  # As for plants: pybind11 has a metaclass of its own.
+    System = object  # pybind11 has its own metaclass, as for plants.
 
 Derived = dict[str, tuple[FloatArray, tuple[Signal, ...]]]
 """Name of a signal -> its values, one row for each time, and their names and units."""
+
+Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
+"""Outputs z, what they should be, both of shape (k,), and their names and units."""
 
 
 @checked(ModelError)
 class Controller(System):
     """The contract of a controller: a Drake System that computes the control of a plant.
 
-    A controller is a LeafSystem or a Diagram that takes this class as its last base. What it does
-    not say itself is as it stands here.
+    A controller is a LeafSystem or a Diagram with this class as its last base. The defaults here
+    apply to everything that it does not override.
 
-    1. What it reads. The input port `estimated_state` is x, shape (n,). It has further input ports
-       as far as it needs them: `reference` (R of its `law`), `measured_force` (all constraint
-       forces), `exogenous` (as of a `Plant`), and `hold` (one entry for each integral of `law`,
-       which stands still where it is not 0).
-    2. What it gives. The output port `control` is u, shape (p,). `further_signals` names the output
-       ports that a record has besides, with names and units; `shown` names those that a loop
-       exports and no record has.
+    1. Inputs. The input port `estimated_state` is x, shape (n,). Further input ports, if needed:
+       `reference` (R of its `law`), `measured_force` (all constraint forces), `exogenous` (as of a
+       `Plant`), and `hold` (one entry for each integral of `law`, which is not updated while it is
+       not 0).
+    2. Outputs. The output port `control` is u, shape (p,). `further_signals` are the other output
+       ports in a record, with names and units; `shown` are those that a loop exports without
+       recording them.
     3. Laws. `law` is the tracking law that acts in contact, of a system of the plant's sizes, and
-       `all_parameters` what its function takes as parameters. `set_gains` changes its gains in a
-       context; a controller whose gains are fixed when it is made refuses.
-    4. Plants and parts. `check_plant` refuses a plant that the controller is not for. `refused`
-       names the settings of a loop that it cannot be wired with, each with a sentence.
-    5. What is computed afterwards. With `follows` its control is a function of the logged state,
-       the reference, the forces, the integrals and its parameters: `law.function`. Otherwise it is
-       logged. `derived` is what else a record has of it, from the other signals.
-    6. Theory. `predicted_error` is what the tracking error of a record should be.
-    7. Starts. With `takes_over` its references begin with the outputs that the robot has then;
-       otherwise they come from a generator, and a run begins where that begins. A run begins on the
-       manifold of `start_structure`.
-    8. Phases. `changes` tells when the phases of a run began, and why; none where there are none.
+       `all_parameters` are the parameters of its function. `set_gains` changes its gains in a
+       context; a controller with fixed gains refuses.
+    4. Plants and parts. `check_plant` refuses a plant that does not fit. `refused` are the settings
+       of a loop that it does not support, each with a sentence.
+    5. Computed afterwards. With `follows` its control is `law.function` of the logged state,
+       reference, forces, integrals and parameters. Otherwise it is logged. `derived` are further
+       signals of a record, computed from the others. `compared` are outputs and their references
+       now, for the check of divergence.
+    6. Theory. `predicted_error` is the predicted tracking error of a record.
+    7. Starts. With `takes_over` its references start at the current outputs; otherwise they come
+       from a generator, and a run starts at their start. A run starts on the manifold of
+       `start_structure`.
+    8. Phases. `changes` are the times at which phases of a run began, with reasons; empty without
+       phases.
     """
 
     __slots__ = ()
@@ -69,16 +74,16 @@ class Controller(System):
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        """Name of an output port that a record has besides -> names and units of its entries."""
+        """Name of a further output port in a record -> names and units of its entries."""
         return {}
 
     @property
     def start_structure(self) -> ConstraintStructure:
-        """The structure whose manifold a run begins on."""
+        """The structure on whose manifold a run starts."""
         return self.law.structure
 
     def all_parameters(self, context: Context) -> FloatArray:
-        """What the law's function takes as parameters: the model's at the context's time, and K."""
+        """The parameters of the law's function: the model's at the context's time, and K."""
         return self.law.all_parameters()
 
     def current_parameters(self, context: Context) -> FloatArray:
@@ -86,7 +91,7 @@ class Controller(System):
         return self.law.system.parameter_values
 
     def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """What the law's function took as parameters at the times of a run, one row for each."""
+        """The parameters of the law's function at the times of a run, one row for each."""
         return np.tile(self.all_parameters(context), (np.size(times), 1))
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
@@ -94,15 +99,15 @@ class Controller(System):
 
         Raises:
             GainError: The gains do not fit.
-            ModelError: The gains of this controller are fixed when it is made.
+            ModelError: The gains of this controller are fixed.
         """
         raise ModelError(f"the gains of a {type(self).__name__} are fixed when it is made")
 
     def check_plant(self, plant: Plant) -> None:
-        """Refuses a plant that the controller is not for.
+        """Refuses a plant that does not fit the controller.
 
         Raises:
-            WiringError: Why, and what would fit.
+            WiringError: The plant does not fit; the message has the reason.
         """
         check_law(plant.dae, self.law)
 
@@ -112,20 +117,37 @@ class Controller(System):
         times: FloatArray,
         values: Mapping[str, FloatArray],
     ) -> Derived:
-        """What follows of a record: its desired outputs, errors and others.
+        """Derived signals of a record: desired outputs, errors and others.
 
         Args:
-            context: The context of this system after the run; None where there was none.
+            context: The context of this system after the run, or None.
             times: The times of the record, in s, shape (k,).
             values: The other signals of the record and the plant's "parameters", one row for each
                 time.
         """
         return {}
 
+    def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
+        """The outputs now and what they should be, with their names; None where nobody tells it.
+
+        Args:
+            context: The context of this system.
+            shown: Name of a signal of the plant, such as "controlled_output" -> its value.
+        """
+        if (reference := self.reference_now(context)) is None:
+            return None
+        law = self.law
+        return shown("controlled_output"), reference[law.layout.lowest], law.system.output_signals
+
+    def reference_now(self, context: Context) -> FloatArray | None:
+        """R: what is wired or fixed, or what the references are by themselves; None without any."""
+        port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
+        return port.Eval(context) if port is not None and port.HasValue(context) else None
+
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """The tracking error that theory predicts, one row for each time.
+        """The predicted tracking error, one row for each time.
 
         Args:
             times: The times of the record, in s, shape (k,).
@@ -135,7 +157,7 @@ class Controller(System):
         raise NotImplementedError
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
-        """When each phase of a run began, and why."""
+        """The start of each phase of a run, with the reason."""
         return ()
 
 
@@ -147,23 +169,23 @@ def check_law(own: DaeSystem, law: TrackingLaw) -> None:
         law: The law.
 
     Raises:
-        WiringError: It is.
+        WiringError: The sizes differ.
     """
     remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
     check_same_sizes(own, law.system, "law", f"{remedy} a model of the same structure")
 
 
 def check_same_sizes(own: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
-    """Refuses what is for a system of another size than the plant's.
+    """Refuses a law or model for a system of another size than the plant's.
 
     Args:
         own: The plant's system.
-        other: What it is for.
-        what: What is wired to the plant.
-        remedy: What to make instead.
+        other: The system that it is for.
+        what: The name of the wired part.
+        remedy: The remedy.
 
     Raises:
-        WiringError: It is.
+        WiringError: The sizes differ.
     """
     sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (own, other)]
     if sizes[0] != sizes[1]:

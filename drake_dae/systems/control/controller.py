@@ -50,33 +50,32 @@ class TrackingController(ParameterizedSystem, Controller):
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, one entry per output.
         integral: The integrals of errors, shape (k,), if the law has any; its state. They start at
-            zero, or where `set_integral` puts them. Where an entry of `hold` is not 0, or an
-            integral has come to its limit and its error would carry it on, it stays (anti-windup).
+            zero, or at the values of `set_integral`. An integral is not updated while its entry of
+            `hold` is not 0, or while it is at its limit and its error would increase it
+            (anti-windup).
 
         feedback: The law with its references and parameters as a value, for the port `feedback` of
-            a `DaePlant`; if asked for.
+            a `DaePlant`; with feedback=True.
 
-    A law with integrals also has an input port `hold`, shape (k,): where it is not 0 that error is
-    not integrated, as while a drive is at its limit or a contact is lost. Without a wire it is 0.
+    A law with integrals also has an input port `hold`, shape (k,): an error is not integrated while
+    its entry is not 0, for example while a drive is at its limit or a contact is lost. Without a
+    wire it is 0.
 
-    The first two output ports have direct feedthrough from all input ports, but for `hold`, and for
-    `measured_force` where the law does but integrate it. The context holds the model's
-    parameters and then the gains as one numeric parameter; see `set_parameter` and `set_gains`.
-    The block converts to AutoDiffXd.
+    The first two output ports have direct feedthrough from all input ports except `hold`, and
+    except `measured_force` if the law only integrates it. Numeric parameter 0 holds the model's
+    parameters and then the gains. The block converts to AutoDiffXd.
 
     Args:
         law: The law.
         outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
         integral_limits: The largest |integral| of each error in its unit times s, a number or shape
-            (k,), positive. Converted to AutoDiffXd it has neither limits nor holds, and a force
-            that it integrates has direct feedthrough, so that it must come from a sensor.
-        sample_period: Integrals are sums of the errors at the multiples of this time in s, as those
-            of a `Sampling`, and do not convert; 0 for integrals by the integrator. An integrator
-            has no use for a discrete plant, whose state jumps while time goes on.
-        references: What R is where the port `reference` has no wire; None if it needs one.
-        feedback: Whether there is an output port `feedback`, for a law that takes the state and
-            `references` alone. The plant then sees what is a trial, and which parameters the law
-            had; the other ports are there to be looked at, and raise at trials too.
+            (k,), positive. Converted to AutoDiffXd there are no limits and no `hold`, and an
+            integrated force must come from a sensor.
+        sample_period: The sample period of integrals in s, as for discrete plants; they then do
+            not convert. 0 for continuous integrals.
+        references: R if the port `reference` has no wire; None if it needs one.
+        feedback: Whether there is an output port `feedback`, for a law that takes only the state
+            and `references`. The other ports are then for logging.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
@@ -91,9 +90,9 @@ class TrackingController(ParameterizedSystem, Controller):
     follows, shown = True, ("tracking_error",)
 
     def __new__(cls, *arguments: Any, **named: Any) -> Self:
-        """A controller of a class with a time derivative, where its integrals are continuous."""
+        """Uses a class with a time derivative if the integrals are continuous."""
         law = arguments[0] if arguments else named.get("law")
-        integral = getattr(law, "integral", None)  # __init__ refuses what is no law.
+        integral = getattr(law, "integral", None)  # __init__ refuses anything else than a law.
         if integral is None or not integral.outputs or named.get("sample_period"):
             return super().__new__(cls)
         return super().__new__(_integrating(cls))  # type: ignore[arg-type]
@@ -126,7 +125,7 @@ class TrackingController(ParameterizedSystem, Controller):
         if references is not None:
             self._reference_at = references.function
             self._reference_port = self.GetInputPort("reference")
-            self._evaluators[1] = weakly(self._reference)
+            self._evaluators[1] = weakly(self.reference_now)
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         if law.integral.outputs:
@@ -157,7 +156,8 @@ class TrackingController(ParameterizedSystem, Controller):
         self._hold = self.DeclareVectorInputPort("hold", count)
         if sample_period:
             self.DeclareDiscreteState(count)
-            # Unrestricted, as the step of a discrete MultibodyPlant: so both see one instant.
+            # Unrestricted, as the step of a discrete MultibodyPlant, so that both see the same
+            # instant.
             self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sum))
             tickets = {self.xd_ticket()}
         else:
@@ -166,7 +166,7 @@ class TrackingController(ParameterizedSystem, Controller):
         self._evaluators.append(weakly(self._integrals))
         self._rate_evaluators = list(self._evaluators)
         if self.law.measured_force and not self.law.control_takes_force:
-            # Whatever it is: reading it would close an algebraic loop.
+            # Any value: reading it would close an algebraic loop.
             nothing = np.zeros(self.dae.num_constraints)
             self._evaluators[2] = lambda context: nothing
         self.DeclareVectorOutputPort("integral", count, weakly(self._copy_integrals), tickets)
@@ -177,7 +177,7 @@ class TrackingController(ParameterizedSystem, Controller):
         return tickets | {self.all_parameters_ticket()}
 
     def set_integral(self, context: Context, integral: ArrayLike) -> None:
-        """Starts the integrals of the errors at values, shape (k,).
+        """Sets the initial integrals of the errors, shape (k,).
 
         Raises:
             ModelError: The shape is wrong, or the law has no integrals.
@@ -256,7 +256,7 @@ class TrackingController(ParameterizedSystem, Controller):
 
     def _evaluate(self, context: Context) -> tuple[FloatArray, ...]:
         function = self.law.function
-        if self._is_plain:  # The same without a call more, where it has values.
+        if self._is_plain:  # The same as above, but without another call.
             of_state, of_reference = self._evaluators
             state, reference = of_state(context), of_reference(context)
             x, r, parameters = function.arguments
@@ -290,15 +290,14 @@ class TrackingController(ParameterizedSystem, Controller):
 
         value.set_value(Feedback(self.law.function, reference, parameters, self._signals))
 
-    def _reference(self, context: Context) -> FloatArray:
-        """R: what is wired or fixed, or what the references are at the context's time."""
-        if self._reference_port.HasValue(context):
-            return self._reference_port.Eval(context)
+    def reference_now(self, context: Context) -> FloatArray | None:
+        if self._references is None or self._reference_port.HasValue(context):
+            return super().reference_now(context)
         return self._reference_at(context.get_time())
 
     @property
     def references_by_time(self) -> Formula | None:
-        """What R is where the input port `reference` has no wire; None if it needs one."""
+        """R if the input port `reference` has no wire; None if it needs one."""
         return None if self._references is None else self._references.formulas["reference"]
 
     def _integrals(self, context: Context) -> FloatArray:
@@ -341,7 +340,7 @@ class TrackingController(ParameterizedSystem, Controller):
 def _integrating(kind: type[TrackingController]) -> type[TrackingController]:
     """A class of controllers with a time derivative.
 
-    Drake would ask those for one too that have no state: a tenth of a short step.
+    Drake would otherwise call it also without a state, which takes 10 % of a short step.
     """
 
     def rate(self: TrackingController, context: Context, derivatives: ContinuousState) -> None:

@@ -1,4 +1,4 @@
-"""Drives that give no more than their limits."""
+"""Drives with limited control."""
 
 import casadi as ca
 import numpy as np
@@ -13,23 +13,22 @@ from drake_dae.systems.blocks.traced import Block, Computation
 
 @checked(ModelError)
 class ControlLimits(LeafSystem):
-    """Cuts each control at its limit, and tells what it cut off.
+    """Limits each control, and reports the excess.
 
     Input port:
-        control: What is wanted, shape (p,).
+        control: The wanted control, shape (p,).
 
     Output ports:
-        control: What the drives give, max(-limit, min(limit, control)), shape (p,).
-        excess: What is missing, wanted less given, shape (p,): 0 within the limits. A log of it
-            tells when.
-        is_limited: 1 while something is missing, else 0, shape (1,); for the `hold` of a
+        control: The limited control, max(-limit, min(limit, control)), shape (p,).
+        excess: Wanted minus limited control, shape (p,): 0 within the limits.
+        is_limited: 1 while any control is limited, else 0, shape (1,); for the `hold` of a
             `TrackingController` with integrals.
 
     Args:
-        limits: The largest |control|, shape (p,), positive; infinite where there is none.
+        limits: The largest |control|, shape (p,), positive; infinite without a limit.
 
     Raises:
-        ModelError: A limit is not positive, or there is none at all.
+        ModelError: A limit is not positive, or there are no limits.
     """
 
     __slots__ = SHARED_DICTIONARY

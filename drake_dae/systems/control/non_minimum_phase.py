@@ -1,4 +1,4 @@
-"""A warning where a law leaves states to unstable zero dynamics.                         (35)"""
+"""A warning for laws with unstable zero dynamics.                                        (35)"""
 
 import warnings
 
@@ -11,7 +11,7 @@ from drake_dae.errors import NonMinimumPhaseWarning
 
 
 def warn_of_zero_dynamics(law: TrackingLaw, outputs: ArrayLike | None) -> None:
-    """Warns whoever makes the block of a law whose zero dynamics (35) are unstable.
+    """Warns if the zero dynamics (35) of a law are unstable.
 
     Args:
         law: The law.

@@ -1,4 +1,4 @@
-"""An observer of what a model lacks: a disturbance, and coefficients of friction."""
+"""An observer of model errors: a disturbance, and coefficients of friction."""
 
 from collections.abc import Sequence
 
@@ -26,62 +26,34 @@ _READ = ("estimated_state", "measured_force", "reference")
 class DisturbanceObserver(ParameterizedSystem):
     """Observes the disturbance d of E x' = f + S d + g v + h u, and identifies friction.
 
-    At each sample, T apart, the momentum p = S^T E x tells what acted besides what is known,
+    With the momentum p = S^T E x a sample of d is, for samples T apart,
 
         d_k = (p_k - p_(k-1)) / T - mean((S^T E)' x + S^T f) - S^T (h u + g v),
 
-    of which r is low-passed with the rate k_o, r_k = e^(-k_o T) r_(k-1) + (1 - e^(-k_o T)) d_k: a
-    constant d is found as 1 - e^(-k_o t), and noise n of the velocities, with M the mass, leaves
-    about k_o M n of noise in r. That part of d which the constraints answer, d - Q d with Q of
-    `Observation`, is found with the rate k_n = `force_rate`: it makes no motion, but its noise
-    makes force.
-
-    Behind springs, motors or valves a law needs n derivatives of d, of which the differences of
-    d_k would be noise. There r is what n + 1 such lags leave, one behind the other, r =
-    (k_o / (s + k_o))^(n+1) d, which has them exactly; see `Lags`.
-
-    A coefficient of friction takes the share that r has of the force of friction c = S^T dg/dmu v,
+    whose low-pass r with the rate k_o is the estimate; its part along the constrained directions
+    has the rate k_n. A constant d is reached as 1 - e^(-k_o t); velocity noise n leaves noise of
+    about k_o M n in r. With flexible joints or motors the law needs derivatives of r: then r is
+    the output of several lags in series, see `Lags`. With c = S^T dg/dmu v, friction takes its
+    share of r,
 
         mu' = k_f (c . r) / (c . c),    r' = k_o (d - r) - c mu',
 
-    in the metric of kinetic energy, in the directions that the constraint leaves. So r + c mu
-    follows what acts with the rate k_o, whatever k_f is, and no motion tells when the share is
-    handed over: nor do the derivatives that are told, r', r'', ... without the share and mu' = 0,
-    of whose errors c mu' and -c mu' the sum is zero. Friction that is identified acts at once where
-    the force or the direction changes; r is late by 1 / k_o. mu stays between 0 and
-    `largest_friction`, and stands still where the contact is pressed by less than `least_force`;
-    also while the input `hold` is not 0. r needs no hold: it has the control that acts, also at its
-    limits, and the force that is measured, also where a contact is open.
-
-    Below `least_speed` a contact may stick, and its friction is a reaction like the constraint's:
-    no motion tells it, nor its coefficient. Then mu stands still, and so does r in the directions
-    in which the contact slides; in the others it goes on. Else r would take up what holds a tool
-    that turns, 2 mu lambda within a sample or two, and give it back for 1 / k_o. The integrals of
-    the law go on, so that what friction holds off its place comes there in the end.
-
-    Friction acts against the motion that the reference wants, c_w = c(x_w), where x_w is x with the
-    velocities that follow from the reference and the constraints: where a motion turns or begins
-    the contact sticks, and its own velocity tells no direction. It is that motion at the time at
-    which the control acts, tau = `control_delay` later: r' + tau r''. A reference has no noise, and
-    what slides slowly is not believed; so c_w, and c where d is observed, are those of ten times
-    the velocity: full from v_s / 10 on. Since the law's model has mu c(x), what it is told to
-    cancel is r + mu (c_w - c(x)), of one and the same x. Where outputs and constraints do not
-    determine the velocities, or `reference` has no wire, x_w = x. The speed of sliding is that by
-    the power of friction, for surfaces that stand still.
+    so that r + c mu follows d with the rate k_o for any k_f, without a jump when the share moves.
 
     Input ports:
         estimated_state: x, shape (n,).
-        control: u as it acts, shape (p,).
+        control: The applied u, shape (p,).
         measured_force: v, shape (m,).
-        hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire.
+        hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire. Then mu is not
+            updated; r is, since it depends on the applied u.
         reference: R, as that of the controller; may be without a wire.
 
     Output ports:
-        exogenous: What to cancel, and mu, each with the derivatives that the law needs, for the
-            port of a `TrackingController` with the same law, in the order of its system's.
+        exogenous: The disturbance to compensate, and mu, each with the derivatives that the law
+            needs, for the port of a `TrackingController` with the same law.
         disturbance: r, shape (k,).
         friction: mu, shape (c,).
-        hold: 1 while the input `hold` is not 0 or a contact that rubs is lost, else 0, shape (1,):
+        hold: 1 while the input `hold` is not 0 or a frictional contact is lost, else 0, shape (1,):
             for the integrals of the controller.
 
     `disturbance` and `friction` are held between samples; r starts at 0, and mu at the model's
@@ -89,20 +61,21 @@ class DisturbanceObserver(ParameterizedSystem):
 
     Args:
         law: The law, for a system that `with_disturbance` made.
-        observing: The rates, and when friction is believed.
+        observing: The rates, and the thresholds for friction.
         sample_period: T in s.
-        control_lag: For which part of T the plant goes on with the control that the port had at a
-            sample, from 0 to 1: all of it for a discrete plant of that step, none for a
-            `ControlHold` without delay before a continuous one.
-        control_delay: tau in s, how much later than its sample a control acts in the mean: the
-            delay, and half of T, for which it is held.
+        control_lag: The fraction of T for which the plant uses the previous control, from 0 to 1: 1
+            for a discrete plant of that step, 0 for a `ControlHold` without delay before a
+            continuous plant.
+        control_delay: tau in s, the mean time from a sample until its control acts: the delay, and
+            half of T, for which it is held.
 
     Attributes:
-        observation, observing, sample_period: What is observed, and the arguments.
+        observation: The observed functions.
+        observing, sample_period: The arguments.
         disturbance_signals, friction_signals: Names and units of the output ports.
 
     Raises:
-        ModelError: The law's system has no disturbance, or a number makes no sense.
+        ModelError: The law's system has no disturbance, or a number is not valid.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -164,12 +137,12 @@ class DisturbanceObserver(ParameterizedSystem):
 
     @property
     def further_signals(self) -> dict[str, Sequence[Signal]]:
-        """Name of an output port that a record has -> names and units of its entries."""
+        """Name of an output port in a record -> names and units of its entries."""
         known = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
         return {name: signals for name, signals in known.items() if signals}
 
     def set_friction(self, context: Context, friction: ArrayLike) -> None:
-        """Starts the coefficients of friction at values, shape (c,), or a number for all.
+        """Sets the initial coefficients of friction, shape (c,), or a number for all.
 
         Raises:
             ModelError: The shape is wrong, or a value is negative or above the largest.

@@ -1,4 +1,4 @@
-"""How fast an observer observes, and what it believes."""
+"""The rates and thresholds of an observer."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,18 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class Observing:
-    """How fast a `DisturbanceObserver` observes, and when it believes what it sees of friction.
+    """The rates of a `DisturbanceObserver`, and its thresholds for friction.
 
     Attributes:
-        rate: k_o in 1/s, at which a disturbance is found that moves what the constraints leave.
-        force_rate: k_n in 1/s, at which that part is found that the constraints answer, and which
-            changes their forces alone; None for k_o.
-        friction_rate: k_f in 1/s, at which coefficients of friction take their share of it.
-        largest_friction: Above which no coefficient of friction goes.
-        least_speed: The speed in m/s below which a contact may stick: then its friction is any.
-        least_force: The force, in N, below which a contact is lost: its coefficient stands still,
-            and so do integrals.
+        rate: k_o in 1/s, the rate of disturbances along the free directions.
+        force_rate: k_n in 1/s, the rate of disturbances along the constrained directions, which
+            change only constraint forces; None for k_o.
+        friction_rate: k_f in 1/s, the rate at which coefficients of friction are identified.
+        largest_friction: The upper bound of coefficients of friction.
+        least_speed: The speed in m/s below which a contact may stick, so that its friction is not
+            identified.
+        least_force: The force in N below which a contact counts as lost: its coefficient and
+            integrals are not updated.
 
     Raises:
         ModelError: A number is not positive.

@@ -1,4 +1,4 @@
-"""One entry of what a controller with phases leaves of a run."""
+"""A change of phase in the record of a run."""
 
 from dataclasses import dataclass
 
@@ -9,15 +9,15 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class PhaseChange:
-    """One entry of the record of a task: a phase begins.
+    """The start of a phase of a task.
 
     Attributes:
-        time: When, in s.
+        time: The time, in s.
         phase: The phase that begins, "Approach" for example; "done" after the last one, "held"
             after a reaction that ends the task.
-        place: Where it stands in the task, from 0; the number of phases when done or held.
-        in_contact: Whether the law with the contact acts from then on.
-        reason: Why the phase before ended.
+        place: Its index in the task, from 0; the number of phases when done or held.
+        in_contact: Whether the law for contact is active from then on.
+        reason: The reason for the end of the previous phase.
         force: The measured force of the contact then, in N.
         distance: The distance by the law's model then, in m.
         distance_rate: Its derivative, in m/s.

@@ -32,10 +32,10 @@ class TrajectoryReference(Reference):
         trajectory: Any column-valued Trajectory, shape (k, 1).
 
     Raises:
-        ReferenceSignalError: The Trajectory is no column; when `derivatives` is called, it has no
-            derivatives, or is a PiecewisePolynomial of which a derivative below the highest one
-            jumps at a break; or, on the way, the time is outside of it, which Drake would silently
-            clip.
+        ReferenceSignalError: The Trajectory is not a column; when `derivatives` is called, it has
+            no derivatives, or is a PiecewisePolynomial of which a derivative below the highest one
+            jumps at a break; or, during a run, the time is outside its range, which Drake would
+            silently clip.
     """
 
     trajectory: Trajectory
@@ -106,11 +106,11 @@ class SystemReference(Reference):
     """A reference that a Drake System computes from the time alone, with its derivatives.
 
     The system has one output port: r_1, r_1', ..., r_1^(nu_1), r_2, ..., output-major. A LeafSystem
-    may have any function there; that a value is the derivative of the one before it is its duty.
+    may compute any function; it must ensure that each value is the derivative of the one before it.
 
     Attributes:
         system: The system; it has no inputs and no state.
-        degrees: How many derivatives nu_1, ..., nu_k it gives of each output.
+        degrees: The number of derivatives nu_1, ..., nu_k of each output.
 
     Raises:
         ReferenceSignalError: The system has inputs, a state or another output; or, when
@@ -186,8 +186,7 @@ class ReferenceGenerator(DifferentiableSystem):
         references, degrees: The arguments.
         function: R(t) as a function of the time in s, whose array the next call overwrites.
 
-    The block converts to AutoDiffXd. A time that has derivatives itself asks each reference for
-    one more.
+    The block converts to AutoDiffXd. If the time has derivatives, each reference needs one more.
 
     Raises:
         ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
@@ -219,7 +218,7 @@ class ReferenceGenerator(DifferentiableSystem):
         return self.function(time).copy()
 
     def along(self, times: ArrayLike) -> FloatArray:
-        """R(t) at many times in s, one row for each; nan where it has no value."""
+        """R(t) at many times in s, one row for each; nan for times without a value."""
         moments = vector("times", times, None, ReferenceSignalError)
         return signal_along(self.function, self.get_output_port().size(), moments)
 

@@ -1,4 +1,4 @@
-"""Laws that run on a computer: read at samples, act late, and held between."""
+"""Sampled laws: inputs at samples, with delay, held between samples."""
 
 from dataclasses import dataclass
 from math import ceil, floor, isfinite
@@ -13,21 +13,21 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
 
 _SAME = 1e-9
-"""Times that differ by less than this, in periods, are one."""
+"""Times that differ by less than this, in periods, count as equal."""
 
 MOST_ON_THE_WAY = 10_000
-"""So many computations may be on the way at once: each is kept, and moved at every sample."""
+"""The largest number of computations in progress: each is stored and shifted at every sample."""
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class Sampling:
-    """A law reads at t_k = k period, and what it computes from that acts from t_k + delay on.
+    """A law samples its inputs at t_k = k period; its control acts from t_k + delay on.
 
     Attributes:
         period: T in s, positive.
-        delay: How long it takes to compute and to send, in s, 0 or more; more than a period where
-            several computations are on the way at once.
+        delay: The time to compute and send, in s, 0 or more; it may exceed a period, with several
+            computations in progress.
 
     Raises:
         ModelError: The period is not positive, or the delay is negative or very many periods.
@@ -49,18 +49,18 @@ class Sampling:
 
     @property
     def whole_periods(self) -> int:
-        """How many whole periods the delay has."""
+        """The number of whole periods in the delay."""
         return floor(self.delay / self.period + _SAME)
 
     @property
     def rest(self) -> float:
-        """What the delay has besides, in s: at least 0, and less than a period."""
+        """The remainder of the delay, in s: at least 0, and less than a period."""
         rest = self.delay - self.whole_periods * self.period
         return rest if rest > _SAME * self.period else 0.0
 
     @property
     def late_samples(self) -> int:
-        """How many samples later what was read has acted, at the latest."""
+        """The largest number of samples until a sampled value acts."""
         return ceil(self.delay / self.period - _SAME)
 
 
@@ -70,26 +70,26 @@ class ControlHold(LeafSystem):
 
         u(t) = control(t_k)    for    t_k + delay <= t < t_(k+1) + delay,    t_k = k period.
 
-    A controller is evaluated at the samples alone. Before the first control acts, that of the start
-    is held, as if the robot had stood there.
+    The controller is evaluated only at samples. Before the first control acts, that of the start is
+    held, as if the robot had been at rest there.
 
-    The updates are unrestricted ones, which Drake makes before those of discrete states, and all of
-    an instant at once: so the controller sees the time, the state and the reference of t_k also
-    where a discrete MultibodyPlant steps at t_k, which is such an update, too. That plant takes
-    what was held before, and sees a delay that is longer by one step of its own.
+    The updates are unrestricted, which Drake computes before discrete ones and all from the same
+    instant: so the controller sees time, state and reference at t_k, even if a discrete
+    MultibodyPlant steps at t_k (also an unrestricted update). That plant uses the previously held
+    control, and so sees a delay longer by one of its steps.
 
     Input port:
-        control: What the controller wants now, shape (p,).
+        control: The present control of the controller, shape (p,).
 
     Output port:
-        control: What is held, shape (p,); no direct feedthrough.
+        control: The held control, shape (p,); no direct feedthrough.
 
     Args:
         size: The number of controls, p.
         sampling: Period and delay.
 
     Raises:
-        WiringError: When a run begins: the first control depends on itself.
+        WiringError: At the start of a run: the first control depends on itself.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -100,7 +100,7 @@ class ControlHold(LeafSystem):
         self.sampling = sampling
         self.sample_period = sampling.period
         self._port = self.DeclareVectorInputPort("control", size)
-        # What is held; then what was read and does not act yet, the oldest first.
+        # The held control; then the waiting ones, the oldest first.
         waiting = sampling.whole_periods + (sampling.rest > 0.0)
         self._state = self.DeclareDiscreteState(np.full((1 + waiting) * size, np.nan))
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
@@ -115,7 +115,7 @@ class ControlHold(LeafSystem):
     def _begin(self, context: Context, state: State) -> EventStatus:
         rows = self._rows(context)
         if not np.isnan(rows).any():
-            return EventStatus.DidNothing()  # A run that goes on.
+            return EventStatus.DidNothing()  # A run that is continued.
         try:
             rows[:] = self._port.Eval(context)
         except NonFiniteError as error:

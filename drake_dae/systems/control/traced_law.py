@@ -1,4 +1,4 @@
-"""What the block of a tracking law computes, as traced functions.                       (28)"""
+"""The computations of the block of a tracking law, as traced functions.                 (28)"""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -31,16 +31,16 @@ def traced_law(
     moving: Sequence[int],
     signals: Mapping[str, Sequence[Signal]],
 ) -> Block:
-    """The computations of a `TrackingController`, and what it does with integrals at samples.
+    """The computations of a `TrackingController`, and its updates of integrals at samples.
 
     Args:
         block: The controller.
         law: Its law.
-        references: What R is where the port `reference` has no wire; None if it needs one.
+        references: R if the port `reference` has no wire; None if it needs one.
         limits: The largest |integral| of each error, shape (k,).
-        sample_period: When errors are summed, in s; 0 for integrals by the integrator.
-        moving: Which parameters come through its port "exogenous".
-        signals: Names and units of what its functions take, for messages.
+        sample_period: The sample period of integrals, in s; 0 for continuous integrals.
+        moving: The indices of parameters that come through its port "exogenous".
+        signals: Names and units of the inputs of its functions, for messages.
     """
     memory = HELD if law.integral.outputs and sample_period else STATE
     named = {"state": "estimated_state", "integral": memory, "parameters": PARAMETERS}
@@ -84,11 +84,11 @@ def _traced_integrals(
     shown: tuple[str, ...],
     memory: str,
 ) -> tuple[tuple[Computation, ...], tuple[Update, ...]]:
-    """What a law with integrals computes, and what it does with those at samples."""
+    """The computations of a law with integrals, and their updates at samples."""
     function = law.function
     acts = Computation.of(function, sources, shown)
     if law.measured_force and not law.control_takes_force:
-        # Whatever the force is: so nothing depends on it in the same instant.
+        # Independent of the force, so that there is no direct feedthrough from it.
         place = sources.index("measured_force")
         inputs = [
             ca.SX.sym(name, size)
@@ -121,7 +121,7 @@ def _traced_integrals(
 
 
 def _motion_under(law: TrackingLaw, sources: tuple[str, ...]) -> Computation | None:
-    """x' and v of a plant that is the law's own model, from what the law wants."""
+    """x' and v of a plant that is the law's own model, from the wanted derivatives."""
     motion = law.trace_motion()
     if motion is None:
         return None

@@ -1,4 +1,4 @@
-"""What happened to contacts, and when."""
+"""Events of contacts."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -8,7 +8,7 @@ from drake_dae.errors import ModelError
 
 
 class ContactChange(Enum):
-    """What happens to a contact; the value says it."""
+    """The kind of an event of a contact; the value describes it."""
 
     IMPACT = "impact"
     REST = "comes to rest"
@@ -22,17 +22,17 @@ class ContactEvent:
     """One event of contacts that open and close.
 
     Attributes:
-        time: When it was, in s.
-        kind: What happened: an impact, from which a contact bounces or slides on; an impact that
-            ends bouncing for good; a touch without impact; the end of a contact whose force came to
+        time: The time, in s.
+        kind: The kind: an impact after which the contact bounces or stays closed; an impact that
+            ends a series of bounces; a touch without impact; an opening when the force reaches
             zero.
-        contacts: The names of the contacts that it happened to.
+        contacts: The names of the contacts of the event.
         closed: The names of the contacts that are closed after it.
-        impulses: What each of `contacts` did to the robot along its normal, N s, zero without an
+        impulses: The normal impulse of each of `contacts` on the robot, N s, zero without an
             impact.
-        energy_lost: Kinetic energy, J, never negative, where surfaces stand still.
-        rest_time: When bouncing would have ended, in s: the limit of the times of infinitely many
-            impacts. None unless it comes to rest.
+        energy_lost: The loss of kinetic energy, J, not negative for surfaces at rest.
+        rest_time: The end of bouncing, in s: the limit of the times of infinitely many impacts.
+            None unless bouncing ends.
     """
 
     time: float

@@ -1,4 +1,4 @@
-"""What a plant does at a singular configuration that its motion crosses."""
+"""The motion of a plant through a singular configuration."""
 
 from collections.abc import Sequence
 
@@ -11,17 +11,17 @@ from drake_dae.trace.functions import TracedFunction
 
 
 class Crossing:
-    """The motion, the force and the outputs where gradients of constraints depend on each other.
+    """The motion, force and outputs at states with dependent gradients of constraints.
 
-    They are those along the branch that the velocity leads along, without what grows there without
-    bound; see `Passage`.
+    They are taken along the branch of the velocity, without the unbounded components; see
+    `Passage`.
 
     Args:
         structure: The structure of the plant's system.
 
     Attributes:
-        doubt: Negative where values that do not know of the crossing are not valid; None where
-            there is nothing to cross.
+        doubt: Negative where the regular functions are not valid; None if no singular configuration
+            can be crossed.
     """
 
     def __init__(self, structure: ConstraintStructure) -> None:
@@ -39,7 +39,7 @@ class Crossing:
     def stands_in_for(
         self, dynamics: TracedFunction, force: TracedFunction, output: TracedFunction
     ) -> None:
-        """Tells which functions of the plant it has other values for."""
+        """Sets the functions of the plant that it replaces."""
         self._dynamics = dynamics
         self._known = {force: self._force_of, output: self._output_of}
 
@@ -50,10 +50,10 @@ class Crossing:
         inputs: Sequence[FloatArray],
         parameters: FloatArray,
     ) -> tuple[FloatArray, ...] | None:
-        """The values of a function whose own are not valid; None where there are none.
+        """The values of a function that is not valid itself; None if there are none.
 
         Args:
-            function: One of the plant's.
+            function: A function of the plant.
             state: x, shape (n,).
             inputs: The control, if the function takes it.
             parameters: Values of all parameters.
@@ -72,5 +72,5 @@ class Crossing:
         return None if given is None else (given(state, found[1], parameters)[0],)
 
     def happens(self, state: FloatArray, control: FloatArray, parameters: FloatArray) -> bool:
-        """Whether the system crosses a singular configuration at a state next to one."""
+        """Whether the system passes a singular configuration near a state."""
         return self._passage.motion(state, control, parameters) is not None

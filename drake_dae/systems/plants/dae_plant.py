@@ -55,37 +55,36 @@ class DaePlant(ParameterizedSystem, Plant):
     start of the next step, so a log or a monitor sees it before its projection;
     `Simulator.AdvancePendingEvents()` projects the last state of a run.
 
-    Assumptions (1)-(3) are all it asks for: there may be no controls, no controlled outputs, other
-    numbers of them, or outputs that the control does not reach. A port of size 0 needs no wire.
+    Only Assumptions (1)-(3) are needed: the numbers of controls and controlled outputs may differ
+    or be zero, and the control need not affect the outputs. A port of size 0 needs no wire.
 
     Input ports:
         control: u, shape (p,).
         exogenous: The signals w with their derivatives, if the system has any; see
             `ParameterizedSystem`.
-        feedback: A law, as the port `feedback` of a `TrackingController` gives it; if asked for.
-            Where `control` has no wire, u is what the law says of x. That is the same as by wires
-            for `state` and `control`, in half the time: an integrator calls one block, and not two.
+        feedback: A law from the port `feedback` of a `TrackingController`; with feedback=True. If
+            `control` has no wire, u is the law's control at x. This equals wires for `state` and
+            `control`, in half the time, since the integrator calls only one block.
 
     Output ports:
         state: x, shape (n,).
         constraint_force: v, shape (m,); direct feedthrough from `control` where beta is not zero.
-            Where redundant constraints share their forces, those of all, in the order of
-            `system.force_signals`: their sum is determined, the split by least squares; see
+            With shared forces of redundant constraints it has all forces, in the order of
+            `system.force_signals`: their sum is determined, the split is by least squares; see
             `share_forces`.
         constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, constraint-major, shape
             (sum r_i,); zero on N*.
         controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
             zero.
 
-    Through a singular configuration, where gradients of constraints depend on each other at one
-    state alone, it goes along the branch of N* that its velocity leads along, whether or not a step
-    ends there; see `Passage`. Within 1e-3 of it, as the sine of an angle between gradients,
-    `constraint_force` and `controlled_output` are without the part that grows there without bound.
-    Where nothing leads through, as at rest, and always with friction, exogenous signals or shared
-    forces, A(x) is singular.
+    The motion passes through isolated singular configurations, where gradients of constraints are
+    dependent, along the branch of N* of its velocity; see `Passage`. Within 1e-3 of it (the sine of
+    an angle between gradients) `constraint_force` and `controlled_output` are without their
+    unbounded components. If no continuation is determined, as at rest, and always with friction,
+    exogenous signals or shared forces, A(x) is singular and an error is raised.
 
-    At a state that an integrator only tries, what has no value is nan, and error control takes a
-    shorter step; at a state that was reached, and where no step leads on, it raises.
+    At a trial state of an integrator, missing values are nan, and error control takes a shorter
+    step. At an accepted state, or if no step is short enough, an error is raised.
 
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
     The default state is the consistent one next to `system.nominal_state`.
@@ -98,7 +97,7 @@ class DaePlant(ParameterizedSystem, Plant):
         structure: The structure of the system, by `find_constraint_structure` or
             `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
-        feedback: Whether there is an input port `feedback`; then nothing may be exogenous.
+        feedback: Whether there is an input port `feedback`; not with exogenous signals.
 
     Attributes:
         structure: The structure.
@@ -108,13 +107,13 @@ class DaePlant(ParameterizedSystem, Plant):
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
-        ModelError: This is no system, the structure is that of another one, or a law cannot be fed
+        ModelError: It is not a system, the structure is that of another one, or a law cannot be fed
             back.
         InconsistentStateError: A simulation starts from a state that is off N*.
-        SingularityError: A(x) is singular on the way; the exception has time and state. Where
-            friction jams a contact it is a JammedContactError, which tells what becomes of it.
-        NonFiniteError: A value is not finite on the way, likewise.
-        SimulationError: The state cannot be projected onto N* on the way, likewise.
+        SingularityError: A(x) is singular during a run; the exception has time and state. In a
+            Painleve paradox it is a PainleveError with the outcome.
+        NonFiniteError: A value is not finite during a run, likewise.
+        SimulationError: The state cannot be projected onto N* during a run, likewise.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -189,7 +188,7 @@ class DaePlant(ParameterizedSystem, Plant):
             self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
 
     def _declare_feedback(self, wanted: bool) -> None:
-        """Declares the input port `feedback`, and what u depends on besides time and state."""
+        """Declares the input port `feedback`, and the dependencies of u besides time and state."""
         self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
         self._law: LawInput | None = None
         if not wanted:
@@ -208,16 +207,16 @@ class DaePlant(ParameterizedSystem, Plant):
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         self.check_context(context)
-        return context.get_continuous_state_vector().CopyToVector()
+        return super().state(context)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,); a run from there is refused if it is off N*.
+        """Sets x as given, shape (n,); a run is refused from a state that is not on N*.
 
         Raises:
             ModelError: The shape is wrong.
         """
         self.check_context(context)
-        context.SetContinuousState(self.dae.state_vector(state))
+        super().set_state(context, state)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -233,7 +232,7 @@ class DaePlant(ParameterizedSystem, Plant):
         return state
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        # What an integrator calls most: without a call more where the values are of use.
+        # Called most by an integrator, so without further calls for valid values.
         if self._law is not None:
             motion = self._law.motion(context)
             if motion is not None:
@@ -265,7 +264,7 @@ class DaePlant(ParameterizedSystem, Plant):
         return self._checked(function, context, x)[0]
 
     def _control(self, context: Context) -> FloatArray | None:
-        """u; None where the law that is fed back has no value at a trial."""
+        """u; None if the law at `feedback` has no value at a trial state."""
         feedback = self._feedback(context)
         if feedback is None:
             given: FloatArray = self._control_port.Eval(context)
@@ -278,11 +277,11 @@ class DaePlant(ParameterizedSystem, Plant):
         return control.copy()
 
     def _feedback(self, context: Context) -> Feedback | None:
-        """The law that is fed back; None where the control has a wire or a fixed value."""
+        """The law at `feedback`; None if the control has a wire or a fixed value."""
         return None if self._law is None else self._law.feedback(context)
 
     def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
-        """The parameters of the law that was fed back, as `parameters_along`; None if none was."""
+        """The parameters of the law at `feedback`, as `parameters_along`; None without one."""
         self.check_context(context)
         return self._steps.laws_along(context, vector("times", times, None))
 
@@ -296,14 +295,14 @@ class DaePlant(ParameterizedSystem, Plant):
         return self._crossing.values(function, state, inputs, parameters)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
-        """What a port of `functions` showed at moments, one row for each; nan where nothing.
+        """The values of a port of `functions` at given times, one row each; nan without a value.
 
         Args:
             port: The port's name.
-            given: "state", "parameters" and "control" at each moment, one row for each.
+            given: "state", "parameters" and "control", one row for each time.
 
         Raises:
-            ModelError: There is no such port, or something is not given, or of another size.
+            ModelError: There is no such port, or values are missing or have a wrong size.
         """
         if port not in self.functions:
             raise ModelError(f"{self.dae.name}: {unknown_name('port', port, self.functions)}")
@@ -321,7 +320,7 @@ class DaePlant(ParameterizedSystem, Plant):
         )
 
     def _crosses(self, state: FloatArray, context: Context) -> bool:
-        """Whether the system crosses a singular configuration at a state next to one."""
+        """Whether the system passes a singular configuration near a state."""
         control = self._control(context) if self._is_controlled else np.zeros(0)
         if control is None:
             return False
@@ -330,8 +329,8 @@ class DaePlant(ParameterizedSystem, Plant):
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
     ) -> SimulationError:
-        """Where friction jams a contact, that, and whether any motion fits."""
-        if not (self.dae.rubbing and isinstance(error, SingularityError)):
+        """In a Painleve paradox, the error with its outcome."""
+        if not (self.dae.frictional_contacts and isinstance(error, SingularityError)):
             return error
         control = inputs[0] if self._is_controlled else np.zeros(0)
         given = (control,) if self._force_needs_control else ()
@@ -393,7 +392,7 @@ class DaePlant(ParameterizedSystem, Plant):
             parameters: Values of all parameters.
 
         Raises:
-            InconsistentStateError: It is.
+            InconsistentStateError: The start is off N*.
         """
         manifold = self.structure.manifold
         if manifold.is_consistent(state, parameters):
@@ -402,7 +401,7 @@ class DaePlant(ParameterizedSystem, Plant):
         raise off_start(self.dae.name, manifold, manifold.residual(state, parameters))
 
     def _check_left_out(self, state: FloatArray, parameters: FloatArray) -> None:
-        """Refuses a state at which redundant constraints that were left out do not hold."""
+        """Refuses a state that violates redundant constraints that were left out."""
         left_out = self._left_out
         if left_out is None or left_out.is_consistent(state, parameters):
             return

@@ -23,14 +23,14 @@ from drake_dae.trace.functions import TracedFunction
 
 
 class _FedBack(NamedTuple):
-    """What a plant's derivative needs besides time and state; it never changes.
+    """The constants of a plant's derivative besides time and state.
 
     Attributes:
-        feedback: The law that is fed back; None where the control has a wire or a fixed value.
+        feedback: The law at `feedback`; None if the control has a wire or a fixed value.
         parameters: Values of all parameters.
-        motion: x' under that law as a function of time and state, whose array the next call
-            overwrites, None where it has no value; None without a law.
-        entry: The cache entry that this is the value of: to find it again takes longer.
+        motion: x' under that law as a function of time and state; the next call overwrites its
+            array, and it returns None without a value. None without a law.
+        entry: The cache entry of this value, kept since looking it up takes longer.
     """
 
     feedback: Feedback | None
@@ -43,14 +43,14 @@ class _FedBack(NamedTuple):
 
 
 class LawInput:
-    """The input port `feedback` of a plant, and what follows from the law that stands there.
+    """The input port `feedback` of a plant, and the motion under its law.
 
-    The law is taken where the plant's port `control` has neither a wire nor a fixed value.
+    The law is used if the plant's port `control` has neither a wire nor a fixed value.
 
     Args:
         plant: The plant; gets the port, and keeps this.
         control: Its port `control`.
-        values: All parameters in a context; not one that keeps the plant alive.
+        values: A function of a context with all parameters; it must not keep the plant alive.
         steps: The plant's steps.
         dynamics: x', a function of state, control and parameters.
         compiled: Whether law and plant together become machine code.
@@ -74,13 +74,13 @@ class LawInput:
         self._latest = [np.zeros(0)]
         self.port = plant.DeclareAbstractInputPort("feedback", nothing())
         sources = {plant.input_port_ticket(port.get_index()) for port in (control, self.port)}
-        # Law and parameters are the same for many states: one look at the context, and not three.
+        # Law and parameters are the same for many states: one look at the context instead of three.
         self._index = plant.DeclareCacheEntry(
             "feedback and parameters",
             ValueProducer(nothing, weakly(self._calc)),
             sources | {plant.all_parameters_ticket()},
         ).cache_index()
-        # Whoever holds an entry holds its system: a context may, but not the system itself.
+        # An entry keeps its system alive: a context may hold one, but not the system itself.
         self._entry: Callable[[], CacheEntry | None] = lambda: None
 
     def _calc(self, context: Context, value: AbstractValue) -> None:
@@ -104,12 +104,12 @@ class LawInput:
         return self._motion[1]
 
     def motion(self, context: Context) -> Callable[[float, FloatArray], FloatArray | None] | None:
-        """x' as a function of time and state; None where no law is fed back."""
+        """x' as a function of time and state; None without a law."""
         entry = self._entry() or self._plant.get_cache_entry(self._index)
         found: _FedBack = entry.Eval(context)
         return found.motion
 
     def feedback(self, context: Context) -> Feedback | None:
-        """The law that is fed back; None where the control has a wire or a fixed value."""
+        """The law at `feedback`; None if the control has a wire or a fixed value."""
         found: _FedBack = self._plant.get_cache_entry(self._index).Eval(context)
         return found.feedback

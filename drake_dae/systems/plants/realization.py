@@ -31,10 +31,10 @@ class StateRealization(ParameterizedSystem):
         xi' = L_f* xi + L_h* xi u,
         z_i = zeta_i,1, or l*_i + n*_i u where mu_i = 0,    v = alpha + beta u (25),
 
-    with x = Phi^-1(0, zeta, xi). It has n - sum r_i states, as few as the motion allows, and no
-    constraint to keep: x is on N* to round-off at every instant, without a projection. The price
-    is the inverse of Phi, by Newton's method, in every evaluation, and that Phi must stay
-    regular along the motion. `DaePlant` needs neither of them.
+    with x = Phi^-1(0, zeta, xi). It has n - sum r_i states, the minimal number, and no constraints:
+    x is on N* to round-off at every instant, without a projection. In exchange every evaluation
+    inverts Phi by Newton's method, and Phi must stay regular along the motion. `DaePlant` needs
+    neither.
 
     Input ports:
         control: u, shape (p,).
@@ -49,20 +49,20 @@ class StateRealization(ParameterizedSystem):
 
     The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
 
-    Newton's method starts from the last x that was computed in the same context. What it finds
-    does not depend on that start beyond round-off, but for the branch: where several states have
-    the same coordinates, x continues the last one. `set_state` chooses the branch;
-    `Clone` of a context keeps it, `SetTimeStateAndParametersFrom` does not.
+    Newton's method starts from the last x that was computed in the same context. Its result does
+    not depend on that start beyond round-off, except for the branch: if several states have the
+    same coordinates, x continues the last one. `set_state` chooses the branch; `Clone` of a context
+    keeps it, `SetTimeStateAndParametersFrom` does not.
 
     Args:
         normal_form: The coordinates, `NormalForm(system)`.
 
     Raises:
-        ModelError: This is no normal form.
-        SimulationError: There is no x on the way, since the motion left the domain of the
+        ModelError: It is not a normal form.
+        SimulationError: During a run there is no x, since the motion left the domain of the
             coordinates; the exception has the time and the last state.
-        SingularityError: A(x) is singular on the way; the exception has time and state.
-        NonFiniteError: A value is not finite on the way, likewise.
+        SingularityError: A(x) is singular during a run; the exception has time and state.
+        NonFiniteError: A value is not finite during a run, likewise.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -76,14 +76,14 @@ class StateRealization(ParameterizedSystem):
         self._layout = layout = structure.layout
         self._on_manifold = np.zeros(sum(structure.constraint_degrees))
         elimination, derivatives = structure.elimination, structure.derivatives
-        highest = structure.drift + ca.mtimes(structure.control_matrix, derivatives.control)
+        highest = structure.drift + ca.mtimes(structure.control_matrix, derivatives.control)  # (26)
         rate = ca.SX(0, 1)
         if normal_form.completion.numel():
             moving = derivatives.expand(derivatives.rate)
             rate = ca.jtimes(normal_form.completion, dae.state, moving)
             rate += dae.exogenous.rate(normal_form.completion)
         rates = ca.vertcat(highest[layout.dynamic.tolist(), :], rate)
-        force = dae.forces(derivatives.expand(derivatives.constraint_input))
+        force = dae.forces(derivatives.expand(derivatives.constraint_input))  # (25)
         self._force_needs_control = elimination.beta.nnz() > 0
         self._dynamics = structure.trace("state realization", rates, True)
         self._force = structure.trace("constraint force", force, self._force_needs_control)
@@ -98,8 +98,8 @@ class StateRealization(ParameterizedSystem):
         degrees = dae.exogenous.degrees(rates, force, direct, chain, normal_form.completion)
         by_state = state_tickets(self) | self._declare_exogenous(degrees)
         by_control = by_state | {self.input_port_ticket(self._control_port.get_index())}
-        # x, and where Newton's method starts: Drake hands the value before to the calculation.
-        # Its number, since Drake's entry would keep this system for ever.
+        # x and the start of Newton's method: Drake passes the previous value to the calculation.
+        # Only the index is kept, since Drake's entry would keep this system alive.
         self._state_index = self.DeclareCacheEntry(
             "state",
             ValueProducer(
@@ -132,7 +132,7 @@ class StateRealization(ParameterizedSystem):
         """Sets the coordinates to those of a state on N*, shape (n,), and the branch to its own.
 
         Raises:
-            InconsistentStateError: The state is off N*; `manifold.project` finds one that is not.
+            InconsistentStateError: The state is off N*; use `manifold.project`.
             ModelError: The shape is wrong.
         """
         self.check_context(context)
@@ -147,7 +147,7 @@ class StateRealization(ParameterizedSystem):
                 residual,
             )
         context.SetContinuousState(self._coordinates(x, p))
-        # Makes x out of date where N* is but points, so that there are no coordinates to set.
+        # Invalidates x even if N* consists of points, so that there are no coordinates to set.
         context.get_mutable_numeric_parameter(0)
         entry = self._state_entry().get_mutable_cache_entry_value(context)
         entry.GetMutableValueOrThrow()[1][:] = x
@@ -183,7 +183,7 @@ class StateRealization(ParameterizedSystem):
             self._steps.tolerate(context, error)
             value.set_value((np.full_like(last, np.nan), last))
             return
-        wanted = np.concatenate([self._on_manifold, coordinates])
+        wanted = np.concatenate([self._on_manifold, coordinates])  # (27)
         try:
             found = self.normal_form.state(wanted, last, p)
             value.set_value((found, found))
@@ -194,8 +194,8 @@ class StateRealization(ParameterizedSystem):
             found = self.normal_form.state(wanted, None, p)
             value.set_value((found, found))
         except InconsistentStateError:
-            # Also in a trial: shorter steps would carry the motion over a fold of its coordinates,
-            # where it has no unique continuation, and come out on a wrong one.
+            # Also at a trial state: shorter steps would carry the motion over a fold of its
+            # coordinates, where the continuation is not unique, to a wrong branch.
             raise SimulationError(
                 f"the motion left the domain of its coordinates at t = {context.get_time():.6g} s, "
                 f"last state {show(last)}: {reason}. DaePlant needs no coordinates",

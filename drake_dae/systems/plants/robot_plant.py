@@ -26,18 +26,19 @@ class RobotPlant(DaePlant):
 
     Output ports:
         link_state: (q, v) of the links, shape (nq + nv,), as Drake's MultibodyPlant orders it.
-        joint_torque: What the stages deliver to the joints, N m (N), shape (nu,); with any stage.
-        constraint_wrenches: What each constraint does to each of its frames: 6 numbers, the moment
-            in N m and the force in N as in Drake's SpatialForce, in the world, the force at the
-            frame's origin. Frame B comes before A, and feels what the class of the constraint
-            calls positive; A feels the opposite at the same point. Their power is zero where the
-            constraint is ideal. `wrench_signals` tells the names,
-            "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
+        joint_torque: The torques or forces of the stages on the joints, N m (N), shape (nu,); with
+            any stage.
+        constraint_wrenches: The wrench of each constraint on each of its frames: 6 numbers, the
+            moment in N m and the force in N as in Drake's SpatialForce, in the world, the force at
+            the frame's origin. Frame B comes before A; the positive direction is that of the
+            constraint's class, and A gets the opposite at the same point. The total power of an
+            ideal constraint is zero. `wrench_signals` has the names, "<constraint>.<frame>.mx",
+            ..., "<constraint>.<frame>.fz".
         loop_state: The coordinates of the joints that close loops, and then their rates, named by
             `model.loop_joints.signals`; if there are such joints.
 
-    A stage of actuation shows its state at ports of its own, which its class names: `motor_state`
-    of `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
+    A stage of actuation has further ports with its state, see its class: `motor_state` of
+    `FlexibleJoints`, for example, or `motor_current` of `DcMotors`.
 
     `constraint_force` is lambda of (37), in N for contacts. With rigid joints it has direct
     feedthrough from `control`; with any stage it is a function of the state alone.

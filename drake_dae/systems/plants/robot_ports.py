@@ -1,4 +1,4 @@
-"""The ports that every plant of a RobotModel has beside those of its system."""
+"""The ports of a plant of a RobotModel besides those of its system."""
 
 from collections.abc import Callable, Sequence
 
@@ -16,26 +16,27 @@ from drake_dae.trace.functions import TracedFunction
 
 
 class RobotPorts:
-    """What a plant shows of a robot, from its state and its constraint force; see `RobotPlant`.
+    """The output ports of a robot's plant, from state and constraint force; see `RobotPlant`.
 
-    Not a base of the plant: a class of Python has one base of Drake's, by one way.
+    Not a base class of the plant, since a Python class can have only one base of Drake.
 
     Args:
         plant: The plant, with x as its continuous state; gets the ports, and keeps this.
         model: The robot.
         dae: The robot's system.
-        values: All parameters in a context; not one that keeps the plant alive.
-        force: lambda in a context, as the port `constraint_force` shows it; likewise.
-        by_state: What a function of the state depends on.
-        by_force: What the constraint force depends on.
+        values: A function of a context with all parameters; it must not keep the plant alive.
+        force: A function of a context with lambda of the port `constraint_force`; likewise.
+        by_state: The dependencies of a function of the state.
+        by_force: The dependencies of the constraint force.
 
     Attributes:
-        parts: Name of a port -> the part of the state that it shows.
+        parts: Name of a port -> its part of the state.
         wrench_signals: Names and units of `constraint_wrenches`.
         wrenches, force: That port as expressions, and the symbols of lambda in it.
         loop_signals: Names and units of `loop_state` under that name; empty without it.
         wrench_function: The same as a function of state, lambda and parameters.
-        loops, joint_force: What the ports `loop_state` and `joint_torque` compute; None without.
+        loops, joint_force: The functions of the ports `loop_state` and `joint_torque`; None without
+            them.
     """
 
     def __init__(

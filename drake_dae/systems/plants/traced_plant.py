@@ -1,4 +1,4 @@
-"""What the plant of a DaeSystem computes, as traced functions.                  (1)-(3), (25)"""
+"""The computations of the plant of a DaeSystem, as traced functions.            (1)-(3), (25)"""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -28,18 +28,18 @@ def traced_plant(
     moving: Sequence[int],
     signals: Mapping[str, Sequence[Signal]],
 ) -> Block:
-    """The computations of a `DaePlant`: those of x' and v are one, where v needs the control.
+    """The computations of a `DaePlant`; x' and v are one function if v needs the control.
 
     Args:
         plant: The plant.
         structure: Its structure.
         projects: Whether its state is projected onto N*.
         check_start: Refuses a start, by the state and all parameters.
-        moving: Which parameters come through its port "exogenous".
-        signals: Names and units of what its functions take, for messages.
+        moving: The indices of parameters that come through its port "exogenous".
+        signals: Names and units of the inputs of its functions, for messages.
     """
     dae, derivatives = structure.system, structure.derivatives
-    rate, force = (
+    rate, force = (  # (25)
         derivatives.expand(value) for value in (derivatives.rate, derivatives.constraint_input)
     )
     control = {"control": derivatives.control}
@@ -59,7 +59,7 @@ def traced_plant(
     shown = {"force": dae.forces(acting), "output": dae.outputs(acting)}
     names = {"force": "constraint_force", "output": "controlled_output"}
     if not structure.elimination.n_star.nnz():
-        # m beta u cancels: what is left is as with any control.
+        # m beta u cancels, so the output does not depend on the control.
         alpha = ca.substitute(force, derivatives.control, 0 * derivatives.control)
         output = dae.trace("controlled output", {"value": dae.outputs(alpha)}, {}, *regular)
         found.append(Computation.of(output, by_state, ("controlled_output",)))

@@ -1,4 +1,4 @@
-"""What a law knows of the state where encoders measure it."""
+"""The state measured by encoders."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ _SAME = 1e-9
 @checked(ModelError)
 @dataclass(frozen=True)
 class Encoders:
-    """How a robot's positions and velocities are measured at samples t_k = k T.
+    """The measurement of a robot's positions and velocities at samples t_k = k T.
 
     A position is rounded to a multiple of the resolution delta, after bias and noise are added:
 
@@ -31,22 +31,22 @@ class Encoders:
 
         vm_k = a vm_(k-1) + (1 - a) (qm_k - qm_(k-1)) / T,    a = exp(-w T),
 
-    which begins with the velocity that the robot has. While a position passes many multiples of
-    delta from one sample to the next, its rounding errors are as noise that is even over
-    (-delta/2, delta/2) and new at each sample: see `position_deviation` and `velocity_deviation`.
+    which starts at the robot's velocity. If a position passes many multiples of delta between
+    samples, its rounding errors are like white noise, uniform over (-delta/2, delta/2): see
+    `position_deviation` and `velocity_deviation`.
 
     Attributes:
         resolution: delta in rad or m, one number for all positions or one each; 0 for none.
-        velocity_bandwidth: w in rad/s; None for velocities that are measured themselves.
+        velocity_bandwidth: w in rad/s; None for directly measured velocities.
         position_bias: b in rad or m, one number or one each.
         position_noise: sigma_q in rad or m, one number or one each.
-        velocity_noise: sigma_v in rad/s or m/s, one number or one each; where there is no
+        velocity_noise: sigma_v in rad/s or m/s, one number or one each; only without a
             velocity_bandwidth.
         seed: The seed of the noise.
 
     Raises:
-        ModelError: A number is negative or not finite; or velocities from differences have a noise
-            of their own.
+        ModelError: A number is negative or not finite, or there are both velocity_bandwidth and
+            velocity_noise.
     """
 
     resolution: ArrayLike = 0.0
@@ -83,7 +83,7 @@ class Encoders:
 
     @property
     def has_noise(self) -> bool:
-        """Whether any of it is random."""
+        """Whether the measurement has noise."""
         return bool(np.any(self.position_noise) or np.any(self.velocity_noise))
 
     @property
@@ -94,8 +94,8 @@ class Encoders:
     def velocity_deviation(self, period: float) -> FloatArray:
         """The standard deviation of vm, rad/s or m/s.
 
-        Of white errors of the positions the filtered difference passes the sum of squares of its
-        impulse response, (1 - a) / T (1, -(1 - a), -(1 - a) a, ...):
+        For white position errors it follows from the sum of squares of the impulse response of the
+        filtered difference, (1 - a) / T (1, -(1 - a), -(1 - a) a, ...):
 
             position_deviation (1 - a) / T sqrt(2 / (1 + a)).
 
@@ -107,37 +107,21 @@ class Encoders:
         a = self._forgetting(period)
         return self.position_deviation * (1.0 - a) / period * np.sqrt(2.0 / (1.0 + a))
 
-    def velocity_lag(self, period: float) -> float:
-        """By how much vm is late where the acceleration is constant, T / 2 + T a / (1 - a), in s.
-
-        It is 0 for velocities that are measured themselves, and about 1 / w for a filter that is
-        slow beside the samples.
-
-        Args:
-            period: T in s.
-        """
-        if self.velocity_bandwidth is None:
-            return 0.0
-        a = self._forgetting(period)
-        return period * (0.5 + a / (1.0 - a))
-
     def _forgetting(self, period: float) -> float:
-        """a, the share of the last velocity that stays in the next one."""
+        """a, the factor of the last velocity in the next one."""
         assert self.velocity_bandwidth is not None
         return float(np.exp(-self.velocity_bandwidth * positive("period", period)))
 
 
 @checked(ModelError)
 class StateSensor(LeafSystem):
-    """Measures a robot's state by `Encoders`: the state that a law gets for x = (q, v, ...).
+    """The state x = (q, v, ...) of a robot, measured by `Encoders`, for a law.
 
-    What it measured at t_k = k period is at its port from then on until the next sample; what
-    stands in x behind q and v passes as it is. At t_k itself it is a function of the state of that
-    instant, so that a law which reads at t_k reads what was measured at t_k. Its updates are
-    unrestricted ones, so that it sees that instant also where a discrete MultibodyPlant steps then.
-
-    Drake's DiscreteDerivative is of no use here: its difference is one sample old, and it is
-    updated after such a plant has stepped.
+    The measurement of t_k = k period is held until the next sample; entries of x after q and v are
+    not changed. At t_k itself the output is a function of the state at that instant, so that a law
+    sampled at t_k uses the measurement of t_k. Its updates are unrestricted, so that it sees that
+    instant even if a discrete MultibodyPlant steps then. Drake's DiscreteDerivative is not
+    suitable: its difference is one sample old, and it is updated after such a plant.
 
     Input ports:
         state: x, shape (n,).
@@ -149,8 +133,8 @@ class StateSensor(LeafSystem):
 
     Args:
         size: n.
-        num_positions: k, the number of positions, and of velocities, that x begins with.
-        encoders: How they are measured.
+        num_positions: k, the number of positions and of velocities at the start of x.
+        encoders: The encoders.
         period: The time between samples in s.
 
     Attributes:
@@ -178,7 +162,7 @@ class StateSensor(LeafSystem):
         self._noise = None
         if encoders.has_noise:
             self._noise = self.DeclareVectorInputPort("noise", 2 * num_positions)
-        # The number of the sample that is held, and what was measured then.
+        # The index of the held sample, and its measurement.
         self._held = self.DeclareDiscreteState(np.full(1 + 2 * num_positions, np.nan))
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, weakly(self._sample))
         self.DeclareVectorOutputPort("estimated_state", size, weakly(self._calc))
@@ -194,7 +178,7 @@ class StateSensor(LeafSystem):
         return EventStatus.Succeeded()
 
     def _measured(self, context: Context, state: FloatArray) -> FloatArray:
-        """The number of the sample that counts now, and what was measured then."""
+        """The index of the current sample, and its measurement."""
         held = context.get_discrete_state(self._held).CopyToVector()
         sample = np.floor(context.get_time() / self.period + _SAME)
         if held[0] == sample:
@@ -228,7 +212,7 @@ class StateSensor(LeafSystem):
         q = ca.SX(q)
         for i in rounded:
             q[i] = self._resolution[i] * _rounded(q[i] / self._resolution[i])
-        is_known = ca.fabs(held[0]) < np.inf  # Where it is a number.
+        is_known = ca.fabs(held[0]) < np.inf  # For finite values.
         if self.encoders.velocity_bandwidth is not None:
             a = np.exp(-self.encoders.velocity_bandwidth * self.period)
             filtered = a * held[1 + count :] + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
@@ -259,7 +243,7 @@ def _function(inputs: list[ca.SX], value: ca.SX) -> ca.Function:
 
 
 def _rounded(number: ca.SX) -> ca.SX:
-    """The nearest whole number; of two the even one, as `numpy.round` has it."""
+    """The nearest integer, halves to even as `numpy.round`."""
     up = ca.floor(number + 0.5)
     is_tie = ca.eq(up, number + 0.5)
     is_odd = ca.eq(2.0 * ca.floor(up / 2.0) + 1.0, up)

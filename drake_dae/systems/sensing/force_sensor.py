@@ -25,13 +25,13 @@ from drake_dae.trace.functions import TracedFunction
 
 @checked(ModelError)
 class ForceSensor(DifferentiableSystem):
-    """A force sensor with state, so that it can stand in a loop with a rigid robot:
+    """A force sensor with state, so that it can close a loop around a rigid robot:
 
         time_constant * y' = force - y,    measured_force = y + bias + noise_deviation * noise,
 
     and, if it samples, measured_force is held between samples. With rigid joints the constraint
-    force depends on the control in the same instant; a controller that read it directly would close
-    an algebraic loop. Without sampling it converts to AutoDiffXd.
+    force has direct feedthrough from the control; reading it directly would close an algebraic
+    loop. Without sampling it converts to AutoDiffXd.
 
     Input ports:
         force: The constraint force in N (N m), shape (m,).
@@ -109,7 +109,7 @@ class ForceSensor(DifferentiableSystem):
         self.DeclareVectorOutputPort("measured_force", size, weakly(self._calc_measured), sources)
 
     def set_force(self, context: Context, force: ArrayLike) -> None:
-        """Starts the sensor as if it had felt a constant force, shape (m,), without noise."""
+        """Sets the steady state of the sensor for a constant force, shape (m,), without noise."""
         self.check_context(context)
         value = vector("force", force, self._force_port.size())
         if self.time_constant:

@@ -1,4 +1,4 @@
-"""Runs that end, with the reason, where their errors leave what is tolerated."""
+"""Tolerances of errors: a run that exceeds them ends with the reason."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 @checked(ModelError)
 @dataclass(frozen=True)
 class Tolerances:
-    """Which errors a run may have: it ends as failed where the recent error of an output,
+    """The tolerated errors of a run. It fails if the recent error of an output,
 
         sqrt(s),    s' = ((z - r)^2 - s) / window,    s = 0 at the start,
 
-    is larger than what is tolerated. So a contact that bounces once is no failure, and one that is
-    lost, or chatters, is.
+    exceeds its tolerance. So a single bounce of a contact is allowed, but loss of contact or
+    chattering is a failure.
 
     Attributes:
         outputs: Output name -> the largest recent error, in the output's unit, positive.
-        after: The time from which on it counts, in s.
-        window: For how long an error is recent, in s.
+        after: The time from which errors are checked, in s.
+        window: The time constant of recent errors, in s.
 
     Raises:
         ModelError: There are no outputs, or a number makes no sense.
@@ -48,7 +48,7 @@ class Tolerances:
         positive("window", self.window)
 
     def places(self, signals: Sequence[Signal]) -> Indices:
-        """Where the outputs stand among all.
+        """The indices of the outputs.
 
         Args:
             signals: Names and units of the controlled outputs.
@@ -64,24 +64,24 @@ class Tolerances:
 
 
 class ToleranceWatch(LeafSystem):
-    """Ends a run that leaves its `Tolerances`.
+    """Ends a run that exceeds its `Tolerances`.
 
     Input ports:
         controlled_output: z, shape (p,).
         reference: R, whose entries at `lowest` are r, shape (p,).
-        constraint_force: lambda, shape (m,), for what is told.
+        constraint_force: lambda, shape (m,), for the message.
         state: x, shape (n,), for the exception.
 
     Args:
         tolerances: The tolerances.
         outputs: Names and units of z.
         forces: Names and units of lambda.
-        lowest: Where r stands in R.
-        sizes: Those of R and x.
-        period: How often it looks, in s.
+        lowest: The indices of r in R.
+        sizes: The sizes of R and x.
+        period: The period of the checks, in s.
 
     Raises:
-        SimulationError: While a run goes on: an error is too large.
+        SimulationError: During a run: an error is too large.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -111,7 +111,8 @@ class ToleranceWatch(LeafSystem):
         }
         self._ports = [self.DeclareVectorInputPort(*item) for item in declared.items()]
         self._recent = self.DeclareDiscreteState(self._places.size)
-        # Unrestricted, as the step of a discrete MultibodyPlant: so all are of one instant.
+        # Unrestricted, as the step of a discrete MultibodyPlant, so that all are from the same
+        # instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, weakly(self._look))
 
     def _look(self, context: Context, state: State) -> EventStatus:

@@ -1,6 +1,6 @@
 """A task as a controller: a law for each member, and what leads from one to the other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,7 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.control.contract import Controller, Derived, check_same_sizes
+from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
@@ -291,6 +291,13 @@ class TaskController(Diagram, Controller):
             "tracking_error": (outputs - desired, signals),
             "predicted_error": (predicted, signals),
         }
+
+    def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
+        own = self.GetSubsystemContext(self.controller, context)
+        parameters = self.controller.current_parameters(own)
+        (found,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
+        desired = self.GetOutputPort("desired_output").Eval(context)
+        return found[:-1], desired, self.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray

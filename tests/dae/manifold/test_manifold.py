@@ -44,6 +44,7 @@ def circle(**parameters: float) -> Manifold:
 
 
 @pytest.mark.slow
+@pytest.mark.equation(4, 42)
 def test_residual_and_dimension_are_those_found_by_hand(problem):
     manifold = find_structure(problem.system).manifold
     assert manifold.dimension == problem.manifold_dimension

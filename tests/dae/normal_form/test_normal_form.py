@@ -16,7 +16,7 @@ from drake_dae.dae.normal_form.normal_form import NormalForm
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import Linearization, newton
+from drake_dae.trace.newton import NewtonModel, newton
 
 ROBOTS = {
     "two_link": lambda: arm("two_link").structure,
@@ -46,6 +46,7 @@ def chain_ends(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*PROBLEMS, *ROBOTS])
+@pytest.mark.equation(20, 24)
 def test_phi_and_its_inverse_compose_to_the_identity(name):
     """Both ways, on N* and off it, from the nominal state as the guess."""
     normal_form = form(name)
@@ -73,6 +74,7 @@ def test_phi_and_its_inverse_compose_to_the_identity(name):
 
 
 @pytest.mark.slow
+@pytest.mark.equation(23)
 def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
     """dPhi/dx (f + g v + h u): integrators, then a + B u by hand; y stays; v by hand."""
     system = problem.system
@@ -118,6 +120,7 @@ def test_the_jacobian_is_the_derivative(name):
 
 
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+@pytest.mark.equation(21, 50, 51, 52, 53)
 def test_robot_coordinates_are_those_of_50_to_53(name):
     """phi, J qd, h_1, P qd from MultibodyPlant alone."""
     normal_form, wall = form(name), {"two_link": 1.2, "seven_joint": 0.7}[name]
@@ -137,6 +140,7 @@ def test_robot_coordinates_are_those_of_50_to_53(name):
         )
 
 
+@pytest.mark.equation(58)
 def test_robot_inverse_is_58():
     """q = psi(xbar_1) by the model's own search; qd = Q xbar_2 with Q from MultibodyPlant."""
     for name in ("two_link", "seven_joint"):
@@ -186,6 +190,7 @@ def test_systems_made_from_their_normal_form(seed):
         np.testing.assert_allclose(back, x, rtol=0, atol=1e-12)
 
 
+@pytest.mark.equation(22)
 def test_chosen_completions_are_named_states():
     """The shafts' velocities behind damped joints, the knife edge's position."""
     expected = {
@@ -331,7 +336,7 @@ def test_continuation_arrives_where_newtons_method_alone_does_not(outputs, guess
 
     def linearize(state):
         inverse = np.linalg.inv(normal_form.jacobian(state))
-        return Linearization(
+        return NewtonModel(
             lambda z: inverse @ (coordinates - normal_form.coordinates(z)), is_regular=True
         )
 

@@ -31,6 +31,7 @@ def test_one_pole_serves_all_outputs():
         np.array([-0.5, -0.5, -0.5]),
     ],
 )
+@pytest.mark.equation(32)
 def test_the_error_dynamics_have_the_chosen_poles(chosen):
     gains = poles(chosen)(["z"], [3])
     # A triple pole is found to the third root of machine precision, 6e-6.
@@ -69,6 +70,7 @@ LAMBDA_1 = np.array([[30.0, 4.0, 1.0], [-5.0, 25.0, 2.0], [3.0, 1.0, 20.0]])
 LAMBDA_2 = np.array([[11.0, 2.0, 0.0], [1.0, 10.0, -2.0], [0.5, 1.0, 9.0]])
 
 
+@pytest.mark.equation(60)
 def test_matrices_couple_outputs_of_one_degree():
     """e'' + Lambda_2 e' + Lambda_1 e = 0 (60) with full matrices, against the matrix exponential.
 

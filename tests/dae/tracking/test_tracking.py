@@ -30,6 +30,7 @@ def starts(problem: Problem) -> np.ndarray:
 
 
 @pytest.mark.slow
+@pytest.mark.equation(6, 7, 8, 28, 30, 31, 33)
 def test_the_closed_loop_has_exactly_the_predicted_error(problem):
     """(30), (31) from a start with an error, by an independent integrator and elimination."""
     law = TrackingLaw(problem.system, poles(-3.0))
@@ -60,7 +61,7 @@ def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(proble
     u = ca.SX.sym("u", system.num_controls)
     if motion is None:
         by_matrix = law.structure.derivatives.inverse(law.structure.highest_derivatives, u) is None
-        assert by_matrix or system.rubbing or system.control_metric is not None
+        assert by_matrix or system.frictional_contacts or system.control_metric is not None
         return
     rate = elimination.f_star + ca.mtimes(elimination.h_star, u)
     force = elimination.alpha + ca.mtimes(elimination.beta, u)
@@ -163,6 +164,7 @@ def test_the_reference_is_output_major():
     assert names == ["v1", "q3", "q3'", "q3''", "v2", "q4", "q4'", "q4''"]
 
 
+@pytest.mark.equation(5)
 def test_control_by_hand():
     """Cart: u = m (r'' - K_2 (x' - r') - K_1 (x - r)) + c x'."""
     law = TrackingLaw(PROBLEMS["cart"]().system, gain_coefficients([6.0, 5.0]))
@@ -176,6 +178,7 @@ def test_control_by_hand():
 
 
 @pytest.mark.slow
+@pytest.mark.equation(29, 34)
 def test_the_tracking_error_of_an_output_met_at_once_is_zero(problem):
     """z - r by the model, with the control that the law chose."""
     law = TrackingLaw(problem.system, poles(-3.0))
@@ -319,6 +322,7 @@ def test_measured_force_replaces_nothing_when_the_model_is_right():
     )
 
 
+@pytest.mark.equation(71, 81)
 def test_measured_force_takes_the_place_of_the_models():
     """(71): an output v1 of degree 1 is fed back from the measurement, its gain acts on v1 - r."""
     problem = PROBLEMS["mixed_degrees"]()

@@ -115,7 +115,7 @@ def test_unstable_zero_dynamics_end_the_motion_in_growth():
 
 def test_stiff_zero_dynamics_take_few_steps(monkeypatch):
     """s' = 1e6 (z - s): an explicit integrator would take 300000 steps a second."""
-    monkeypatch.setattr(module, "STEPS", 200)
+    monkeypatch.setattr(module, "MOST_STEPS", 200)
     dynamics = zero_dynamics(internal(lambda s, z: 1e6 * (z - s)))
     motion = dynamics.motion(derivatives(lambda t: [ca.sin(t)], (1,)), [0.0, 5.0, 10.0])
     assert motion.ending is None
@@ -171,7 +171,7 @@ def test_long_chains_do_not_drift_away(monkeypatch):
 
 
 def test_the_work_is_bounded(monkeypatch):
-    monkeypatch.setattr(module, "STEPS", 50)
+    monkeypatch.setattr(module, "MOST_STEPS", 50)
     system = spring_masses(0.0)
     motion = zero_dynamics(system).motion(
         derivatives(lambda t: [0], (2,)), [0.0, 1000.0], [0.0, 1.0, 0.0, 0.0]

@@ -44,6 +44,7 @@ def following(problem: Problem, count: int = 13) -> tuple[ZeroDynamics, Array, P
 
 
 @pytest.mark.slow
+@pytest.mark.equation(36)
 def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
     """By the closed forms of the problem: k and its derivatives, z = l + m (alpha + beta u)."""
     _, times, motion = following(problem)
@@ -64,6 +65,7 @@ def test_outputs_and_constraints_hold_on_the_whole_motion(problem):
 
 
 @pytest.mark.slow
+@pytest.mark.equation(35)
 def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     """The law (28) without an initial error moves the same way; integrated by DOP853."""
     _, times, motion = following(problem)

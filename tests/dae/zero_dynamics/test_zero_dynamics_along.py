@@ -400,7 +400,7 @@ def test_several_equilibria():
     )
     assert "At rest at z=0, s=1, s" not in str(told)
     assert "At rest at z=0, s=1, w=0: exponentially stable." in str(told)
-    assert "settles into another motion, which is stable" in told.problems[0]
+    assert "converges to another stable motion" in told.problems[0]
     with pytest.raises(ModelError, match="guesses must have shape"):
         dynamics.equilibria([0.0, 0.0, 0.0])
 

@@ -141,6 +141,7 @@ def explicit_actuator(name, kind, x, reference, gains, force_gains):
 @pytest.mark.parametrize("full", [False, True], ids=["poles", "Lambda"])
 @pytest.mark.parametrize("kind", ["flexible", "motor", "hydraulic"])
 @pytest.mark.parametrize("name", ARMS)
+@pytest.mark.equation(39, 64, 65, 66, 67, 68, 69, 70, 74, 75, 76, 77, 78, 79, 80)
 def test_law_is_the_explicit_law(name, kind, full):
     """(69)-(71), (79)-(81) and their hydraulic form, at random states and references.
 
@@ -259,6 +260,7 @@ def track(name, kind, step, duration):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", DEGREES)
 @pytest.mark.parametrize("name", ARMS)
+@pytest.mark.equation(72, 73, 82, 83)
 def test_errors_are_their_closed_forms(name, kind):
     """(72)-(73), (82)-(83) and their kin at 1 ms, relative to the errors at the start.
 

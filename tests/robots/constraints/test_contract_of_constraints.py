@@ -9,7 +9,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from members import Mirror, RubbingPoint, Saddle, subclasses
+from members import FrictionalPoint, Mirror, Saddle, subclasses
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
@@ -76,9 +76,9 @@ def ball_at(place, _):
     return PointOnSurface("tip", Sphere(tuple(center), 0.5, inside=True), POINT, "ball")
 
 
-def rubbing_at(place, _):
+def frictional_at(place, _):
     surface = Plane(tuple(place @ POINT), (1.0, 2.0, -2.0))
-    return RubbingPoint("tip", surface, POINT, "rubbing", coefficient=0.4)
+    return FrictionalPoint("tip", surface, POINT, "frictional", coefficient=0.4)
 
 
 def rough_at(place, _):
@@ -222,7 +222,7 @@ MEMBERS = {
     "prismatic": (sliding_at, {"tip", "base"}),
     "planar prismatic": (sliding_in_a_plane_at, {"tip", "base"}),
     "rod": (rod_at, {"tip", "base"}),
-    "rubbing": (rubbing_at, {"tip", "world"}),
+    "frictional": (frictional_at, {"tip", "world"}),
     "rough": (rough_at, {"tip", "world"}),
     "blade": (blade_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
@@ -295,7 +295,7 @@ def given(request):
 def test_rows_are_as_many_as_names(given):
     _, constraint, evaluate, *_ = given
     found, count = evaluate(), len(constraint.force_signals)
-    assert len(constraint.residual_signals) == len(constraint.can_only_push) == count
+    assert len(constraint.residual_signals) == len(constraint.is_unilateral) == count
     assert found["rate"].shape == (count,)
     assert found["residual"].size <= count
     names = [s.name for s in (*constraint.force_signals, *constraint.residual_signals)]
@@ -304,6 +304,7 @@ def test_rows_are_as_many_as_names(given):
     assert all(name.startswith(f"{constraint.name}.") for name in names)
 
 
+@pytest.mark.equation(38)
 def test_it_holds_and_its_rate_is_the_derivative(given):
     _, _, evaluate, *_ = given
     found = evaluate()
@@ -317,6 +318,7 @@ def test_rate_is_linear_in_velocities(given):
     np.testing.assert_allclose(evaluate(v=-3.0 * v)["rate"], -3.0 * evaluate()["rate"], **CLOSE)
 
 
+@pytest.mark.equation(41)
 def test_reaction_is_linear_and_does_the_work_of_the_rate(given):
     """Friction takes some: tau . v = lambda . rate without it, and less with it."""
     _, constraint, evaluate, _, v, load, _ = given
@@ -444,7 +446,7 @@ def test_a_push_drives_the_residual_up():
     links, found = robot(), set()
     for name in MEMBERS:
         constraint, _, context, v, *_ = case(name, 0)
-        pushing = [i for i, pushes in enumerate(constraint.can_only_push) if pushes]
+        pushing = [i for i, pushes in enumerate(constraint.is_unilateral) if pushes]
         if not pushing:
             continue
         found.add(name)
@@ -457,4 +459,4 @@ def test_a_push_drives_the_residual_up():
         )(links.plant.GetPositions(context), v, values)
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
-    assert found == {"plane", "ball", "saddle", "formula", "rubbing", "rough", "rolling"}
+    assert found == {"plane", "ball", "saddle", "formula", "frictional", "rough", "rolling"}

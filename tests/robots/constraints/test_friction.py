@@ -26,7 +26,7 @@ from drake_dae.scenario.shipped import find_scenario
 GRAVITY = 9.81
 
 
-def rubbing(friction=0.3, stiction_tolerance=0.05, viscous=None, actuation=(), name="two_link"):
+def frictional(friction=0.3, stiction_tolerance=0.05, viscous=None, actuation=(), name="two_link"):
     """An arm of `arms` whose wall rubs."""
     model = touching(name, actuation)
     (smooth,) = model.constraints
@@ -50,7 +50,7 @@ def test_the_motion_is_that_of_multibody_plant_with_the_force_of_friction_on_the
     Numbers are of order 100: 1e-9 is round-off with room.
     """
     mu, speed, d = 0.4, 0.05, 7.0
-    model = rubbing(mu, speed, d, name=name)
+    model = frictional(mu, speed, d, name=name)
     plant, count = RobotPlant(model), model.links.v.numel()
     context, random = plant.CreateDefaultContext(), np.random.default_rng(1)
     for state in consistent_states(name, 5):
@@ -80,10 +80,10 @@ def test_the_motion_is_that_of_multibody_plant_with_the_force_of_friction_on_the
 
 def test_no_friction_leaves_no_trace_in_the_equations():
     """Without it, not an operation more; with a coefficient of 0, the same motion."""
-    smooth, zero = touching("two_link"), rubbing(0.0)
+    smooth, zero = touching("two_link"), frictional(0.0)
     assert [p.name for p in smooth.constraints[0].parameters] == ["wall.position"]
     assert not smooth.dae.contacts
-    assert not smooth.dae.rubbing
+    assert not smooth.dae.frictional_contacts
     values = []
     for model in (smooth, zero):
         plant = RobotPlant(model)
@@ -103,7 +103,7 @@ def test_numbers_of_friction_that_make_no_sense_are_refused():
         PointOnSurface("tool", wall, viscous_friction=-0.1)
     with pytest.raises(ModelError, match=r"'surface\.stiction_tolerance' must be positive"):
         PointOnSurface("tool", wall, friction=0.3, stiction_tolerance=0.0)
-    plant = RobotPlant(rubbing())
+    plant = RobotPlant(frictional())
     context = plant.CreateDefaultContext()
     with pytest.raises(ModelError, match="must not be negative"):
         plant.set_parameter(context, "wall.friction", -0.3)

@@ -131,14 +131,14 @@ def test_a_surface_that_turns_drags_along_what_rubs_on_it(friction, viscous):
         stiction_tolerance=speed,
         viscous_friction=viscous,
     )
-    rubbing = RobotModel(
+    frictional = RobotModel(
         model.links,
         [wall],
         model.positions,
         [1.2, -1.6],
         exogenous=("wall.position", "wall.rpy"),
     )
-    plant, random = RobotPlant(rubbing), np.random.default_rng(3)
+    plant, random = RobotPlant(frictional), np.random.default_rng(3)
     center, rpy = random.uniform(-0.5, 0.5, (3, 3)), random.uniform(-1.0, 1.0, (3, 3))
     center[0], rpy[0] = (1.2, 0.0, 0.1), (0.0, 0.1, 0.0)
     context, control = plant.CreateDefaultContext(), random.uniform(-30.0, 30.0, 2)

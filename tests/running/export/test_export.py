@@ -240,7 +240,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
     """Law, limits and observer are in the update of the loop, so that nothing is left out."""
     words = ["observer={rate: 20.0}", "sampling={period: 0.002}", "saturation=true"]
-    words.append("force=!MeasuredForce {sample_period: 0.002}")
+    words.append("force_feedback=!MeasuredForce {sample_period: 0.002}")
     settings = [word for each in words for word in ("--set", each)]
     assert main(["export", "two_link_wall", *settings, "--out", str(tmp_path)]) == 0
     assert "not among them" not in capsys.readouterr().out

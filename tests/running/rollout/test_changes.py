@@ -28,7 +28,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.errors import InconsistentStateError, JammedContactError, ModelError, SimulationError
+from drake_dae.errors import InconsistentStateError, PainleveError, ModelError, SimulationError
 from drake_dae.running.rollout.program import program_of
 
 with_compiler = pytest.param(
@@ -311,7 +311,7 @@ def test_what_a_block_raises_ends_the_run_with_its_record():
     context = diagram.CreateDefaultContext()
     plant.set_state(plant.GetMyMutableContextFromRoot(context), sliding(1.1))
     (found,) = rollout(diagram, *start_values(diagram, context), [0.0, 0.1])
-    assert isinstance(found.failure, JammedContactError)
+    assert isinstance(found.failure, PainleveError)
     assert found.record.time.size == 0
     above = sliding(1.1) + np.eye(6)[1] * 0.05
     plant.set_state(plant.GetMyMutableContextFromRoot(context), above)

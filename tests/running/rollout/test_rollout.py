@@ -94,7 +94,7 @@ def test_equal_fixed_steps_are_equal(name, scheme, compiled):
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
-    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    seeds = [chosen.force_feedback.seed] if chosen.force_feedback.is_measured else None
     (found,) = rollout(
         loop,
         start,
@@ -306,7 +306,7 @@ def test_integrals_are_those_of_drake(case, compiled):
         grid(0.1, 1e-3),
         config=chosen.integrator,
         compiled=compiled,
-        seeds=[chosen.force.seed],
+        seeds=[chosen.force_feedback.seed],
     )
     assert_equal_records(found.record, wanted, 1e-12)
 
@@ -386,7 +386,7 @@ def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
     chosen = scenario(name, "duration=0.02", *fixed())
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
-    seeds = [chosen.force.seed] if chosen.force.is_measured else None
+    seeds = [chosen.force_feedback.seed] if chosen.force_feedback.is_measured else None
     wanted = run(loop, context, 0.02, chosen.integrator)
     arguments = (loop, start, parameters, grid(0.02, 1e-3))
     for compiled in (False, True)[: 2 if name in COMPILED and shutil.which("cc") else 1]:
@@ -405,7 +405,9 @@ def test_a_rollout_that_is_stopped_has_its_record_up_to_there(compiled):
     times, looks = np.linspace(0.0, 3.0, 31), iter([False] * (1 if compiled else 40))
     settings = {"config": chosen.integrator, "compiled": compiled}
     (whole,) = run_loop(loop, start, parameters, times, **settings)
-    (part,) = run_loop(loop, start, parameters, times, stop=lambda: next(looks, True), **settings)
+    (part,) = run_loop(
+        loop, start, parameters, times, look=lambda record: next(looks, True), **settings
+    )
     assert part.failure is None
     assert 1 < part.record.time.size < 31
     for name in whole.record.signals:
@@ -444,7 +446,7 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
         ["sampling={period: 0.003, delay: 0.003}", "saturation=true"],
         [
             "sampling={period: 0.002}",
-            "force=!MeasuredForce {sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
+            "force_feedback=!MeasuredForce {sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
             "integral=[tool.z]",
             "gains=!Poles {all: [-4, -5, -6]}",
         ],
@@ -461,7 +463,7 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
-    seeds = {"force_noise": chosen.force.seed} if chosen.force.is_measured else {}
+    seeds = {"force_noise": chosen.force_feedback.seed} if chosen.force_feedback.is_measured else {}
     if chosen.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
     (found,) = rollout(
@@ -477,7 +479,7 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     assert_equal_records(found.record, wanted, 1e-11)
 
 
-OBSERVED = ["sampling={period: 0.002}", "force=!MeasuredForce {sample_period: 0.002}"]
+OBSERVED = ["sampling={period: 0.002}", "force_feedback=!MeasuredForce {sample_period: 0.002}"]
 
 
 @pytest.mark.slow
@@ -485,7 +487,7 @@ OBSERVED = ["sampling={period: 0.002}", "force=!MeasuredForce {sample_period: 0.
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
-        ("two_link_wall", ["constraints.0.friction=0.0", "observer.friction=[wall]"]),
+        ("two_link_wall", ["constraints.0.friction=0.0", "observer.identify_friction=[wall]"]),
         ("two_link_wall", ["saturation=true", "integral=[tool.z]", "observer.force_rate=5.0"]),
         ("two_link_wall", ["encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"]),
         ("two_link_flexible", ["sampling.delay=0.001"]),
@@ -503,7 +505,7 @@ def test_observed_loops_are_those_of_drake(name, settings, compiled):
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
     assert np.ptp(wanted["disturbance"], axis=0).max() > 1.0
-    seeds = {"force_noise": chosen.force.seed}
+    seeds = {"force_noise": chosen.force_feedback.seed}
     if chosen.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
     settings = {"config": chosen.integrator, "compiled": compiled, "seeds": [seeds]}

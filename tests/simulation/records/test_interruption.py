@@ -9,7 +9,7 @@ import pytest
 
 from drake_dae.simulation.records.interruption import (
     ENDING_SIGNALS,
-    Ending,
+    Interruption,
     end_at_once,
     ending_signals,
 )
@@ -46,7 +46,7 @@ def test_a_signal_within_a_call_of_casadi_is_heard(sent):
     with pytest.raises(KeyboardInterrupt) as ended:
         wait()
     assert ended.value.args == (sent,)
-    with ending_signals(ending := Ending()):
+    with ending_signals(ending := Interruption()):
         compute(Interrupted(sent))
         limit = time.monotonic() + 20
         while ending.signal is None and time.monotonic() < limit:

@@ -167,6 +167,11 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     assert predicted.shape == record["tracking_error"].shape
     np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-6)
     own = controller.GetMyContextFromRoot(context)
+    plant = loop.plant.GetMyContextFromRoot(context)
+    compared = controller.compared(own, lambda name: loop.plant.GetOutputPort(name).Eval(plant))
+    assert (compared is None) is not ("reference" in loop.signals or controller.takes_over)
+    for found, wanted in zip(compared or (), (outputs, desired), strict=False):
+        np.testing.assert_allclose(found, wanted[-1], atol=1e-6)
     assert ("control" in loop.loggers) is not controller.follows
     assert len(controller.changes(own)) == (1 if controller.takes_over else 0)
 

@@ -106,7 +106,7 @@ def test_a_push_that_the_law_does_not_know_is_integrated_away():
     push = KnownForce("tool", name="push")
     smooth = touching("two_link")
     model = RobotModel(
-        smooth.links, smooth.constraints, smooth.positions, [1.2, -1.6], loads=[push]
+        smooth.links, smooth.constraints, smooth.positions, [1.2, -1.6], known_forces=[push]
     )
     structure = find_structure(model.dae)
     wanted, ends = [ConstantReference(0.3), ConstantReference(20.0)], {}

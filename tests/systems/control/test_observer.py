@@ -141,7 +141,7 @@ def test_noise_of_velocities_comes_through_as_the_filter_says():
 
 
 @cache
-def rubbing(friction: float) -> tuple[RobotModel, DaeSystem]:
+def frictional(friction: float) -> tuple[RobotModel, DaeSystem]:
     """The two-link arm on its wall, and what its law takes it for: with friction to be found."""
     smooth = touching("two_link")
     wall = replace(smooth.constraints[0], friction=friction, stiction_tolerance=1e-3)
@@ -153,14 +153,14 @@ def rubbing(friction: float) -> tuple[RobotModel, DaeSystem]:
 @cache
 def smooth_law() -> tuple[TrackingLaw, ConstraintStructure]:
     """The law that is told of no friction, and the structure of its plant."""
-    model, dae = rubbing(0.0)
+    model, dae = frictional(0.0)
     law = TrackingLaw(dae, poles(-10.0), measured_force=True)
     return law, find_structure(model.dae)
 
 
 def slide(wanted, duration, observing, friction=0.3, change=None):
     """The arm on a wall that rubs, of which its law knows nothing; the plant is ideal."""
-    model, _ = rubbing(0.0)
+    model, _ = frictional(0.0)
     law, structure = smooth_law()
     plant = RobotPlant(model, structure=structure)
     sensor = ForceSensor(1, sample_period=1e-3)
@@ -234,7 +234,7 @@ def test_handing_over_to_friction_moves_nothing():
 
 def test_wanted_velocities_are_those_of_the_reference_on_the_constraints():
     """v of P v = r' + t r'', J v = 0, with P and J of the tool by MultibodyPlant; t = 20 ms."""
-    _, dae = rubbing(0.3)
+    _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-4.0))
     observation = DisturbanceObserver(law, Observing(5.0), T).observation
     state = law.structure.states[0]
@@ -252,7 +252,7 @@ def test_friction_is_cancelled_against_the_motion_that_is_wanted_when_the_contro
 
     r' = -5 mm/s turns by then, with r'' = 1 m/s^2, to 15 mm/s, at which friction is nearly full.
     """
-    _, dae = rubbing(0.3)
+    _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-4.0))
     observer = DisturbanceObserver(law, Observing(5.0), T, control_delay=0.02)
     state = law.structure.states[0]
@@ -281,7 +281,7 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
     So noise of a velocity near 0, where friction is steep, makes no torque. With poles at -1e-6 the
     law feeds no velocity back; what is left grows with its square.
     """
-    _, dae = rubbing(0.3)
+    _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-1e-6))
     observer = DisturbanceObserver(law, Observing(5.0), T)
     reference, controls = np.array([0.3, 0.2, 0.0, 20.0]), []
@@ -330,7 +330,7 @@ def test_sharing_is_by_the_accelerations_that_forces_make():
 
 
 def test_law_without_a_disturbance_is_that_of_the_system():
-    model, dae = rubbing(0.3)
+    model, dae = frictional(0.3)
     given = TrackingLaw(model.dae, poles(-4.0)), TrackingLaw(dae, poles(-4.0))
     state = find_structure(model.dae).states[0]
     reference = np.linspace(0.2, 0.7, given[0].layout.reference_size)
@@ -340,7 +340,7 @@ def test_law_without_a_disturbance_is_that_of_the_system():
 
 def test_law_cancels_a_disturbance_that_acts_as_a_known_torque():
     """A torque d at the joints is cancelled by -d of the motors, whatever the state."""
-    _, dae = rubbing(0.3)
+    _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-4.0))
     state = law.structure.states[0]
     reference = np.linspace(0.2, 0.7, law.layout.reference_size)
@@ -356,7 +356,7 @@ def test_what_cannot_be_observed_is_refused():
         with_disturbance(system, ["w"])
     with pytest.raises(ModelError, match="already"):
         with_disturbance(system, ["v"])
-    model, dae = rubbing(0.3)
+    model, dae = frictional(0.3)
     with pytest.raises(ModelError, match="no disturbance to observe"):
         DisturbanceObserver(TrackingLaw(model.dae, poles(-4.0)), Observing(5.0), T)
     law = TrackingLaw(dae, poles(-4.0))

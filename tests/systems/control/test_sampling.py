@@ -345,7 +345,7 @@ def test_force_of_a_sampled_sensor_follows_the_control_of_two_samples_before():
         "two_link_wall",
         "references={tool.z: 0.3, wall.force: 20}",
         "start.errors={}",
-        "force=!MeasuredForce {gain: 5, time_constant: 0.05, sample_period: 0.01}",
+        "force_feedback=!MeasuredForce {gain: 5, time_constant: 0.05, sample_period: 0.01}",
         "sampling={period: 0.01, delay: 0.0}",
     )
     loop, context = build_scenario(found)

@@ -79,6 +79,7 @@ def test_direct_feedthrough_is_exact():
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.equation(26, 27)
 def test_vector_field_and_outputs_by_hand(name):
     """zeta' ends in a + B u, xi' follows x', and v and z are those of the closed forms."""
     problem, system = PROBLEMS[name](), realization(name)

@@ -87,6 +87,7 @@ def run(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 4.0])
+@pytest.mark.equation(61)
 def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     """(61) with a wrong mass: within 5 %, of which the lag takes about 1 %; position untouched."""
     model = arm("two_link").model
@@ -179,6 +180,7 @@ def test_with_a_right_model_measured_force_changes_nothing():
             )
 
 
+@pytest.mark.equation(59)
 def test_law_59_with_measured_force():
     """u of (59) less u without Gbar is J^T Gbar (lambda - r_2)."""
     found, gain = arm("two_link"), 3.0

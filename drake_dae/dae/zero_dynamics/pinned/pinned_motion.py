@@ -6,8 +6,8 @@ from enum import Enum
 from drake_dae.arrays import FloatArray
 
 
-class Cause(Enum):
-    """Why a motion with pinned outputs ends; the value says it."""
+class EndCause(Enum):
+    """The cause for the end of a motion with pinned outputs; the value describes it."""
 
     NO_START = "no state has the outputs that the reference begins with"
     SINGULAR_START = "A(x) or B(x) is singular at the start, or the domain of the system ends"
@@ -23,18 +23,18 @@ class Cause(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Ending:
-    """Up to where there is a motion with pinned outputs, and why not further.
+class MotionEnd:
+    """The end of a motion with pinned outputs, and its cause.
 
     Attributes:
         cause: Why the motion ends.
-        time: Up to when there is a motion, in s.
+        time: The end time, in s.
         state: The last state, shape (n,); None if there is none.
         matrix: The matrix that loses its rank, "A" or "B"; empty if none does.
-        text: All of this in a sentence.
+        text: The same as a sentence.
     """
 
-    cause: Cause
+    cause: EndCause
     time: float
     text: str
     state: FloatArray | None = None
@@ -66,4 +66,4 @@ class PinnedMotion:
     parameters: FloatArray
     constraint_margins: FloatArray
     control_margins: FloatArray
-    ending: Ending | None
+    ending: MotionEnd | None

@@ -1,11 +1,11 @@
-"""The states that have their outputs on a reference, and how they move.             (28), (35)
+"""States whose outputs are on a reference, and their motion.                        (28), (35)
 
 Pinned outputs leave the states
 
     Z(R) = {x in N*: L_f*^j l*_i(x) = r_i^(j), j = 0, ..., mu_i - 1},
 
-and the control u = B^-1 (-a + r^(mu)), which is (28) without an error; where controls outnumber
-outputs, the u that the system's metric chooses. On Z(R) the state moves by x' = f* + h* u.
+and the control u = B^-1 (-a + r^(mu)), which is (28) without an error; with more controls than
+outputs, the system's metric chooses u. On Z(R) the state moves by x' = f* + h* u.
 """
 
 from functools import cached_property
@@ -18,13 +18,14 @@ from drake_dae.dae.manifold.search import CONSISTENT
 from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.zero_dynamics.pinned.points import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
-from drake_dae.trace.newton import Linearization, newton, shortest_steps
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
 VANISHED = 1e-9
-"""A or B counts as singular below this part of its usual margin, also where it is one number."""
+"""A or B counts as singular below this fraction of its usual margin, also if it is a single
+number."""
 
 
 class PinnedOutputs:
@@ -35,7 +36,7 @@ class PinnedOutputs:
 
     Attributes:
         layout: How R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) is stacked.
-        residual_signals: What is zero on Z(R): the constraints, then the output errors, each with
+        residual_signals: The residuals of Z(R): the constraints, then the output errors, each with
             its derivatives.
     """
 
@@ -49,10 +50,10 @@ class PinnedOutputs:
             *layout.chain_signals(system.output_signals),
         )
         errors = structure.chain - goal[layout.chained.tolist(), :]
-        residual = ca.vertcat(structure.manifold.residual_expression, errors)
+        residual = ca.vertcat(structure.manifold.residual_expression, errors)  # (36)
         derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
         control, pivot = structure.control_by_matrix(highest)
-        self._rate, constraint_input = (
+        self._rate, constraint_input = (  # (35)
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
         )
@@ -62,9 +63,9 @@ class PinnedOutputs:
         self._gradient = system.trace(
             "gradient of the pinned outputs",
             {"gradient": ca.jacobian(ca.cse(residual), system.state)},
-            often=False,  # Those of the residual are removed above; finding more takes long.
+            often=False,  # Common subexpressions are removed already.
         )
-        # E x' = f + g v + h u, and the sizes of what cancels in it at rest.
+        # E x' = f + g v + h u, and the sizes of its terms, which cancel at rest.
         mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
         states = ca.fmax(ca.DM(system.scale), ca.fabs(system.state))
         sizes = ca.mtimes(mass, states) + ca.fabs(system.f)
@@ -100,7 +101,7 @@ class PinnedOutputs:
                 "of the system",
                 residual,
             )
-        # The distances by which they are missed, if these are small.
+        # The remaining distances, if these are small.
         length = np.linalg.norm(self.gradients(found, parameters) * self.system.scale, axis=1)
         missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
         worst = int(np.argmax(missed))
@@ -119,13 +120,13 @@ class PinnedOutputs:
     def project(
         self, start: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, bool]:
-        """The state on Z(R) next to a start; or where Newton's method ended, and False."""
+        """The state on Z(R) next to a start, and whether Newton's method converged."""
         scale = self.system.scale
 
         def residual(z: FloatArray) -> FloatArray:
             return self._residual.evaluate(scale * z, reference, parameters)[0]
 
-        def linearize(z: FloatArray) -> Linearization | None:
+        def linearize(z: FloatArray) -> NewtonModel | None:
             return shortest_steps(self.gradients(scale * z, parameters) * scale, residual)
 
         found, converged = newton(start / scale, linearize)
@@ -139,7 +140,7 @@ class PinnedOutputs:
     def residual(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """What is zero on Z(R), named by `residual_signals`, shape (k,)."""
+        """The residual of Z(R), named by `residual_signals`, shape (k,)."""
         return self._residual.evaluate(state, reference, parameters)[0].copy()
 
     def gradients(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -154,7 +155,7 @@ class PinnedOutputs:
     def coordinates(
         self, state: FloatArray, parameters: FloatArray, scale: FloatArray
     ) -> tuple[Indices, FloatArray]:
-        """States that are coordinates of Z(R), and how all move with them, (d,) and (n, d)."""
+        """Coordinate states of Z(R), and the derivatives of all by them, (d,) and (n, d)."""
         return coordinates(self.gradients(state, parameters), scale)
 
     def rate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -206,7 +207,7 @@ class PinnedOutputs:
     def sizes_of_slopes(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """How large the terms are that add up to dx'/dx, before they cancel, shape (n, n)."""
+        """The sizes of the terms of dx'/dx before cancellation, shape (n, n)."""
         point = self.point(state, reference, parameters)
         given = (point.rate, point.control, point.constraint_input, parameters)
         n, inputs = state.size, point.constraint_input.size + point.control.size
@@ -229,7 +230,7 @@ class PinnedOutputs:
 
     @cached_property
     def _balance(self) -> TracedFunction:
-        """E, the slope of f + g v + h u - E x' with all but the state fixed, and (g, h)."""
+        """E, the derivative of f + g v + h u - E x' by the state alone, and (g, h)."""
         system, u = self.system, self.structure.derivatives.control
         rate, v = ca.SX.sym("x'", system.num_states), ca.SX.sym("v", system.num_constraints)
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)

@@ -1,4 +1,4 @@
-"""What a robot must be for Drake's own contact to be its plant, and what it has otherwise."""
+"""Checks of a robot for Drake's own contact, and changed parameters."""
 
 from collections.abc import Mapping
 
@@ -12,17 +12,17 @@ from drake_dae.robots.model import RobotModel
 
 
 def check_model(model: RobotModel) -> None:
-    """Refuses what Drake's contact cannot stand for.
+    """Refuses a model that Drake's contact cannot represent.
 
     Raises:
-        ModelError: What that is.
+        ModelError: It cannot; the message has the reason.
     """
     if model.links.plant is None:
         raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
-    if model.dae.exogenous or model.loads:
+    if model.dae.exogenous or model.known_forces:
         raise ModelError(
-            "Drake's contact as the plant takes no exogenous signals and no loads; forces that the "
-            "law does not know are pushes (plant_pushes)"
+            "Drake's contact as the plant takes no exogenous signals and no known_forces; forces "
+            "that the law does not know are disturbance forces (plant_disturbances)"
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
@@ -36,11 +36,11 @@ def check_model(model: RobotModel) -> None:
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
-    """The values of all parameters, of which a plant has some otherwise.
+    """The values of all parameters, some of them changed for a plant.
 
     Args:
         model: The robot.
-        parameters: Name -> value, of what the robot touches, of masses, and of stages.
+        parameters: Name -> value: of surfaces, masses and stages.
 
     Raises:
         ModelError: There is no such parameter, or a value does not fit.
@@ -67,10 +67,10 @@ def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -
 
 
 def check_same(plant: MultibodyPlant, model: RobotModel) -> None:
-    """Refuses another robot than that of the model.
+    """Refuses a robot other than that of the model.
 
     Raises:
-        ModelError: It is another.
+        ModelError: It is another robot.
     """
     drawn = model.links.plant
     assert drawn is not None  # check_model.

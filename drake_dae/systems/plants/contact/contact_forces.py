@@ -1,4 +1,4 @@
-"""What Drake's contact results are as constraint forces."""
+"""Drake's contact results as constraint forces."""
 
 from collections.abc import Sequence
 
@@ -19,11 +19,11 @@ from drake_dae.systems.blocks.traced import Block, not_traced
 
 
 class ContactForces(LeafSystem):
-    """Reads Drake's contact of a robot as its `RobotModel` speaks of it.
+    """Converts Drake's contact results to the signals of a `RobotModel`.
 
     A constraint force is the contact force along the normal of its surface, lambda = n(q) . F,
-    where n is the gradient of phi and F is what all contacts of the constraint's two geometries,
-    points and patches, exert on the robot. A contact that is open has lambda = 0 and phi > 0.
+    where n is the gradient of phi and F is the total force on the robot of all contacts (points and
+    patches) between the constraint's two geometries. An open contact has lambda = 0 and phi > 0.
 
     Input ports:
         state: x, shape (n,).
@@ -31,15 +31,16 @@ class ContactForces(LeafSystem):
 
     Output ports:
         constraint_force: lambda, N, shape (m,).
-        contact_force: F in the world, N, shape (3 m,), constraint by constraint: with its friction.
-        constraint_residual: phi and phi', as `DaePlant` has them; not zero, since a compliant
-            surface is pressed in.
+        contact_force: F in the world, N, shape (3 m,), constraint by constraint, including
+            friction.
+        constraint_residual: phi and phi', as for `DaePlant`; not zero, since compliant surfaces are
+            penetrated.
         controlled_output: z = l(x) + m(x) lambda.
 
     Args:
         model: The robot; each constraint is a contact with one force.
         structure: The structure of its system.
-        pairs: For each constraint, the geometry of the robot and that of what it touches.
+        pairs: For each constraint, the geometry of the robot and that of the surface.
         parameters: Values of all parameters.
 
     Attributes:
@@ -71,7 +72,7 @@ class ContactForces(LeafSystem):
         self._output = dae.trace("controlled output", output, {"force": force})
         self._state = self.DeclareVectorInputPort("state", dae.num_states)
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        # What the other ports take from it is found once.
+        # The part that other ports use is computed once.
         contact = self.DeclareVectorOutputPort(
             "contact_force", 3 * len(self._pairs), weakly(self._calc_contact)
         )

@@ -1,4 +1,4 @@
-"""How Drake's own contact gives way and rubs."""
+"""The compliance and friction of Drake's own contact."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -20,28 +20,28 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class ContactMaterial:
-    """How Drake's MultibodyPlant shall model the contacts of a robot.
+    """The contact model of Drake's MultibodyPlant for a robot.
 
-    The robot touches with a ball, and what it touches is as in its constraints. With points the
-    force is stiffness times depth; with hydroelastic patches the ball is rigid, and what it touches
-    has a pressure of modulus times depth / thickness.
+    The robot touches with a ball; the surfaces are those of its constraints. With point contact the
+    force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
+    the pressure modulus times depth / thickness.
 
-    Where the robot tilts by an angle a from its nominal position, the ball rolls: it touches
-    2 radius sin(a / 2) beside the point of the constraint, and that point is radius (1 - cos a)
-    off the surface. A stiffer contact does not come nearer to the ideal one there, a smaller
-    radius does. A tool that stays normal to its surface does not roll.
+    If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
+    distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
+    a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
+    stiffer contact. A tool that stays normal to its surface does not roll.
 
     Attributes:
         time_step: The step of the plant, s.
         contact_model: "point" or "hydroelastic".
-        stiffness: Of a point contact, N/m.
+        stiffness: The stiffness of point contact, N/m.
         modulus: The hydroelastic modulus, Pa.
-        thickness: How deep the layer is that gives way, m; hydroelastic contact alone.
-        dissipation: Of Hunt and Crossley, s/m.
+        thickness: The thickness of the compliant layer, m; hydroelastic contact only.
+        dissipation: The Hunt-Crossley dissipation, s/m.
         friction: The coefficient of friction of all contacts; None for those of the constraints.
-        radius: Of the ball, m. It touches the surface where the point of the constraint is while
-            the robot holds it as at its nominal positions, and rolls on it otherwise: the
-            difference from an ideal contact is proportional to it, whatever the stiffness.
+        radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
+            constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
+            radius.
 
     Raises:
         ModelError: A number makes no sense.
@@ -76,7 +76,7 @@ def ball_properties(material: ContactMaterial, friction: float) -> ProximityProp
 def surface_properties(
     material: ContactMaterial, friction: float, is_half_space: bool
 ) -> ProximityProperties:
-    """The properties of what the ball touches."""
+    """The properties of the surface."""
     properties = _common_properties(material, friction)
     if material.contact_model == "hydroelastic" and is_half_space:
         AddCompliantHydroelasticPropertiesForHalfSpace(
@@ -88,7 +88,7 @@ def surface_properties(
 
 
 def _common_properties(material: ContactMaterial, friction: float) -> ProximityProperties:
-    properties, rubbing = ProximityProperties(), CoulombFriction(friction, friction)
+    properties, frictional = ProximityProperties(), CoulombFriction(friction, friction)
     # Two equal springs in series have half their stiffness.
-    AddContactMaterial(material.dissipation, 2.0 * material.stiffness, rubbing, properties)
+    AddContactMaterial(material.dissipation, 2.0 * material.stiffness, frictional, properties)
     return properties

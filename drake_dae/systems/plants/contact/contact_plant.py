@@ -46,13 +46,16 @@ from drake_dae.systems.plants.contact.contact_material import (
     ball_properties,
     surface_properties,
 )
-from drake_dae.systems.plants.contact.pushes import AppliedPushes, Push
+from drake_dae.systems.plants.contact.disturbance_forces import (
+    AppliedDisturbances,
+    DisturbanceForce,
+)
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
 from drake_dae.systems.plants.contract import Plant
 
 
 def _is_of_use(record: logging.LogRecord) -> bool:
-    """Each context would tell that half spaces have no deformable contact, which none here has."""
+    """Filters Drake's message on half spaces in deformable contact, which is not used here."""
     return "half spaces are not currently supported for deformable" not in record.getMessage()
 
 
@@ -60,48 +63,46 @@ def _is_of_use(record: logging.LogRecord) -> bool:
 class ContactPlant(Diagram, Plant):
     """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
 
-    What an ideal constraint keeps exactly, compliant contact with friction keeps nearly, and it may
-    open. A ball on the robot stands for the point of each constraint, and its surface for what it
-    touches; nothing else of the robot collides.
+    Compliant contact with friction satisfies the constraints approximately, and may open. For each
+    constraint there is a ball on the robot at its point, and its surface in the world; nothing else
+    of the robot collides.
 
-    The plant steps at t_n = n time_step: what is at its ports then is x(t_n), before the step to
-    t_(n+1), for which it takes the control that it finds at t_n. The force is that of the step that
-    led to t_n.
+    The plant steps at t_n = n time_step: its ports then have x(t_n), before the step to t_(n+1),
+    which uses the control at t_n. The force is that of the step to t_n.
 
-    Stages of actuation step beside it, and drive its joints: see `SteppedStages`. Rotors that turn
-    with a stage do not turn with the links.
+    Stages of actuation step with it and drive its joints: see `SteppedStages`. Rotors that belong
+    to a stage do not move with the links.
 
     Input port:
-        control: u, shape (p,): the torques and forces of the actuators, N m (N), or what drives the
-            last stage.
+        control: u, shape (p,): the torques and forces of the actuators, N m (N), or the drive of
+            the last stage.
 
     Output ports:
         state: x = (q, v), and the states of the stages; shape (n,).
-        link_state: (q, v), shape (nq + nv,).
-        joint_torque, and those of the stages, as `motor_state`: as of a `RobotPlant`.
+        link_state: (q, v), shape (nq + nv,). joint_torque, and the ports of the stages such as
+        `motor_state`: as for `RobotPlant`.
         constraint_force, contact_force, constraint_residual, controlled_output: As of
             `ContactForces`.
         contact_results: Drake's.
         query_object: Drake's, of the scene with the contact geometry.
 
     Args:
-        model: The robot: each constraint a `PointOnSurface` that stands still, on a surface that
-            has a `solid`.
-        add_robot: Adds the robot to a plant as it was added to the one that the model is made of.
-        material: How it touches.
+        model: The robot: each constraint a `PointOnSurface` at rest, on a surface with a `solid`.
+        add_robot: Adds the robot to a plant, as it was added to the plant of the model.
+        material: The contact material.
         structure: The structure of the model's system.
-        parameters: Parameter name -> what the plant has otherwise: positions and friction of
-            surfaces, masses of bodies, and the numbers of stages.
-        pushes: Forces on the robot that its law does not know.
+        parameters: Parameter name -> the plant's value if it differs from the model: positions and
+            friction of surfaces, masses of bodies, and numbers of stages.
+        disturbances: Forces on the robot that its law does not know.
 
     Attributes:
-        dae, model, structure, time_step: Of the plant.
+        dae, model, structure, time_step: As for `Plant`.
         multibody: Drake's plant.
         contact_force_signals: Names and units of `contact_force`.
 
     Raises:
-        ModelError: The robot cannot touch in this way, or the step is too long for its stages;
-            why.
+        ModelError: The robot's contacts cannot be represented, or the step is too long for its
+            stages.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -115,7 +116,7 @@ class ContactPlant(Diagram, Plant):
         *,
         structure: ConstraintStructure,
         parameters: Mapping[str, ArrayLike] | None = None,
-        pushes: Sequence[Push] = (),
+        disturbances: Sequence[DisturbanceForce] = (),
     ) -> None:
         super().__init__()
         check_model(model)
@@ -140,9 +141,9 @@ class ContactPlant(Diagram, Plant):
         plant.Finalize()
         check_same(plant, model)
         self._masses = self._other_masses()
-        if pushes:
-            frames = [frame_named(plant, push.frame) for push in pushes]
-            applied = builder.AddSystem(AppliedPushes(plant, pushes, frames))
+        if disturbances:
+            frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
+            applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
             port = plant.get_applied_spatial_force_input_port()
             builder.Connect(applied.get_output_port(), port)
 
@@ -207,7 +208,7 @@ class ContactPlant(Diagram, Plant):
                 surface_properties(material, friction, isinstance(solid.form, HalfSpace)),
             )
             pairs.append((ball, touched))
-        # A robot's own shapes collide with nothing, and a ball with its own surface alone.
+        # The robot's own shapes do not collide, and a ball collides only with its own surface.
         every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
         manager = scene_graph.collision_filter_manager()
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(every)))
@@ -217,14 +218,14 @@ class ContactPlant(Diagram, Plant):
         return pairs
 
     def _balls(self, plant: MultibodyPlant, radius: float) -> list[tuple[Frame, FloatArray]]:
-        """The frame of the robot that each constraint holds, and where in it the ball stands."""
+        """The frame of each constraint on the robot, and the position of the ball in it."""
         model, values, drawn = self.model, self._values, self.model.links.plant
         assert drawn is not None  # check_model.
         state = self.structure.manifold.project(self.dae.nominal_state, values)
         context = drawn.CreateDefaultContext()
         drawn.SetPositionsAndVelocities(context, state[: drawn.num_multibody_states()])
         loads = ConstraintWrenches(model, values)
-        # A unit of force shows the normal, where nothing rubs.
+        # A unit force without sliding gives the normal.
         state[model.links.q.numel() :] = 0.0
         found = loads(state, np.ones(self.dae.num_constraints))
         balls = []
@@ -272,7 +273,7 @@ class ContactPlant(Diagram, Plant):
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x in a context, shape (n,), in contact or not.
 
-        Bodies get the masses that the plant has otherwise: Drake has these in its context.
+        Also sets the plant's changed masses, which Drake keeps in its context.
 
         Raises:
             ModelError: The shape is wrong.
@@ -289,7 +290,7 @@ class ContactPlant(Diagram, Plant):
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
 
-        The robot then touches without a force, and sinks in when the run begins.
+        The robot then touches without force, and penetrates when the run starts.
 
         Raises:
             InconsistentStateError: None is found near the guess.

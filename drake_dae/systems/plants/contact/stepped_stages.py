@@ -1,4 +1,4 @@
-"""Stages of actuation that step beside a discrete MultibodyPlant."""
+"""Stages of actuation that step with a discrete MultibodyPlant."""
 
 import casadi as ca
 import numpy as np
@@ -14,34 +14,34 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 _GROWTH = 1e-7
-"""By how much more than 1 a step may multiply what swings: round-off of motions without a force."""
+"""The allowed excess of the spectral radius over 1: round-off of motions without a force."""
 
 _SHORTER = np.geomspace(1.0, 0.01, 300)[1:]
-"""The parts of a step that is too long of which one may be short enough."""
+"""The fractions of a too long step that are tried for the message."""
 
 
 class SteppedStages(LeafSystem):
     """The stages between control and joints, E s' = drift(q, v, s) + drive u, step by step.
 
-    A discrete MultibodyPlant takes the forces on its joints as it finds them at t_n, makes the new
-    velocities with them, and the new positions with these. So do the stages: positions of shafts
-    are new by their new velocities, and everything else is new by what was at t_n,
+    A discrete MultibodyPlant computes new velocities from the forces at t_n, and new positions from
+    the new velocities. The stages do the same: positions of shafts follow from their new
+    velocities, and everything else from the values at t_n,
 
         E (s_(n+1) - s_n) = h (drift(q_n, v_n, s_n) + drive u_n),    but p_(n+1) = p_n + h p'_(n+1).
 
-    For springs, links and shafts together take the symplectic Euler method: where nothing damps, a
-    swing of rate w keeps its size as long as w h < 2, with the rate w_h of sin(w_h h / 2) = w h / 2
-    in place of w. Everything is of first order in h, as the step of the MultibodyPlant. A step that
-    lets something grow is refused: see `check_step`.
+    For springs, links and shafts together this is the symplectic Euler method: an undamped
+    oscillation of frequency w keeps its amplitude for w h < 2, with the frequency w_h of sin(w_h h
+    / 2) = w h / 2 in place of w. The method is of first order in h, as is that of the
+    MultibodyPlant. An unstable step is refused: see `check_step`.
 
     Input ports:
         link_state: (q, v) of the links, shape (nq + nv,).
-        control: What drives the last stage, shape (p,).
+        control: The drive of the last stage, shape (p,).
 
     Output ports:
         joint_torque: tau(q, v, s), N m (N), shape (p,).
-        state: x = (q, v, s), shape (n,).
-        And those of the stages, as `motor_state`; see their classes.
+        state: x = (q, v, s), shape (n,). And the ports of the stages, such as `motor_state`; see
+        their classes.
 
     Args:
         model: The robot, with any stage.
@@ -64,7 +64,7 @@ class SteppedStages(LeafSystem):
         self._size = size = _num_link_states(model)
         control = ca.SX.sym("u", dae.num_controls)
         driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
-        # No stage shares a mass with the links.
+        # Stages do not share a mass with the links.
         rate = PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
         after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rate)
         for position, velocity in _shafts(model).items():
@@ -75,7 +75,7 @@ class SteppedStages(LeafSystem):
         self._links = self.DeclareVectorInputPort("link_state", size)
         self._control = self.DeclareVectorInputPort("control", dae.num_controls)
         self._state = self.DeclareDiscreteState(dae.nominal_state[size:])
-        # Unrestricted, as the step of a discrete MultibodyPlant: so both see one instant.
+        # Unrestricted, as the step of a discrete MultibodyPlant, so that both see the same instant.
         self.DeclarePeriodicUnrestrictedUpdateEvent(time_step, 0.0, weakly(self._advance))
         own = {self.discrete_state_ticket(self._state)}
         both = own | {self.input_port_ticket(self._links.get_index())}
@@ -121,7 +121,7 @@ class SteppedStages(LeafSystem):
         """The value of a function.
 
         Raises:
-            NonFiniteError: There is none, at this time and state.
+            NonFiniteError: It is not finite, at this time and state.
         """
         state = self._whole(context)
         values = function.evaluate(state, *inputs, self._parameters)
@@ -136,10 +136,10 @@ class SteppedStages(LeafSystem):
 def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:
     """Refuses a step that is too long for the stages of a robot.
 
-    About rest, and with what the links are at the nominal state, one step multiplies small
-    deviations of (q, v, s) by a matrix; none of its eigenvalues must be beyond the unit circle. For
-    springs without damping that is w h <= 2; for the electric part of a motor R h / L <= 2, and
-    less where it swings with the inertia.
+    About rest at the nominal state, one step multiplies small deviations of (q, v, s) by a matrix,
+    whose eigenvalues must not be outside the unit circle. For springs without damping this means w
+    h <= 2; for the electric part of a motor R h / L <= 2, and less if it oscillates with the
+    inertia.
 
     Args:
         model: The robot, with any stage.

@@ -1,1 +1,1 @@
-"""Robots whose contacts open and close: modes, guards, resets, and the plant that runs them."""
+"""Robots with opening and closing contacts: modes, guards, resets, and the plant."""

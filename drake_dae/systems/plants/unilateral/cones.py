@@ -1,13 +1,15 @@
-"""Impulses of several contacts in their cones of friction, all at once; numbers alone.
+"""Impulses of several frictional contacts together, from numbers alone.
 
-With u = W y + q, y the impulses and u what becomes of the rates, each contact has its normal first:
+With u = W y + q, y the impulses and u the rates after the impact, each contact has its normal
+first:
 
     y in K = {|y_t| <= mu y_n},    u + mu |u_t| n in K*,    y . (u + mu |u_t| n) = 0,
 
 which is Coulomb's law (De Saxce and Feng, 1998). For given mu |u_t| that is a convex program, which
 the method of multipliers solves, and the shift follows along (Acary, Cadoux, Lemarechal and Malick,
-2011; Tasora, Mangoni, Benatti and Garziera, 2021). It need but tell which contacts open, stick and
-slide: with that Newton's method finds the impulses to round-off, and all conditions are checked.
+2011; Tasora, Mangoni, Benatti and Garziera, 2021). It only has to determine which contacts open,
+stick and slide. Then Newton's method finds the impulses to round-off, and all conditions are
+checked.
 """
 
 from collections.abc import Sequence
@@ -17,32 +19,32 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 
-STEPS = 1000
-"""So many steps are taken at most."""
+SWEEPS = 1000
+"""The largest number of steps of the method of multipliers."""
 
 LOOK = 20
-"""After so many steps each the ways of the contacts are tried."""
+"""The number of steps after which the present contact states (open, stick, slide) are tried."""
 
 LARGEST = 1e8
-"""Impulses that grow beyond this, relative to those that are wanted, balance nothing."""
+"""Impulses above this, relative to the wanted ones, show that there is no solution."""
 
 MARGINS = (1e-8, 1e-5, 1e-3, 1e-2)
-"""How near to an edge of its cone an impulse is on it."""
+"""The distances from the boundary of its cone at which an impulse counts as on it."""
 
 NEWTON_STEPS = 12
-"""So many steps of Newton's method are enough where the ways are right."""
+"""The largest number of Newton steps for the right contact states."""
 
 ROUND_OFF = 1e-14
-"""A step of Newton's method of this size, relative to the impulses, is the last."""
+"""A Newton step below this, relative to the impulses, is the last."""
 
 FITS = 1e-11
-"""What may be violated, relative to what there is."""
+"""The allowed violation of the conditions, relative to the sizes of their terms."""
 
 PENALTIES = 1e-4, 1e4
-"""Between these the penalty of the method of multipliers is sought."""
+"""The range of the penalty of the method of multipliers."""
 
 BALANCE = 10.0
-"""By more than this the residuals of impulses and of rates do not differ for long."""
+"""The penalty is adapted if the residuals of impulses and rates differ by more than this factor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Cone:
     """The cone of a contact.
 
     Attributes:
-        rows: Where its impulses stand, the normal's first.
+        rows: The rows of its impulses, the normal first.
         friction: mu, zero or more; infinite where it cannot slide.
     """
 
@@ -58,7 +60,7 @@ class Cone:
     friction: float
 
     def nearest(self, values: FloatArray) -> FloatArray:
-        """The impulse of the cone next to another one."""
+        """The projection of an impulse onto the cone."""
         normal, along, mu = values[0], values[1:], self.friction
         if np.isinf(mu):
             return np.concatenate([[max(normal, 0.0)], along])
@@ -77,11 +79,11 @@ def in_cones(matrix: FloatArray, offset: FloatArray, cones: Sequence[Cone]) -> F
     Args:
         matrix: W, positive semidefinite, shape (k, k).
         offset: q, shape (k,).
-        cones: The contacts, which have all rows, one after the other.
+        cones: The contacts, which together have all rows in order.
     """
     if not offset.any():
         return np.zeros(offset.size)
-    # One unit for all rows of a contact leaves its cone what it is.
+    # A common scale for all rows of a contact does not change its cone.
     unit = np.ones(offset.size)
     for cone in cones:
         unit[cone.rows] = 1.0 / np.sqrt(np.mean(np.diag(matrix)[cone.rows]))
@@ -96,7 +98,7 @@ def _searched(W: FloatArray, q: FloatArray, cones: Sequence[Cone]) -> FloatArray
     penalty, identity = 1.0, np.eye(q.size)
     inverse = np.linalg.inv(W + penalty * identity)
     z = multiplier = np.zeros(q.size)
-    for step in range(STEPS):
+    for step in range(SWEEPS):
         shifted = q.copy()
         for cone in cones:
             if np.isfinite(cone.friction):
@@ -126,7 +128,7 @@ def _nearest(cones: Sequence[Cone], values: FloatArray) -> FloatArray:
 def _polished(
     W: FloatArray, q: FloatArray, cones: Sequence[Cone], start: FloatArray
 ) -> FloatArray | None:
-    """The impulses of contacts that open, stick and slide as they nearly do; None if none fit."""
+    """The impulses for the contact states of an approximate solution; None if none fit."""
     tried: list[list[int]] = []
     largest = float(np.abs(start).max())
     for margin in MARGINS:
@@ -147,15 +149,15 @@ def _solved(
     start: FloatArray,
     ways: list[FloatArray | None],
 ) -> FloatArray | None:
-    """The impulses of contacts in certain ways, by Newton's method; None if they do not fit.
+    """The impulses for given contact states, by Newton's method; None if they do not fit.
 
     A contact that sticks has u = 0; one that slides along d has y = y_n (1, -mu d), u_n = 0, and no
     u across d, which is an unknown too.
 
     Args:
-        W, q, cones: As they are searched for.
-        start: Where to begin.
-        ways: As of `_way`.
+        W, q, cones: As for `in_cones`.
+        start: The start of Newton's method.
+        ways: The contact states, see `_way`.
     """
     y = start.copy()
     for cone, way in zip(cones, ways, strict=True):
@@ -217,14 +219,14 @@ def _way(cone: Cone, impulse: FloatArray, least: float, margin: float) -> FloatA
 
 
 def _against(cone: Cone, way: FloatArray) -> FloatArray:
-    """The impulse of a contact that slides along a way, for a unit across the surface."""
+    """The impulse of a contact that slides along a direction, per unit of normal impulse."""
     return np.concatenate([[1.0], -cone.friction * way])
 
 
 def _frame(
     cone: Cone, way: FloatArray | None, impulse: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What the unknowns of a contact change of its impulse, and which rates are zero; columns."""
+    """A contact's impulse by its unknowns, and its rates that are zero, as columns."""
     identity = np.eye(impulse.size)
     if way is None:
         return identity[:, :0], identity[:, :0]
@@ -239,7 +241,7 @@ def _frame(
 
 
 def _fits(cone: Cone, way: FloatArray | None, impulse: FloatArray, rates: FloatArray) -> bool:
-    """Whether a contact does as its way says, rates being relative to what there is."""
+    """Whether a contact satisfies the conditions of its state."""
     if way is None:
         return bool(rates[0] >= -FITS)
     if impulse[0] < 0.0:

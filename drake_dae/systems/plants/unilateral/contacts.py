@@ -1,4 +1,4 @@
-"""The contacts of a robot that open and close, and their numbers at a state."""
+"""The opening contacts of a robot, and their matrices at a state."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -8,29 +8,29 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, number, show, unknown_name
-from drake_dae.dae.system.contacts import Jam, jam
+from drake_dae.dae.system.contacts import PainleveOutcome, painleve_outcome
 from drake_dae.dae.system.layout import Indices
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import JammedContactError, ModelError
+from drake_dae.errors import ModelError, PainleveError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.unilateral.frictional import Rubbing
-from drake_dae.systems.plants.unilateral.impacts import Touch, is_p_matrix
+from drake_dae.systems.plants.unilateral.frictional import FrictionalContact
+from drake_dae.systems.plants.unilateral.impacts import TouchRows, is_p_matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """What decides of contacts at one state, for all constraints, shape (m,) each.
+    """The rates, accelerations and matrices of all constraints at one state.
 
     Attributes:
-        all_rates: The rates c of the constraints, phi' or what restricts velocities alone, and
-            below them the velocities at which contacts slide that rub, shape (m + s,).
+        all_rates: The rates c of the constraints, phi' or nonholonomic rows, then the sliding
+            velocities of frictional contacts, shape (m + s,).
         accelerations: c' without constraint forces.
-        force_matrix: How constraint forces enter c', shape (m, m).
-        all_impulses: How impulses enter `all_rates`, shape (m + s, m + s).
-        velocity_change: How impulses enter x, shape (n, m + s).
-        size: How large the terms are that `accelerations` are the sums of.
+        force_matrix: The matrix of constraint forces in c', shape (m, m).
+        all_impulses: The matrix of impulses in `all_rates`, shape (m + s, m + s).
+        velocity_change: The matrix of impulses in x, shape (n, m + s).
+        size: The sizes of the terms of `accelerations`.
     """
 
     all_rates: FloatArray
@@ -47,15 +47,17 @@ class Terms:
 
     @property
     def impulse_matrix(self) -> FloatArray:
-        """How impulses of constraints enter their rates, shape (m, m)."""
+        """The matrix of impulses of constraints in their rates, shape (m, m)."""
         m = self.accelerations.size
         return self.all_impulses[:m, :m]
 
-    def jam(self, kept: Sequence[int], normals: Sequence[int]) -> Jam | None:
-        """What becomes of contacts that touch and rub; None where one set of forces fits.
+    def painleve_outcome(
+        self, kept: Sequence[int], normals: Sequence[int]
+    ) -> PainleveOutcome | None:
+        """The outcome of a Painleve paradox of touching contacts; None if one set of forces fits.
 
         Args:
-            kept: The rows that nothing opens.
+            kept: The bilateral rows.
             normals: The rows of the contacts.
         """
         rows = [*kept, *normals]
@@ -71,11 +73,11 @@ class Terms:
         force = np.full(len(rows), np.inf)
         with suppress(np.linalg.LinAlgError):
             force[:] = np.linalg.solve(matrix, -offset)
-        return jam(matrix, without, force, self.size[rows], places)
+        return painleve_outcome(matrix, without, force, self.size[rows], places)
 
 
 class UnilateralContacts:
-    """Those constraints of a robot that open and close.
+    """The constraints of a robot that open and close.
 
     Args:
         model: The robot.
@@ -86,17 +88,16 @@ class UnilateralContacts:
         dae: The system with all contacts closed.
         restitution: e of each contact, shape (k,).
         touches: The rows of each contact.
-        along: Where the velocities of each contact stand along which it rubs, among `all_rates`.
+        along: The rows of the sliding velocities of each contact in `all_rates`.
         kept: The rows of all other constraints.
-        normals: The row of each contact that can only push.
+        normals: The normal row of each contact.
         gaps: A function of state and parameters: phi of each contact, and phi'.
-        rates: The rates of all constraints, shape (m, 1), and `drift`, that part of their
-            derivatives which exogenous signals make.
-        residual: phi_i, phi_i' of each, or what restricts velocities alone; `sizes` are the
-            numbers of its entries.
+        rates: The rates of all constraints, shape (m, 1), and `drift`, the part of their
+            derivatives from exogenous signals.
+        residual: phi_i, phi_i' of each, or nonholonomic rows; `sizes` are the numbers of entries.
 
     Raises:
-        ModelError: There is no such constraint, or it is none that can only push.
+        ModelError: There is no such constraint, or it is not unilateral.
     """
 
     def __init__(self, model: RobotModel, restitution: Mapping[str, float]) -> None:
@@ -104,8 +105,8 @@ class UnilateralContacts:
         fitting = [
             name
             for name, (constraint, _) in parts.items()
-            if sum(constraint.can_only_push) == 1
-            and constraint.can_only_push.index(True) < constraint.residual(model.links).numel()
+            if sum(constraint.is_unilateral) == 1
+            and constraint.is_unilateral.index(True) < constraint.residual(model.links).numel()
         ]
         if not restitution:
             raise ModelError(
@@ -129,8 +130,8 @@ class UnilateralContacts:
         self.touches = []
         for name in self.names:
             constraint, part = parts[name]
-            normal = part.start + constraint.can_only_push.index(True)
-            self.touches.append(Touch(normal, np.arange(part.start, part.stop)))
+            normal = part.start + constraint.is_unilateral.index(True)
+            self.touches.append(TouchRows(normal, np.arange(part.start, part.stop)))
         own = {int(row) for touch in self.touches for row in touch.rows}
         self.kept: Indices = np.array(
             [i for i in range(model.dae.num_constraints) if i not in own], dtype=int
@@ -177,7 +178,7 @@ class UnilateralContacts:
         )
 
     def _sliding(self, model: RobotModel, parts: Mapping[str, tuple[Constraint, slice]]) -> ca.SX:
-        """The velocities of contacts that rub, shape (s, 1); notes where they stand, and mu."""
+        """The sliding velocities of frictional contacts, shape (s, 1); stores rows and mu."""
         kinematics, rows = model.links.kinematics(), [ca.SX(0, 1)]
         start = self.dae.num_constraints
         self.along: list[Indices] = []
@@ -193,19 +194,24 @@ class UnilateralContacts:
             start += size
         return kinematics.value(ca.vertcat(*rows))
 
-    def rubbing(self, place: int, parameters: FloatArray, restitution: float) -> Rubbing:
-        """How a contact rubs in an impact.
+    def frictional_contact(
+        self, place: int, parameters: FloatArray, restitution: float
+    ) -> FrictionalContact:
+        """The friction of a contact in an impact.
 
-        What restricts its velocities besides, as where it sticks, holds as far as it pushes.
+        Further rows that restrict its velocities, such as sticking, hold while it has a normal
+        impulse.
         """
         touch, mu = self.touches[place], self._friction[place]
         others = touch.rows[touch.rows != touch.normal]
         if mu is None or others.size:
-            return Rubbing(touch.normal, others, np.inf, restitution)
-        return Rubbing(touch.normal, self.along[place], float(parameters[mu]), restitution)
+            return FrictionalContact(touch.normal, others, np.inf, restitution)
+        return FrictionalContact(
+            touch.normal, self.along[place], float(parameters[mu]), restitution
+        )
 
     def holds(self, closed: Sequence[bool]) -> FloatArray:
-        """For each entry of the residual 1, or 0 where it is that of a contact that is open."""
+        """For each entry of the residual 1, or 0 if its contact is open."""
         rows = np.ones(self.dae.num_constraints)
         for touch, shut in zip(self.touches, closed, strict=True):
             rows[touch.rows] = shut
@@ -233,15 +239,15 @@ class UnilateralContacts:
             size=np.abs(slope[:m]) @ np.abs(solved[:, 0]) + np.abs(drift),
         )
 
-    def jammed(
-        self, time: float, state: FloatArray, names: Sequence[str], found: Jam | None
-    ) -> JammedContactError:
-        """The error where friction jams contacts."""
+    def painleve_error(
+        self, time: float, state: FloatArray, names: Sequence[str], found: PainleveOutcome | None
+    ) -> PainleveError:
+        """The error of a Painleve paradox."""
         outcome = f". What becomes of it is {found.value}" if found else ""
-        return JammedContactError(
-            f"{self.dae.name}: friction jams the contact of {', '.join(names)} at t = {time:.6g} "
-            f"s, state {show(state)} (Painleve){outcome}. Lower the friction, slide the other way, "
-            "or hold the robot less steeply to the surface",
+        return PainleveError(
+            f"{self.dae.name}: Painleve paradox at the contact of {', '.join(names)} at "
+            f"t = {time:.6g} s, state {show(state)}{outcome}. Lower the friction, slide the other "
+            "way, or hold the robot less steeply to the surface",
             time,
             state,
             found,
@@ -249,7 +255,7 @@ class UnilateralContacts:
 
 
 def subsystem(contacts: UnilateralContacts, rows: Sequence[int], state: FloatArray) -> DaeSystem:
-    """The system in which some constraints hold and the others are not there.
+    """The system with some of the constraints only.
 
     Args:
         contacts: The contacts.

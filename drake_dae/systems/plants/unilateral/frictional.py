@@ -1,4 +1,4 @@
-"""Impacts of contacts that rub: Newton's law across surfaces, Coulomb's along them; numbers alone.
+"""Impacts of frictional contacts: Newton's law along normals, Coulomb's along surfaces.
 
 With c the rates, A = J M^-1 J^T over all rows, and Lambda the impulses, c+ = c- + A Lambda; kept
 rows have c+ = 0, and each contact with its normal n and its rows t along the surface
@@ -11,8 +11,8 @@ rows have c+ = 0, and each contact with its normal n and its rows t along the su
 
     T+ - T- = Lambda . c+ - Lambda . A Lambda / 2 <= 0.
 
-So where energy would be gained all coefficients of restitution are less, by the factor at which
-none is; and likewise where contacts wedge a body, so that no impulses bring what they want. One
+So if energy would be gained, all coefficients of restitution are reduced by the factor at which
+none is gained; and likewise if contacts wedge a body so that there are no such impulses. One
 contact is solved in closed form, several by `in_cones`.
 """
 
@@ -27,25 +27,26 @@ from drake_dae.systems.plants.unilateral.cones import Cone, in_cones
 from drake_dae.systems.plants.unilateral.impacts import DEPENDENT
 
 NEAR, POLISHED = 1e-3, 5
-"""So far from one may the length of a zero be before it is polished, by so many Newton steps."""
+"""The allowed deviation of the modulus of a zero from one before it is refined, and the number of
+Newton steps for that."""
 
 NOTHING = 1e-14
-"""What is less, relative to all, is round-off."""
+"""Values below this, relative to the largest, are round-off."""
 
 FITS = 1e-11
-"""What may be violated, relative to what there is."""
+"""The allowed violation of the conditions, relative to the sizes of their terms."""
 
 HALVINGS = 40
-"""So often the factor of restitution is halved in between: to 1e-12."""
+"""The number of bisections of the factor of restitution: to 1e-12."""
 
 
 @dataclass(frozen=True, eq=False)
-class Rubbing:
-    """The rows of one contact that rubs.
+class FrictionalContact:
+    """The rows of one frictional contact.
 
     Attributes:
-        normal: The row that must not be pierced.
-        along: The rows along the surface, in any axes of length one; they may depend on each other.
+        normal: The row of its normal.
+        along: The rows along the surface, in any unit axes; they may be dependent.
         friction: mu, zero or more.
         restitution: e, 0 to 1.
     """
@@ -57,14 +58,14 @@ class Rubbing:
 
 
 def impact(
-    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[FrictionalContact]
 ) -> FloatArray | None:
-    """The impulses Lambda of contacts that rub, shape (k,).
+    """The impulses Lambda of frictional contacts, shape (k,).
 
     Args:
         matrix: A over all rows, positive semidefinite, shape (k, k).
         before: c-, shape (k,).
-        kept: The rows that nothing opens.
+        kept: The bilateral rows.
         contacts: The contacts that touch.
 
     Returns:
@@ -85,21 +86,21 @@ def impact(
     return best
 
 
-def _bouncing(contacts: Sequence[Rubbing], factor: float) -> list[Rubbing]:
+def _bouncing(contacts: Sequence[FrictionalContact], factor: float) -> list[FrictionalContact]:
     return [replace(one, restitution=factor * one.restitution) for one in contacts]
 
 
 def _gained(matrix: FloatArray, before: FloatArray, impulses: FloatArray) -> float:
-    """What the kinetic energy gains, less round-off."""
+    """The gain of kinetic energy, minus round-off."""
     twice = impulses @ (2.0 * before + matrix @ impulses)
     size = np.abs(impulses) @ np.abs(before)
     return float(0.5 * twice - 1e-14 * size)
 
 
 def _impulses(
-    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[Rubbing]
+    matrix: FloatArray, before: FloatArray, kept: Indices, contacts: Sequence[FrictionalContact]
 ) -> FloatArray | None:
-    # What is kept follows from the contacts: c_k = 0.
+    # The impulses of bilateral rows follow from c_k = 0.
     inverse = np.linalg.pinv(matrix[np.ix_(kept, kept)], DEPENDENT, hermitian=True)
     A = matrix - matrix[:, kept] @ inverse @ matrix[kept]
     b = before - matrix[:, kept] @ inverse @ before[kept]
@@ -123,8 +124,8 @@ def _impulses(
     return total
 
 
-def _axes(matrix: FloatArray, one: Rubbing) -> FloatArray:
-    """The normal, and those directions along the surface that it rubs along, as columns."""
+def _axes(matrix: FloatArray, one: FrictionalContact) -> FloatArray:
+    """The normal and the sliding directions, as columns."""
     rows = one.along if one.friction else one.along[:0]
     values, vectors = np.linalg.eigh(matrix[np.ix_(rows, rows)])
     moved = vectors[:, values > DEPENDENT * max(values.max(initial=0.0), 0.0)]
@@ -145,7 +146,7 @@ def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArr
         return sticking
     if np.isinf(friction):
         return None
-    # Where no impulse would do there are numbers that are none, and fit nothing.
+    # If there is no impulse, values are not finite and do not fit.
     with np.errstate(invalid="ignore"):
         ways = np.array([[1.0, -1.0]]) if wanted.size == 2 else _ways(matrix, wanted, friction)
         impulses, after = _slid(matrix, wanted, friction, ways)
@@ -153,16 +154,16 @@ def _of_one(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArr
     fits = (impulses[0] > 0.0) & np.isfinite(impulses[0]) & (onward >= 0.0)
     if not fits.any():
         return None
-    # Where several fit, that which goes on most as it came.
+    # If several fit, the one with the smallest change of direction.
     left = np.flatnonzero(fits)
     best = int(np.argmax(wanted[1:] @ after[:, left]))
     return np.asarray(impulses[:, left[best]])
 
 
 def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
-    """Impulses that push and leave w = 0, of several those that rub least; None if none do.
+    """Impulses with w = 0 in the cone, those with the least friction; None if there are none.
 
-    Of a robot with fewer freedoms than a contact has rows these depend on each other.
+    If the robot has fewer degrees of freedom than the contact has rows, they are dependent.
     """
     values, vectors = np.linalg.eigh(matrix)
     is_moved = values > NOTHING * values[-1]
@@ -180,7 +181,7 @@ def _sticking(matrix: FloatArray, wanted: FloatArray) -> FloatArray | None:
 def _slid(
     matrix: FloatArray, wanted: FloatArray, friction: float, ways: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Impulses that rub against ways along the surface, and what of c+ is along it; columns."""
+    """Impulses with friction opposite to given directions, and their tangential c+; columns."""
     push = np.vstack([np.ones((1, ways.shape[1])), -friction * ways])
     mobility = matrix[0] @ push
     impulses = push * np.divide(
@@ -190,7 +191,7 @@ def _slid(
 
 
 def _ways(matrix: FloatArray, wanted: FloatArray, friction: float) -> FloatArray:
-    """The directions in a plane against which impulses rub that leave it sliding along them.
+    """The directions in a plane for which the contact slides along them after the impact.
 
     Of c+ along the surface, times the mobility across it, what is across a direction of angle a is
     a trigonometric polynomial of degree two: sum c_k z^k, |k| <= 2, whose zeros are of length one.

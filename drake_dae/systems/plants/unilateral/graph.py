@@ -1,4 +1,4 @@
-"""Modes, guards and resets of contacts that open and close, to be read and drawn."""
+"""The graph of modes, guards and resets of opening contacts, as text or drawing."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,14 +7,14 @@ from itertools import combinations
 
 @dataclass(frozen=True)
 class Transition:
-    """What leads from a mode to another, or back to itself.
+    """A transition from a mode to another, or to itself.
 
     Attributes:
         source: The contacts that are closed before.
         target: The contacts that are closed after it, if none of the others opens at once.
-        contact: The contact that it happens to.
-        guard: When it happens.
-        reset: What it does to the state; empty if nothing.
+        contact: The contact concerned.
+        guard: The condition of the transition.
+        reset: The change of the state; empty for none.
     """
 
     source: tuple[str, ...]
@@ -30,7 +30,7 @@ class Transition:
 
 @dataclass(frozen=True)
 class ContactGraph:
-    """All modes of a plant, and what leads from one to another; `str` is one line for each.
+    """All modes of a plant and their transitions; `str` has one line for each.
 
     Attributes:
         name: The plant.

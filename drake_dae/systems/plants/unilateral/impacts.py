@@ -1,12 +1,12 @@
-"""Complementarity: which contacts push, in an impact and after it; numbers alone.
+"""Complementarity: the contacts with force or impulse, in an impact and after it.
 
-Rows are constraints, one below the other; w = A y + b is what becomes of their rates, A being
-positive semidefinite. In an impact y are impulses and b rates before it, after it y are forces and
-b the accelerations without them. Kept rows have w = 0; each contact has
+Rows are constraints; w = A y + b are their rates or accelerations, with A positive semidefinite. In
+an impact y are impulses and b the rates before it; after it y are forces and b the accelerations
+without them. Bilateral rows have w = 0; each contact has
 
     y_n >= 0,    w_n >= 0,    y_n w_n = 0
 
-for its normal n, and w = 0 in its other rows if it pushes, y = 0 if not. Without friction exactly
+for its normal n, and w = 0 in its other rows if y_n > 0, y = 0 otherwise. Without friction exactly
 one w fits, and exactly one y where rows are independent.
 """
 
@@ -21,24 +21,24 @@ from drake_dae.dae.system.layout import Indices
 from drake_dae.trace.functions import SINGULAR_PIVOT
 
 MOST = 8
-"""So many contacts may touch at once: every set of them is tried."""
+"""The largest number of touching contacts: every subset of them is tried."""
 
 TIE = 1e-10
-"""Sets of contacts whose violations differ by less, relative to what there is, fit alike."""
+"""Subsets whose violations differ by less, relative to the sizes of the terms, fit equally well."""
 
 FITS = 1e-6
-"""What a set may violate, relative to what there is."""
+"""The allowed violation of a subset, relative to the sizes of the terms."""
 
 DEPENDENT = 1e-11
-"""Rows are dependent, and no set, where the smallest eigenvalue of their equilibrated A is less."""
+"""Rows are dependent if the smallest eigenvalue of their equilibrated A is below this."""
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
+class TouchRows:
     """The rows of one contact.
 
     Attributes:
-        normal: The row that must not be pierced, whose force can only push.
+        normal: The row of its unilateral normal.
         rows: All rows of the contact.
     """
 
@@ -48,10 +48,10 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What fits.
+    """A solution of the complementarity problem.
 
     Attributes:
-        pushing: Places of the contacts that push, among those given.
+        pushing: Indices of the contacts with force, among those given.
         values: y, one for each row.
     """
 
@@ -60,9 +60,9 @@ class Fit:
 
 
 def complementary(
-    matrix: FloatArray, offset: FloatArray, kept: Indices, touches: Sequence[Touch]
+    matrix: FloatArray, offset: FloatArray, kept: Indices, touches: Sequence[TouchRows]
 ) -> Fit | None:
-    """The y that fits, with as few contacts that push as do.
+    """The y that fits with the fewest acting contacts.
 
     Args:
         matrix: A, shape (m, m).
@@ -71,7 +71,7 @@ def complementary(
         touches: The contacts.
 
     Returns:
-        What fits; None if nothing does.
+        The solution; None if there is none.
     """
     length = np.sqrt(np.abs(np.diag(matrix)))
     length[length == 0.0] = 1.0
@@ -98,11 +98,11 @@ def complementary(
     return best if least <= FITS * size else None
 
 
-def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[Touch]) -> Indices | None:
-    """The rows that hold while some contacts push, kept ones first, then normals.
+def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[TouchRows]) -> Indices | None:
+    """The rows that hold while some contacts act, bilateral ones first, then normals.
 
-    Of a table with four feet three carry it: normals that depend on each other are no set. Other
-    rows that depend on those before them, as of two feet that both stick, hold without a force.
+    Dependent normals are not allowed: of four feet of a table only three carry it. Other rows that
+    depend on those before them, such as of two sticking feet, hold without a force.
 
     Args:
         matrix: A, shape (m, m).
@@ -130,7 +130,7 @@ def rows_of(matrix: FloatArray, kept: Indices, pushing: Sequence[Touch]) -> Indi
 
 
 def stopping(matrix: FloatArray, offset: FloatArray, rows: Indices) -> FloatArray:
-    """The least impulses, shape (m,), that bring some rows to rest, dependent or not."""
+    """The smallest impulses, shape (m,), that bring some rows to rest, dependent or not."""
     values = np.zeros(offset.size)
     part = matrix[np.ix_(rows, rows)]
     values[rows] = np.linalg.pinv(part, DEPENDENT, hermitian=True) @ -offset[rows]
@@ -150,7 +150,7 @@ def is_p_matrix(matrix: FloatArray, without: FloatArray, contacts: Sequence[int]
         for chosen in combinations(contacts, count):
             part = np.ix_([*kept, *chosen], [*kept, *chosen])
             whole = np.linalg.det(without[part])
-            # Of normals that depend on each other none is a minor that decides.
+            # Minors of dependent normals are not decisive.
             if whole > DEPENDENT * np.prod(np.diag(without[part])) and not (
                 np.linalg.det(matrix[part]) > SINGULAR_PIVOT * whole
             ):

@@ -1,4 +1,4 @@
-"""What a plant whose contacts open and close knows of its run, and of the step that is made."""
+"""The log of a plant with opening contacts: its run and the current step."""
 
 from dataclasses import dataclass, field
 
@@ -9,21 +9,21 @@ from drake_dae.systems.blocks.dips import TOUCHING, lowest
 from drake_dae.systems.plants.contact_events import ContactEvent
 
 MARGIN = 1e-13
-"""How far below zero, in m/s, the rate of a contact that begins to leave is still round-off."""
+"""The rate of an opening contact above minus this, in m/s, is round-off."""
 
 
 @dataclass
 class Log:
-    """What is known of one run, in one context.
+    """The log of one run, in one context.
 
     Attributes:
-        events: What happened to contacts.
-        time: When the step began that is being made, in s.
-        gaps, rates: Those of all contacts then, in m and m/s; empty before a run.
+        events: The events of contacts.
+        time: The start time of the current step, in s.
+        gaps, rates: The gaps and rates of all contacts then, in m and m/s; empty before a run.
         before: Time and state before the last reset.
-        held: Whether the step began in the mode of that before, with all its contacts pushing.
-        pulled: The places of contacts that pull since then, by a control that jumped.
-        waits: Whether the first step is to choose the mode, with the control that there is then.
+        held: Whether the step began in the previous mode, with positive forces of all its contacts.
+        pulled: The indices of contacts with negative force since then, after a jump of the control.
+        waits: Whether the first step must choose the mode, with the control at its start.
     """
 
     events: list[ContactEvent] = field(default_factory=list)
@@ -37,16 +37,16 @@ class Log:
 
 
 def clearance(log: Log, time: float, gaps: FloatArray, rates: FloatArray) -> FloatArray:
-    """For each contact a number that is positive until it would be pierced, if it is open.
+    """For each open contact a number that is positive until it penetrates.
 
-    A contact that leaves has a gap of round-off, whatever its sign. One that is below where its
-    step began is pierced, even where it comes out again; and so is one that came out within the
-    step, by the cubic in time through gaps and rates at both ends.
+    An opening contact has a gap of round-off size with any sign. A contact penetrates if its gap is
+    smaller than at the start of the step, also if it increases again; or if the cubic in time
+    through gaps and rates at both ends of the step has a negative minimum within the step.
 
     Args:
-        log: What is known of the begin of the step.
+        log: The log at the start of the step.
         time: The time, in s.
-        gaps, rates: Those of the contacts then, in m and m/s.
+        gaps, rates: The gaps and rates of the contacts then, in m and m/s.
     """
     found = np.maximum(gaps, rates + MARGIN)
     if not log.gaps.size:

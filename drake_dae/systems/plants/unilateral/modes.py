@@ -1,4 +1,4 @@
-"""The modes of a robot whose contacts open and close: one system for each set of closed ones."""
+"""The modes of a robot with opening contacts: one system for each set of closed contacts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,17 +18,16 @@ Closed = tuple[bool, ...]
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """How the robot moves while some contacts are closed.
+    """The motion of the robot while some contacts are closed.
 
     Attributes:
-        closed: Which contacts are closed.
+        closed: The closed contacts, one flag for each.
         structure: The structure of the system with their constraints alone.
-        rows: Where its constraints stand among all; of contacts that stick, those that are
-            independent.
+        rows: The indices of its constraints among all; of sticking contacts, the independent ones.
         dynamics: x', a function of state, control if there is one, and parameters.
         force: All constraint forces, zero where open, likewise if `force_needs_control`.
         output: The controlled outputs, likewise if `output_needs_control`.
-        holds: For each entry of the constraint residual 1, or 0 where its contact is open.
+        holds: For each entry of the constraint residual 1, or 0 if its contact is open.
         force_needs_control, output_needs_control: Whether the control enters them.
     """
 
@@ -59,14 +58,14 @@ class Modes:
 
     @property
     def known(self) -> Sequence[Mode]:
-        """Those that were needed so far."""
+        """The modes traced so far."""
         return tuple(self._known.values())
 
     def __call__(self, closed: Closed, state: FloatArray) -> Mode:
         """A mode.
 
         Args:
-            closed: Which contacts are closed.
+            closed: The closed contacts, one flag for each.
             state: A state near which it is examined, if it is new, shape (n,).
 
         Raises:
@@ -121,7 +120,7 @@ class Modes:
 
 
 def closed_of(values: FloatArray) -> Closed:
-    """Which contacts are closed, by the numbers of a discrete state: 1 is closed."""
+    """The closed contacts of a discrete state: 1 is closed."""
     return tuple(value > 0.5 for value in values.tolist())
 
 

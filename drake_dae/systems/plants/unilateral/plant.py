@@ -1,4 +1,4 @@
-"""A RobotModel whose contacts open and close, as a LeafSystem."""
+"""A RobotModel with opening contacts, as a LeafSystem."""
 
 from collections.abc import Mapping
 
@@ -38,24 +38,24 @@ from drake_dae.systems.plants.unilateral.traced import TracedContacts
 
 @checked(ModelError)
 class UnilateralRobotPlant(ModalPorts):
-    """A robot (37)-(40) some of whose contacts open and close: a system for each closed set.
+    """A robot (37)-(40) with opening contacts: a system for each set of closed contacts.
 
-    The constraints that are closed hold as in `RobotPlant`; an open contact has a gap phi > 0 and
-    no force. So each contact that opens and closes keeps phi >= 0, lambda >= 0, phi lambda = 0.
+    Closed constraints hold as in `RobotPlant`; an open contact has a gap phi > 0 and no force. So
+    each contact satisfies phi >= 0, lambda >= 0, phi lambda = 0.
 
     - It closes where phi falls through zero: an impact, by Newton's law with its coefficient of
       restitution e; several at once by a linear complementarity problem. Bouncing ends by a rule
-      that is exact in its limit; see `Resets` for all of it. Velocities jump; positions and the
-      states of stages do not. A contact that rubs does so in impacts, too.
-    - It opens where lambda falls through zero, or where a control that jumps pulls at it.
-    - Where contacts depend on each other, as four feet of a table, as few as do carry it, and the
-      others touch without force. Where friction leaves no motion, or two, the run ends with a
-      JammedContactError.
+      that is exact in its limit; see `Resets`. Velocities jump; positions and the states of stages
+      do not. Friction also acts in impacts.
+    - It opens when lambda falls through zero, or when a jump of the control makes it negative.
+    - With dependent contacts, such as four feet of a table, as few as possible carry the force, and
+      the others touch without force. If friction leaves no motion or two, the run ends with a
+      PainleveError.
 
-    Drake's Simulator finds these moments as zeros of witness functions, to within a hundredth of
-    the context's accuracy in s under error control, and in steps with a fixed step. So it must be
-    set, which `simulate` does to that of the integrator: context.SetAccuracy(1e-9) is 1e-11 s. A
-    step leaves N* by its error, and is projected at the start of the next one, as in `DaePlant`.
+    Drake's Simulator finds these times as zeros of witness functions, to within a hundredth of the
+    context's accuracy in s under error control, and of a step with fixed steps. So the context's
+    accuracy must be set, as `simulate` does: context.SetAccuracy(1e-9) gives 1e-11 s. After each
+    step the state is projected onto N* at the start of the next one, as in `DaePlant`.
 
     Input ports:
         control: u, shape (p,).
@@ -67,38 +67,37 @@ class UnilateralRobotPlant(ModalPorts):
         mode: For each contact 1 if it is closed and 0 if it is open, shape (k,).
         gap: phi of each contact, m, shape (k,).
         constraint_force: lambda, zero where open, shape (m,).
-        constraint_residual: phi_i, phi_i' of each constraint (or what restricts velocities alone),
-            constraint-major; zero where a contact is open, which is no constraint then.
+        constraint_residual: phi_i, phi_i' of each constraint (or nonholonomic rows),
+            constraint-major; zero for open contacts.
         controlled_output: z.
         link_state: (q, v) of the links, shape (nq + nv,).
-        constraint_wrenches: What each constraint does to each of its frames; see `RobotPlant`.
+        constraint_wrenches: The wrench of each constraint on each of its frames; see `RobotPlant`.
 
-    A stage of actuation shows its state at ports of its own, and a robot with any has
-    `joint_torque`, as a `RobotPlant` has them.
+    Stages of actuation add ports for their states and `joint_torque`, as for `RobotPlant`.
 
     Args:
         model: The robot.
-        contacts: Name of a constraint that can only push -> its coefficient of restitution, 0 (no
-            bounce) to 1 (no loss). It becomes the parameter "<name>.restitution".
+        contacts: Name of a unilateral constraint -> its coefficient of restitution, 0 (no bounce)
+            to 1 (no loss). It becomes the parameter "<name>.restitution".
         settling_time: Bouncing that would end within this time, in s, ends at once; positive.
-        structure: The structure of `model.dae`; found if None, where all contacts are closed.
+        structure: The structure of `model.dae`, with all contacts closed; found if None.
 
     Attributes:
         model: The robot.
         contacts: The names of the contacts that open and close, in the order of `mode`.
-        modes: Which contacts are closed -> how the robot moves then; see `Mode`.
+        modes: The closed contacts -> the motion then; see `Mode`.
         gap_signals: Names and units of `gap`.
         mode_signals: Names of `mode`.
-        normals: Where the normal force of each contact stands in `constraint_force`.
+        normals: The index of the normal force of each contact in `constraint_force`.
         wrench_signals: Names and units of `constraint_wrenches`.
 
     Raises:
-        ModelError: A constraint is not known, or cannot open; a number makes no sense.
-        InconsistentStateError: A simulation starts off the constraints that stay, or inside a
+        ModelError: A constraint is not known, or cannot open, or a number is not valid.
+        InconsistentStateError: A simulation starts off the bilateral constraints, or inside a
             surface.
         AssumptionError: The constraints of a mode are dependent.
         SimulationError: No forces fit, impacts do not end, or the context has no accuracy.
-        JammedContactError: Friction jams a contact (Painleve), which has no motion, or two.
+        PainleveError: The Painleve paradox: a contact with no motion, or two.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -136,7 +135,7 @@ class UnilateralRobotPlant(ModalPorts):
         ]
 
     def events(self, context: Context) -> tuple[ContactEvent, ...]:
-        """What happened to contacts since the run of a context began."""
+        """The events of contacts since the start of the run of a context."""
         self.check_context(context)
         return tuple(self._log(context).events)
 
@@ -149,24 +148,25 @@ class UnilateralRobotPlant(ModalPorts):
         return self._witnesses
 
     def _log(self, context: Context) -> Log:
-        # The object stays the same, and is ours to change.
+        # The object is not replaced, and is changed in place.
         found: Log = self.get_cache_entry(self._log_index).Eval(context)
         return found
 
     def _guard(self, place: int, context: Context) -> float:
-        """Positive while a contact stays as it is: Drake seeks where that ends."""
+        """Positive while a contact keeps its mode: Drake locates the zero."""
         margin, log = float(self._margins(context)[place]), self._log(context)
         closed = context.get_discrete_state_vector().value()[place] > 0.5
         if not closed or context.get_time() != log.time:
             return -1.0 if place in log.pulled else margin
-        # A control that jumped, as where it is sampled, pulls from the start of a step on. That is
-        # seen only if it was not so at the start; it may have ceased at the end of the step.
+        # After a jump of a sampled control the force may be negative from the start of a step on.
+        # Drake sees a zero only if the sign was different at the start, and the force may be
+        # positive again at the end of the step.
         if margin <= 0.0 and log.held:
             log.pulled.add(place)
         return margin if margin > 0.0 else 1.0
 
     def _margins(self, context: Context) -> FloatArray:
-        """For each contact: its force if it is closed; else positive until it would be pierced."""
+        """For each contact: its force if closed; otherwise positive until it penetrates."""
         found: FloatArray = self.get_cache_entry(self._margins_index).Eval(context)
         return found
 
@@ -190,7 +190,9 @@ class UnilateralRobotPlant(ModalPorts):
 
     def _start(self, context: Context, state: State) -> EventStatus:
         log, now = self._log(context), context.get_time()
-        earlier = [event for event in log.events if event.time < now]  # Of a run that goes on.
+        earlier = [
+            event for event in log.events if event.time < now
+        ]  # For a run that is continued.
         vars(log).update(vars(Log(events=earlier, time=now)))
         if context.get_accuracy() is None:
             raise SimulationError(
@@ -203,14 +205,14 @@ class UnilateralRobotPlant(ModalPorts):
         self._check(x, values)
         log = self._log(context)
         if np.isnan(self._control(context)).any():
-            # What is held between samples comes with this event: the first step begins with it.
+            # Values held between samples change with this event, at the start of the first step.
             log.waits = True
             closed = self._resets.resting(x, values)
             state.get_mutable_discrete_state().set_value(numbers_of(closed))
             self._begin_step(context, x, values)
             return EventStatus.Succeeded()
         status = self._reset(context, state)
-        # To begin closed is no event.
+        # A closed contact at the start is not an event.
         log.events = [
             event
             for event in log.events
@@ -257,7 +259,7 @@ class UnilateralRobotPlant(ModalPorts):
         return EventStatus.Succeeded()
 
     def _begin_step(self, context: Context, state: FloatArray, values: FloatArray) -> None:
-        """Notes where a step begins."""
+        """Stores the start of a step."""
         log = self._log(context)
         log.gaps, log.rates = (v.copy() for v in self._contacts.gaps.evaluate(state, values))
 
@@ -271,7 +273,7 @@ class UnilateralRobotPlant(ModalPorts):
         except InconsistentStateError as error:
             raise off_manifold(time, x, error) from error
         log, before = self._log(context), (time, x.tobytes())
-        if log.before != before:  # Guards that trigger at once lead here each.
+        if log.before != before:  # Several guards may trigger at the same time.
             log.before = before
             log.events += after.events
         state.get_mutable_continuous_state().SetFromVector(after.state)
@@ -316,4 +318,4 @@ def _no_margins() -> AbstractValue:
 
 
 def _keep(context: Context, value: AbstractValue) -> None:
-    """The log of a context is never out of date."""
+    """The log of a context is never invalidated."""

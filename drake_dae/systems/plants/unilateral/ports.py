@@ -1,4 +1,4 @@
-"""What a robot shows whose contacts open and close, in the mode that its context is in."""
+"""The ports of a robot with opening contacts, in the mode of its context."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -31,11 +31,11 @@ from drake_dae.trace.functions import TracedFunction
 
 @checked(ModelError)
 class ModalPorts(ParameterizedSystem, Plant):
-    """State, mode and ports of a `UnilateralRobotPlant`, with its attributes; the mode stays.
+    """State, mode and ports of a `UnilateralRobotPlant`, with its attributes, in a fixed mode.
 
     Args:
         model: The robot.
-        contacts: Name of a constraint that can only push -> its coefficient of restitution.
+        contacts: Name of a unilateral constraint -> its coefficient of restitution.
         structure: The structure of `model.dae`, if it is known.
     """
 
@@ -77,7 +77,7 @@ class ModalPorts(ParameterizedSystem, Plant):
             dae.exogenous.degrees(*moved)
         )
         self._by_state.add(self.xd_ticket())
-        # The control enters forces where it enters what they balance.
+        # The control enters forces if it enters the equations that they balance.
         derivatives = opened.structure.derivatives
         rate = derivatives.expand(derivatives.rate)
         balanced = ca.jtimes(bound.rates, dae.state, rate)
@@ -133,7 +133,7 @@ class ModalPorts(ParameterizedSystem, Plant):
         context.get_mutable_numeric_parameter(1).SetFromVector(values)
 
     def _restitution_place(self, name: str) -> int | None:
-        """Which contact's coefficient of restitution a name is that of; None if of none."""
+        """The index of the contact whose coefficient of restitution has a name, or None."""
         names = [f"{contact}.restitution" for contact in self.contacts]
         return names.index(name) if name in names else None
 
@@ -145,16 +145,16 @@ class ModalPorts(ParameterizedSystem, Plant):
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         self.check_context(context)
-        return context.get_continuous_state_vector().CopyToVector()
+        return super().state(context)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,), all contacts open: a run finds its mode when it begins.
+        """Sets x as given, shape (n,), all contacts open: a run finds its mode at its start.
 
         Raises:
             ModelError: The shape is wrong.
         """
         self.check_context(context)
-        context.SetContinuousState(self.dae.state_vector(state))
+        super().set_state(context, state)
         context.SetDiscreteState(np.zeros(len(self.contacts)))
 
     def gaps(self, context: Context) -> FloatArray:
@@ -171,16 +171,6 @@ class ModalPorts(ParameterizedSystem, Plant):
         """
         return self.modes((True,) * len(self.contacts), self.dae.nominal_state).structure
 
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state next to a guess, shape (n,), with all contacts closed, and returns it.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
-        state = self.structure.manifold.settle(guess, self._values(context))
-        self.set_state(context, state)
-        return state
-
     def closed(self, context: Context) -> tuple[str, ...]:
         """The names of the contacts that are closed."""
         self.check_context(context)
@@ -188,11 +178,11 @@ class ModalPorts(ParameterizedSystem, Plant):
         return tuple(name for name, is_shut in zip(self.contacts, shut, strict=True) if is_shut)
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
-        """What a port of `functions` showed at moments, one row for each; nan where nothing.
+        """The values of a port of `functions` at given times, one row each; nan without a value.
 
         Args:
             port: The port's name.
-            given: "state", "mode", "parameters" and "control" at each moment, one row for each.
+            given: "state", "mode", "parameters" and "control", one row for each time.
 
         Raises:
             ModelError: There is no such port.
@@ -230,7 +220,9 @@ class ModalPorts(ParameterizedSystem, Plant):
 
     def _mode(self, context: Context) -> Mode:
         numbers = context.get_discrete_state_vector().value()
-        mode = self._by_numbers.get(numbers.tobytes())  # In each evaluation, so without tuples.
+        mode = self._by_numbers.get(
+            numbers.tobytes()
+        )  # Called in each evaluation, so without tuples.
         if mode is None:
             state = context.get_continuous_state_vector().value()
             mode = self.modes(closed_of(numbers), state)
@@ -256,17 +248,19 @@ class ModalPorts(ParameterizedSystem, Plant):
     def _explained(
         self, error: SimulationError, parameters: FloatArray, *inputs: FloatArray
     ) -> SimulationError:
-        """Where friction jams a contact, that, and whether any motion fits."""
-        if not (self.dae.rubbing and isinstance(error, SingularityError) and self._now):
+        """In a Painleve paradox, the error with its outcome."""
+        if not (self.dae.frictional_contacts and isinstance(error, SingularityError) and self._now):
             return error
         control = inputs[0] if inputs else np.zeros(self.dae.num_controls)
         bound = self._contacts
         terms = bound.terms(error.state, control, parameters)
         places = [i for i, shut in enumerate(self._now.closed) if shut]
-        found = terms.jam(bound.kept.tolist(), [bound.normals[i] for i in places])
+        found = terms.painleve_outcome(bound.kept.tolist(), [bound.normals[i] for i in places])
         if found is None:
             return error
-        return bound.jammed(error.time, error.state, [self.contacts[i] for i in places], found)
+        return bound.painleve_error(
+            error.time, error.state, [self.contacts[i] for i in places], found
+        )
 
     def _copy_state(self, context: Context, output: BasicVector) -> None:
         output.SetFrom(context.get_continuous_state_vector())
@@ -278,9 +272,9 @@ class ModalPorts(ParameterizedSystem, Plant):
         output.SetFromVector(self._pushing(self._shown_force(context)))
 
     def _pushing(self, force: FloatArray) -> FloatArray:
-        """Forces, along the last axis, where those of contacts are not negative.
+        """Forces, along the last axis; those of contacts are at least zero.
 
-        A contact opens at the end of a step that ends within round-off behind the zero.
+        A contact opens at the end of a step, within round-off after the zero of its force.
         """
         found, normals = force.copy(), self._contacts.normals
         found[..., normals] = np.maximum(found[..., normals], 0.0)

@@ -1,4 +1,4 @@
-"""What becomes of state and mode where a gap or a force of a contact comes to zero."""
+"""The reset of state and mode when a gap or a force of a contact reaches zero."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.system.contacts import Jam
+from drake_dae.dae.system.contacts import PainleveOutcome
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
@@ -15,7 +15,7 @@ from drake_dae.systems.plants.unilateral.frictional import impact
 from drake_dae.systems.plants.unilateral.impacts import (
     MOST,
     Fit,
-    Touch,
+    TouchRows,
     complementary,
     rows_of,
     stopping,
@@ -23,20 +23,20 @@ from drake_dae.systems.plants.unilateral.impacts import (
 from drake_dae.systems.plants.unilateral.modes import Closed, Modes
 
 SLOW = 1e-11
-"""A rate below this, in m/s, is none."""
+"""A rate below this, in m/s, counts as zero."""
 
 REPEATED = 100
-"""So many impacts may follow each other at one time, as in a row of balls."""
+"""The largest number of successive impacts at one time, as in a row of balls."""
 
 
 @dataclass(frozen=True, eq=False)
 class After:
-    """What a reset made.
+    """The result of a reset.
 
     Attributes:
         state: x, shape (n,).
         closed: The mode.
-        events: What happened.
+        events: The events.
     """
 
     state: FloatArray
@@ -52,22 +52,22 @@ class Resets:
 
         c+ = c- + A Lambda,    0 <= Lambda_i,    0 <= c+_i + e_i c-_i,    Lambda_i (...) = 0,
 
-    c being the rates and A = J M^-1 J^T; kept constraints have c+ = 0. No energy is gained: it
-    changes by Lambda . (c- + c+) / 2, in which every term of a contact is at most zero. Where a
-    contact rubs, its impulse along the surface is Coulomb's; see `frictional`.
+    with the rates c and A = J M^-1 J^T; bilateral constraints have c+ = 0. The energy changes by
+    Lambda . (c- + c+) / 2 <= 0, since every term of a contact is at most zero. With friction the
+    tangential impulse follows Coulomb's law; see `frictional`.
 
-    Bouncing ends where its end is near: the contacts that leave at c+ fall back at the rate a > 0
-    after 2 c+ / a, and from impact to impact the largest rate shrinks by rho = max c+ / max |c-|.
-    With a and rho as they are, infinitely many impacts take
+    Bouncing ends by its limit: contacts that leave with c+ and the acceleration -a < 0 return after
+    2 c+ / a, and from impact to impact the largest rate shrinks by rho = max c+ / max |c-|. With
+    constant a and rho, infinitely many impacts take
 
         max(2 c+ / a) / (1 - rho)
 
     (exact for a single contact, and for two that a block rocks on, where a is constant). If that is
-    at most `settling_time` T, all touching contacts come to rest at once, which may take impulses
-    that pull as little as what is skipped: gaps of at most a T^2 / 8, and rates of at most a T / 2.
-    No energy is gained by that either. The event has the limit as its `rest_time`.
+    at most `settling_time` T, all touching contacts come to rest immediately, which may need small
+    negative impulses. This neglects gaps of at most a T^2 / 8 and rates of at most a T / 2, and no
+    energy is gained. The event has the limit as its `rest_time`.
 
-    Then those touching contacts are closed which push: lambda_i >= 0, c'_i >= 0, lambda_i c'_i = 0.
+    Then the touching contacts with force are closed: lambda_i >= 0, c'_i >= 0, lambda_i c'_i = 0.
 
     Args:
         contacts: The contacts.
@@ -89,7 +89,7 @@ class Resets:
         parameters: FloatArray,
         restitution: FloatArray,
     ) -> After:
-        """What follows at a time from a state, in a mode, with the e of each contact.
+        """The reset at a time from a state, in a mode, with the e of each contact.
 
         Raises:
             SimulationError: No set of contacts fits, or impacts do not end.
@@ -109,7 +109,7 @@ class Resets:
                     time,
                     x,
                 )
-            # What leaves already takes no part.
+            # Separating contacts take no part.
             touching = [i for i in touching if rates[i] <= SLOW]
             if not any(rates[i] < -SLOW for i in touching):
                 break
@@ -124,10 +124,12 @@ class Resets:
                 x,
             )
         touches = [contacts.touches[i] for i in touching]
-        if contacts.dae.rubbing:
-            found = terms.jam(contacts.kept.tolist(), [touch.normal for touch in touches])
-            if found in (Jam.INCONSISTENT, Jam.INDETERMINATE):
-                raise contacts.jammed(time, x, [contacts.names[i] for i in touching], found)
+        if contacts.dae.frictional_contacts:
+            found = terms.painleve_outcome(
+                contacts.kept.tolist(), [touch.normal for touch in touches]
+            )
+            if found in (PainleveOutcome.INCONSISTENT, PainleveOutcome.INDETERMINATE):
+                raise contacts.painleve_error(time, x, [contacts.names[i] for i in touching], found)
         fit = self._fit(time, x, terms.force_matrix, terms.accelerations, touches)
         pushing = {touching[place] for place in fit.pushing}
         closed = tuple(i in pushing for i in range(len(closed)))
@@ -136,7 +138,7 @@ class Resets:
         return After(x, closed, tuple(self._told(events, closed)))
 
     def resting(self, state: FloatArray, parameters: FloatArray) -> Closed:
-        """The contacts that touch at rest, as many as can be closed together, whatever pushes."""
+        """The contacts that touch at rest, as many as can be closed together."""
         contacts = self._contacts
         control = np.zeros(contacts.dae.num_controls)
         matrix = contacts.terms(state, control, parameters).impulse_matrix
@@ -162,9 +164,12 @@ class Resets:
         touches = [contacts.touches[i] for i in touching]
         normals = np.array([touch.normal for touch in touches])
         matrix = terms.all_impulses
-        rubbing = [contacts.rubbing(i, parameters, own) for i, own in zip(touching, e, strict=True)]
-        if any(0.0 < one.friction < np.inf for one in rubbing):
-            found = impact(matrix, before, contacts.kept, rubbing)
+        frictional = [
+            contacts.frictional_contact(i, parameters, own)
+            for i, own in zip(touching, e, strict=True)
+        ]
+        if any(0.0 < one.friction < np.inf for one in frictional):
+            found = impact(matrix, before, contacts.kept, frictional)
             if found is None:
                 raise self._unfit(time, state)
             impulse = found
@@ -196,12 +201,12 @@ class Resets:
         self,
         time: float,
         state: FloatArray,
-        touches: Sequence[Touch],
+        touches: Sequence[TouchRows],
         before: FloatArray,
         control: FloatArray,
         parameters: FloatArray,
     ) -> float | None:
-        """How long bouncing would go on after an impact, in s; None if not for a short time."""
+        """The remaining duration of bouncing after an impact, in s; None if it is long."""
         terms = self._contacts.terms(state, control, parameters)
         after = terms.rates
         leaving = [touch for touch in touches if after[touch.normal] > SLOW]
@@ -226,7 +231,7 @@ class Resets:
         state: FloatArray,
         matrix: FloatArray,
         offset: FloatArray,
-        touches: Sequence[Touch],
+        touches: Sequence[TouchRows],
     ) -> Fit:
         fit = complementary(matrix, offset, self._contacts.kept, touches)
         if fit is None:
@@ -244,7 +249,7 @@ class Resets:
     def _changes(
         self, time: float, before: Closed, closed: Closed, events: Sequence[ContactEvent]
     ) -> list[ContactEvent]:
-        """What opened or closed without impact."""
+        """The contacts that opened or closed without impact."""
         told = {name for event in events for name in event.contacts}
         found = []
         for kind, was in ((ContactChange.OPENING, True), (ContactChange.CLOSING, False)):

@@ -232,7 +232,7 @@ def test_analysis_and_pictures_stay(tmp_path):
             ["actuation=[!FlexibleJoints {stiffness: 8.0e+6, inertia: 0.5}]"],
             "plant or plant_parameters: a time_step of 0.001 s is too long",
         ),
-        (["loads=[{frame: tool}]"], r"no loads; .*\(plant_pushes"),
+        (["known_forces=[{frame: tool}]"], r"no known_forces; .*\(plant_disturbances"),
         (["plant_parameters={link1.mas: [1.0]}"], "no parameter 'link1.mas'; did you"),
         (["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1.3, inside: true}"], "solid"),
     ],

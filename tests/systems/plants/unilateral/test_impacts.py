@@ -5,9 +5,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 
-from drake_dae.systems.plants.unilateral.frictional import Rubbing, impact
+from drake_dae.systems.plants.unilateral.frictional import FrictionalContact, impact
 from drake_dae.systems.plants.unilateral.impacts import (
-    Touch,
+    TouchRows,
     complementary,
     is_p_matrix,
     rows_of,
@@ -19,7 +19,7 @@ def rows(*numbers):
     return np.array(numbers, dtype=int)
 
 
-TOUCHES = [Touch(i, rows(i)) for i in range(1, 5)]
+TOUCHES = [TouchRows(i, rows(i)) for i in range(1, 5)]
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -56,7 +56,7 @@ def test_which_contacts_push_does_not_depend_on_units(seed):
 def test_a_contact_that_would_pull_opens_in_any_units(scale):
     """Held, row 0 would keep both closed, with y_0 = -1: so it opens, and row 1 has y_1 = 1/2."""
     A, b, s = np.array([[1.0, -0.9], [-0.9, 1.0]]), np.array([1.0, -0.5]), np.array([scale, 1.0])
-    touches = [Touch(0, rows(0)), Touch(1, rows(1))]
+    touches = [TouchRows(0, rows(0)), TouchRows(1, rows(1))]
     fit = complementary(A * s * s[:, None], b * s, rows(), touches)
     assert fit.pushing == (1,)
     assert_allclose(fit.values, [0.0, 0.5], rtol=1e-14)
@@ -70,7 +70,9 @@ def test_an_impact_gains_no_energy_and_pierces_nothing(seed):
     J = np.column_stack([np.ones(4), random.uniform(-1.0, 1.0, (4, 2))])
     before = J @ np.array([-1.0, *random.uniform(-0.5, 0.5, 2)])
     e = random.uniform(0.0, 1.0, 4)
-    fit = complementary(J @ J.T, (1.0 + e) * before, rows(), [Touch(i, rows(i)) for i in range(4)])
+    fit = complementary(
+        J @ J.T, (1.0 + e) * before, rows(), [TouchRows(i, rows(i)) for i in range(4)]
+    )
     after = before + J @ J.T @ fit.values
     assert np.all(after >= -1e-10)
     assert fit.values @ (before + after) <= 1e-12
@@ -80,7 +82,7 @@ def test_of_a_table_with_four_feet_two_carry_it_and_it_comes_to_rest():
     """A body on feet at (+-1, +-1): any three normals are independent, all four are not."""
     feet = np.array([[1.0, x, y] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
     A = feet @ feet.T
-    touches = [Touch(i, rows(i)) for i in range(4)]
+    touches = [TouchRows(i, rows(i)) for i in range(4)]
     fit = complementary(A, np.full(4, -1.0), rows(), touches)
     assert_allclose(A @ fit.values, 1.0, rtol=1e-14)
     assert len(fit.pushing) == 2
@@ -88,7 +90,7 @@ def test_of_a_table_with_four_feet_two_carry_it_and_it_comes_to_rest():
     assert rows_of(A, rows(), touches[:3]).tolist() == [0, 1, 2]
     # Two feet that stick need one of their tangential rows.
     J = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    pair = [Touch(0, rows(0, 1)), Touch(2, rows(2, 3))]
+    pair = [TouchRows(0, rows(0, 1)), TouchRows(2, rows(2, 3))]
     assert rows_of(J @ J.T, rows(), pair).tolist() == [0, 2, 1]
     stopped = stopping(J @ J.T, np.array([-1.0, 0.3, -1.0, 0.3]), rows(0, 1, 2, 3))
     assert_allclose(J @ J.T @ stopped, [1.0, -0.3, 1.0, -0.3], atol=1e-14)
@@ -99,7 +101,7 @@ def test_friction_may_leave_none_or_two():
     assert is_p_matrix(smooth, smooth, [0, 1])
     assert not is_p_matrix(turned, smooth, [0, 1])
     assert complementary(turned, np.array([-1.0, 1.0]), rows(), TOUCHES[:0]) is not None
-    touches = [Touch(0, rows(0)), Touch(1, rows(1))]
+    touches = [TouchRows(0, rows(0)), TouchRows(1, rows(1))]
     assert complementary(turned, np.array([-1.0, 1.0]), rows(), touches) is None
 
 
@@ -117,7 +119,9 @@ def rubbing_bodies(seed, tangents, count=2):
     for start in range(1, len(J), 1 + tangents):
         J[start] *= -np.sign(J[start] @ velocity)
         along = np.arange(start + 1, start + 1 + tangents)
-        contacts.append(Rubbing(start, along, random.uniform(0.0, 1.0), random.uniform(0.0, 1.0)))
+        contacts.append(
+            FrictionalContact(start, along, random.uniform(0.0, 1.0), random.uniform(0.0, 1.0))
+        )
     return J @ np.linalg.inv(root @ root.T + 0.5 * np.eye(6)) @ J.T, J @ velocity, contacts
 
 
@@ -167,7 +171,9 @@ def test_contacts_of_a_mechanism_of_one_freedom_find_impulses():
         random = np.random.default_rng(seed)
         J = random.standard_normal(4)
         J[::2] = -np.abs(J[::2])
-        contacts = [Rubbing(i, rows(i + 1), random.uniform(0.0, 1.0), 0.5) for i in (0, 2)]
+        contacts = [
+            FrictionalContact(i, rows(i + 1), random.uniform(0.0, 1.0), 0.5) for i in (0, 2)
+        ]
         impulses = impact(np.outer(J, J), J, rows(), contacts)
         after = J * (1.0 + J @ impulses)
         assert impulses @ (J + after) <= 1e-12
@@ -190,7 +196,7 @@ def test_a_box_that_lands_on_four_feet():
         J = np.vstack([np.hstack([np.eye(3), -np.cross(np.eye(3), p)])[[2, 0, 1]] for p in feet])
         velocity = random.standard_normal(6) * [1.0, 1.0, 1.0, 0.2, 0.2, 1.0]
         velocity[2] = -1.0 - abs(velocity[2])
-        contacts = [Rubbing(3 * i, rows(3 * i + 1, 3 * i + 2), mu, e) for i in range(4)]
+        contacts = [FrictionalContact(3 * i, rows(3 * i + 1, 3 * i + 2), mu, e) for i in range(4)]
         A, before = J / inertia @ J.T, J @ velocity
         impulses = impact(A, before, rows(), contacts)
         after = before + A @ impulses
@@ -219,7 +225,7 @@ def test_a_wedged_body_bounces_less_or_not_at_all():
     ways = np.array([[np.cos(lean), -np.sin(lean)], [np.cos(lean), np.sin(lean)]])
     J = np.array([rises[0], ways[0], rises[1], ways[1]])
     before = J @ np.array([-1.0, 0.0])
-    contacts = [Rubbing(0, rows(1), 1.0, 0.5), Rubbing(2, rows(3), 1.0, 0.5)]
+    contacts = [FrictionalContact(0, rows(1), 1.0, 0.5), FrictionalContact(2, rows(3), 1.0, 0.5)]
     impulses = impact(J @ J.T, before, rows(), contacts)
     assert_allclose(before + J @ J.T @ impulses, 0.0, atol=1e-9)
 
@@ -232,7 +238,7 @@ def test_one_contact_in_space_always_finds_its_impulse():
         A = J * 10.0 ** random.uniform(-2.0, 2.0, 5) @ J.T
         before, mu = J @ random.standard_normal(5), random.choice([0.1, 0.5, 1.0, 3.0])
         before[0] = -abs(before[0])
-        impulses = impact(A, before, rows(), [Rubbing(0, rows(1, 2), mu, 0.0)])
+        impulses = impact(A, before, rows(), [FrictionalContact(0, rows(1, 2), mu, 0.0)])
         assert impulses is not None
         after, most = before + A @ impulses, mu * impulses[0]
         assert abs(after[0]) < 1e-10 * np.abs(before).max()
@@ -283,7 +289,7 @@ def test_of_several_directions_of_sliding_it_is_that_which_goes_on_most_as_it_ca
             found.append((before[1:] @ after, impulses))
     assert len(found) == 3
     _, wanted = max(found, key=lambda one: one[0])
-    impulses = impact(A, before, rows(), [Rubbing(0, rows(1, 2), mu, 0.0)])
+    impulses = impact(A, before, rows(), [FrictionalContact(0, rows(1, 2), mu, 0.0)])
     # Directions lie as close as 1e-3 to each other, and zeros are good to 1e-13.
     assert_allclose(impulses, wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max())
 
@@ -297,7 +303,7 @@ def test_a_lever_of_one_freedom_rubs(slope, bounce):
     """
     mu, J = 0.5, np.array([1.0, slope])
     A, before = np.outer(J, J), -2.0 * J
-    impulses = impact(A, before, rows(), [Rubbing(0, rows(1), mu, bounce)])
+    impulses = impact(A, before, rows(), [FrictionalContact(0, rows(1), mu, bounce)])
     after = before + A @ impulses
     assert impulses[0] > 0.0
     assert abs(impulses[1]) <= mu * impulses[0] * (1.0 + 1e-12)
@@ -320,7 +326,7 @@ def test_of_impulses_that_stick_alike_those_are_taken_that_rub_least(tangents, s
         J[0], n[0] = -J[0], -n[0]
         before = -J @ J.T @ given
     along = np.arange(1, 1 + tangents)
-    impulses = impact(J @ J.T, before, rows(), [Rubbing(0, along, 10.0, 0.0)])
+    impulses = impact(J @ J.T, before, rows(), [FrictionalContact(0, along, 10.0, 0.0)])
     assert_allclose(before + J @ J.T @ impulses, 0.0, atol=1e-12 * np.abs(before).max())
     best = given - n * (n[1:] @ given[1:]) / (n[1:] @ n[1:])
     if best[0] > 0.0 and np.linalg.norm(best[1:]) < 10.0 * best[0]:
@@ -329,7 +335,7 @@ def test_of_impulses_that_stick_alike_those_are_taken_that_rub_least(tangents, s
 
 def test_a_block_that_lands_on_one_foot_sticks_or_slides():
     """A point mass: A is 1 / m. It sticks where |c_t| <= mu |c_n|, else it slows down."""
-    contact = [Rubbing(0, rows(1, 2), 0.5, 0.0)]
+    contact = [FrictionalContact(0, rows(1, 2), 0.5, 0.0)]
     A = np.eye(3) / 2.0
     sticks = impact(A, np.array([-1.0, 0.3, 0.3]), rows(), contact)
     assert_allclose(A @ sticks, [1.0, -0.3, -0.3], atol=1e-14)

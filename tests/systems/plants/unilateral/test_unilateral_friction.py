@@ -18,8 +18,8 @@ from drake_dae import (
     poles,
     simulate,
 )
-from drake_dae.dae.system.contacts import Jam
-from drake_dae.errors import JammedContactError
+from drake_dae.dae.system.contacts import PainleveOutcome
+from drake_dae.errors import PainleveError
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +27,14 @@ def plant():
     return UnilateralRobotPlant(rod(1.5, 1.1), {"floor": 0.0})
 
 
-@pytest.mark.parametrize(("turn", "outcome"), [(0.0, Jam.INCONSISTENT), (6.0, Jam.INDETERMINATE)])
+@pytest.mark.parametrize(
+    ("turn", "outcome"), [(0.0, PainleveOutcome.INCONSISTENT), (6.0, PainleveOutcome.INDETERMINATE)]
+)
 def test_a_rod_that_jams_does_not_start(plant, turn, outcome):
     """b = l sin a a'^2 - g: a rod at rest would pierce the floor, one that turns fast lifts off."""
-    with pytest.raises(JammedContactError, match=f"'?floor'? .*{outcome.name.lower()}:") as caught:
+    with pytest.raises(PainleveError, match=f"'?floor'? .*{outcome.name.lower()}:") as caught:
         simulator_of(plant, sliding(1.1, turn))
-    assert caught.value.jam is outcome
+    assert caught.value.outcome is outcome
 
 
 def test_a_run_into_the_edge_stops_there():
@@ -57,17 +59,17 @@ def test_a_run_into_the_edge_stops_there():
     root = diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
     plant.set_state(context, law.structure.manifold.project(sliding(np.deg2rad(80.0))))
-    with pytest.raises(JammedContactError, match="floor") as caught:
+    with pytest.raises(PainleveError, match="floor") as caught:
         simulate(diagram, root, 3.5, error_controlled(1e-8))
     angle = np.arctan((9.0 + np.sqrt(17.0)) / 4.0)
     when = np.arccos((np.rad2deg(angle) - 60.0) / 20.0) / (np.pi / 4.0)
     assert caught.value.time == pytest.approx(when, abs=1e-5)
-    assert caught.value.jam is Jam.INDETERMINATE
+    assert caught.value.outcome is PainleveOutcome.INDETERMINATE
     assert plant.events(context) == ()
 
 
 def test_a_rod_that_rubs_lands_and_stays_as_its_equation_says(plant):
-    """At 35 degrees it does not jam: an end that slides keeps lambda = -b / A > 0."""
+    """At 35 degrees there is no paradox: an end that slides keeps lambda = -b / A > 0."""
     start = sliding(0.6)
     start[1] += 0.01
     start[4] = -0.1

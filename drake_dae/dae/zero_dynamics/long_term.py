@@ -1,4 +1,4 @@
-"""What becomes of a motion with pinned outputs in the long run."""
+"""The long-term behavior of a motion with pinned outputs."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -6,9 +6,9 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Passage
+from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Transition
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import Cause
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.returns import Return, find_multiple, find_return
 from drake_dae.dae.zero_dynamics.stability import (
     Stability,
@@ -18,62 +18,67 @@ from drake_dae.dae.zero_dynamics.stability import (
 from drake_dae.errors import InconsistentStateError
 
 FOLDINGS = 40.0
-"""A motion is watched while the fastest disturbance grows by e to this power."""
+"""A motion is followed until its fastest disturbance could have grown by e to this power."""
 
 BESIDE = 1e-3
-"""How far beside a motion one starts that may leave it, relative to the scale of the states."""
+"""The initial distance from an unstable motion, relative to the scale of the states."""
 
 PATIENCE = 10.0
-"""For a return is waited so many times as long as for what becomes of disturbances."""
+"""The factor by which the search for a return lasts longer than that for the growth of
+disturbances."""
 
 PLAIN = float(np.log(10.0))
-"""Disturbances grow or shrink where the logarithm of their size changes by more than this."""
+"""Disturbances count as growing or decaying if the logarithm of their size changes by more than
+this."""
 
 
 LONGEST = 1500.0
-"""No motion is followed through a larger angle, in rad, some hundred turns."""
+"""The largest angle through which a motion is followed, in rad: some hundred turns."""
 
 SLOWEST = 1e-4
-"""What moves more slowly than this, relative to all that moves, is not waited for."""
+"""Rates below this, relative to the fastest, are ignored."""
 
 
-class Fate(Enum):
-    """What becomes of a motion; the value says it."""
+class Behavior(Enum):
+    """The long-term behavior of a motion; the value describes it."""
 
     GROWS = "grows without bound"
-    SETTLES = "settles into another motion, which is stable"
-    CIRCLES = "settles into a bounded motion, a limit cycle"
-    LEAVES = "comes to a periodic motion that it leaves again"
-    WANDERS = "draws its neighbours to it, but was not seen to return: it may drift"
-    SPREADS = "stays beside no neighbour: small disturbances grow on and on"
-    UNCLEAR = "was not followed long enough to tell"
+    SETTLES = "converges to another stable motion"
+    CIRCLES = "converges to a limit cycle"
+    LEAVES = "approaches an unstable periodic motion"
+    WANDERS = "attracts its neighbours but did not return: it may drift"
+    SPREADS = "is unstable: small disturbances grow exponentially"
+    UNCLEAR = "was not followed long enough to decide"
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """What becomes of a motion, and what shows it.
+class LongTerm:
+    """The long-term behavior of a motion, with its evidence.
 
     Attributes:
-        fate: What becomes of it.
-        state: Where it was at the end; None if that is not known.
-        closed: The periodic motion that it comes to; None if there is none.
+        behavior: The behavior.
+        state: The last state; None if it is not known.
+        closed: The periodic motion to which it converges; None without one.
     """
 
-    fate: Fate
+    behavior: Behavior
     state: FloatArray | None = None
     closed: Return | None = None
 
     def __str__(self) -> str:
-        return self.fate.value if self.closed is None else f"{self.fate.value} ({self.closed})"
+        return (
+            self.behavior.value if self.closed is None else f"{self.behavior.value} ({self.closed})"
+        )
 
 
-def fate_of(passage: Passage, *halves: Passage) -> Fate:
-    """What an interval says of a motion that has lasted for some time.
+def behavior_of(passage: Transition, *halves: Transition) -> Behavior:
+    """The behavior of a motion, from its disturbances over a late interval.
 
-    Neighbours that a motion draws to it come nearer in all directions. On a limit cycle those
-    ahead stay ahead, while volumes shrink; but so they do where a motion drifts for ever. A growth
-    that is no more than proportional to time, as of neighbours that are a little faster, is not
-    exponential: then that of both halves adds up to much more.
+    If a motion attracts its neighbours, disturbances decay in all directions. On a limit cycle,
+    disturbances along the motion neither grow nor decay while volumes shrink; the same holds for a
+    motion that drifts. Growth proportional to time, from neighbours with a slightly different
+    speed, is not exponential: then the growth of the two halves adds up to much more than the
+    whole.
 
     Args:
         passage: The interval.
@@ -81,23 +86,23 @@ def fate_of(passage: Passage, *halves: Passage) -> Fate:
     """
     grows = passage.growth > 0.8 * sum(max(half.growth, 0.0) for half in halves)
     if passage.growth > PLAIN and grows:
-        return Fate.SPREADS
+        return Behavior.SPREADS
     if passage.growth < -PLAIN:
-        return Fate.SETTLES
+        return Behavior.SETTLES
     if abs(passage.growth) < 0.7 * PLAIN and passage.volume < -2.0 * PLAIN:
-        return Fate.WANDERS
-    return Fate.UNCLEAR
+        return Behavior.WANDERS
+    return Behavior.UNCLEAR
 
 
 def watch(
     flow: Flow, state: FloatArray, begin: float, end: float, period: float | None = None
-) -> Course:
-    """What becomes of the motion from a state.
+) -> LongTerm:
+    """The long-term behavior of the motion from a state.
 
     Args:
         flow: Of a reference that can be asked at all times.
         state: The state, shape (n,).
-        begin, end: From when to when it is watched, in s; the second half decides.
+        begin, end: The interval of observation, in s; the second half decides.
         period: The period of the reference; None if it is constant.
     """
     middle = 0.5 * (begin + end)
@@ -105,25 +110,25 @@ def watch(
         later = flow.carry(state, begin, middle, disturbed=False).state
         passage, halves = carry_in_halves(flow, later, middle, end)
     except Lost as lost:
-        return Course(Fate.GROWS if lost.cause is Cause.UNBOUNDED else Fate.UNCLEAR)
-    fate, last = fate_of(passage, *halves), passage.state
-    if fate is not Fate.WANDERS:
-        return Course(fate, last)
+        return LongTerm(Behavior.GROWS if lost.cause is EndCause.UNBOUNDED else Behavior.UNCLEAR)
+    behavior, last = behavior_of(passage, *halves), passage.state
+    if behavior is not Behavior.WANDERS:
+        return LongTerm(behavior, last)
     if period is None:
         closed = find_return(flow, last, PATIENCE * (end - begin))
     else:
         closed = find_multiple(flow, last, end, period)
     if closed is not None and closed.attracts:
-        return Course(Fate.CIRCLES, closed.state, closed)
+        return LongTerm(Behavior.CIRCLES, closed.state, closed)
     if closed is not None and closed.repels:
-        return Course(Fate.LEAVES, closed.state, closed)
-    return Course(fate, last)
+        return LongTerm(Behavior.LEAVES, closed.state, closed)
+    return LongTerm(behavior, last)
 
 
 def carry_in_halves(
     flow: Flow, state: FloatArray, begin: float, end: float
-) -> tuple[Passage, tuple[Passage, Passage]]:
-    """What an interval of time and its halves make of a state.
+) -> tuple[Transition, tuple[Transition, Transition]]:
+    """The flow over an interval and over its halves.
 
     Raises:
         Lost: The motion cannot be followed.
@@ -133,7 +138,7 @@ def carry_in_halves(
     second = flow.carry(first.state, middle, end)
     transition = second.transition @ first.transition
     size = max(float(np.linalg.norm(transition, 2)), 1e-300)
-    whole = Passage(
+    whole = Transition(
         second.state,
         second.basis,
         transition / size,
@@ -143,20 +148,20 @@ def carry_in_halves(
     return whole, (first, second)
 
 
-def watch_from(flow: Flow, state: FloatArray) -> Course:
-    """What becomes of the motion from a state that is not at rest, under a constant reference.
+def watch_from(flow: Flow, state: FloatArray) -> LongTerm:
+    """The long-term behavior from a state that is not at rest, for a constant reference.
 
-    How long that takes is told by how fast its disturbances move.
+    The duration follows from the rates of its disturbances.
     """
     basis = flow.basis(state, 0.0) / flow.scale[:, None]
     slopes, _ = flow.pinned.slopes(state, flow.goal(0.0), flow.parameters(0.0))
     slopes = slopes * flow.scale / flow.scale[:, None]
     if not np.all(np.isfinite(slopes)):
-        return Course(Fate.UNCLEAR)
+        return LongTerm(Behavior.UNCLEAR)
     rates = np.abs(np.linalg.eigvals(basis.T @ slopes @ basis))
     rates = rates[rates > SLOWEST * np.linalg.norm(slopes, 2)]
     if not rates.size:
-        return Course(Fate.UNCLEAR)
+        return LongTerm(Behavior.UNCLEAR)
     return watch(flow, state, 0.0, FOLDINGS / float(rates.min()))
 
 
@@ -167,23 +172,23 @@ def leave(
     rate: float,
     fastest: float,
     period: float | None = None,
-) -> Course:
-    """What becomes of the motions that leave an unstable one, on both sides of it.
+) -> LongTerm:
+    """The long-term behavior of the motions that leave an unstable one, on both sides.
 
     Args:
         flow: Of a reference that can be asked at all times.
         state: A state of the unstable motion, shape (n,).
-        time: When it is there.
+        time: The time of that state.
         rate: The largest exponent of its disturbances, in 1/s, positive.
-        fastest: How fast it moves, in rad/s; what takes too many turns is not followed.
+        fastest: Its fastest frequency in rad/s; motions of too many turns are not followed.
         period: The period of the reference; None if it is constant.
 
     Returns:
-        The fate that is worse, or that is not known; the circling one only if both sides circle.
+        The worse behavior of both sides; a limit cycle only if both sides converge to one.
     """
     duration = FOLDINGS / rate
     if duration * fastest > LONGEST:
-        return Course(Fate.UNCLEAR)
+        return LongTerm(Behavior.UNCLEAR)
     basis = flow.basis(state, 0.0)
     aside = basis @ np.random.default_rng(0).standard_normal(basis.shape[1])
     aside *= BESIDE / np.max(np.abs(aside) / flow.scale)
@@ -192,18 +197,18 @@ def leave(
         try:
             start = flow.onto(state + side, time)
         except Lost:
-            return Course(Fate.UNCLEAR)
+            return LongTerm(Behavior.UNCLEAR)
         courses.append(watch(flow, start, time, time + duration, period))
-        if courses[-1].fate not in (Fate.CIRCLES, Fate.SETTLES, Fate.WANDERS):
+        if courses[-1].behavior not in (Behavior.CIRCLES, Behavior.SETTLES, Behavior.WANDERS):
             return courses[-1]
-    order = (Fate.WANDERS, Fate.SETTLES, Fate.CIRCLES)
-    return min(courses, key=lambda course: order.index(course.fate))
+    order = (Behavior.WANDERS, Behavior.SETTLES, Behavior.CIRCLES)
+    return min(courses, key=lambda course: order.index(course.behavior))
 
 
 def judge_at_rest(
     equilibria: Equilibria, goal: FloatArray, rest: FloatArray, parameters: FloatArray
 ) -> Stability:
-    """What the eigenvalues say; where they are unstable, also what leaves the equilibrium.
+    """The verdict by eigenvalues; if unstable, also by the motions that leave the equilibrium.
 
     Args:
         equilibria: The states at rest on Z(R).
@@ -222,14 +227,16 @@ def judge_at_rest(
     return _after(found, course)
 
 
-def _after(found: Stability, course: Course) -> Stability:
-    """What is said of an unstable equilibrium once it is known what becomes of what leaves it."""
-    verdict = {Fate.CIRCLES: Verdict.BOUNDED, Fate.WANDERS: Verdict.UNDECIDED}.get(
-        course.fate, Verdict.UNSTABLE
+def _after(found: Stability, course: LongTerm) -> Stability:
+    """The verdict on an unstable equilibrium, given the behavior of motions that leave it."""
+    verdict = {Behavior.CIRCLES: Verdict.BOUNDED, Behavior.WANDERS: Verdict.UNDECIDED}.get(
+        course.behavior, Verdict.UNSTABLE
     )
-    if course.fate in (Fate.UNCLEAR, Fate.GROWS, Fate.SPREADS):
+    if course.behavior in (Behavior.UNCLEAR, Behavior.GROWS, Behavior.SPREADS):
         return found
-    return replace(found, verdict=verdict, reason=f"{found.reason}; what leaves it {course}")
+    return replace(
+        found, verdict=verdict, reason=f"{found.reason}; a motion that leaves it {course}"
+    )
 
 
 def judge_without_rest(
@@ -239,7 +246,7 @@ def judge_without_rest(
     parameters: FloatArray,
     reason: str,
 ) -> Stability:
-    """What the motion from a state says where the search finds no equilibrium near it.
+    """The verdict by the motion from a state near which no equilibrium is found.
 
     Args:
         equilibria: The states at rest on Z(R).
@@ -252,17 +259,17 @@ def judge_without_rest(
     flow = Flow(pinned, lambda time: goal, lambda time: parameters, equilibria.sizes)
     try:
         course = watch_from(flow, pinned.state(goal, start, parameters))
-        if course.fate is Fate.SETTLES and course.state is not None:
+        if course.behavior is Behavior.SETTLES and course.state is not None:
             rest = equilibria.find(goal, course.state, parameters)
             return judge_at_rest(equilibria, goal, rest, parameters)
     except InconsistentStateError:
         return Stability(Verdict.UNDECIDED, nothing, None, reason)
     verdict = {
-        Fate.GROWS: Verdict.UNSTABLE,
-        Fate.LEAVES: Verdict.UNSTABLE,
-        Fate.CIRCLES: Verdict.BOUNDED,
-        Fate.WANDERS: Verdict.UNDECIDED,
-    }.get(course.fate)
+        Behavior.GROWS: Verdict.UNSTABLE,
+        Behavior.LEAVES: Verdict.UNSTABLE,
+        Behavior.CIRCLES: Verdict.BOUNDED,
+        Behavior.WANDERS: Verdict.UNDECIDED,
+    }.get(course.behavior)
     if verdict is None:
         return Stability(Verdict.UNDECIDED, nothing, None, reason)
     return Stability(verdict, nothing, None, f"{reason}; the motion from there {course}")

@@ -1,4 +1,4 @@
-"""Pushes on a robot that its law does not know."""
+"""Disturbance forces on a robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class Push:
-    """A force F on a point of a frame for some time, which grows and fades smoothly:
+class DisturbanceForce:
+    """A disturbance force F on a point of a frame, with a smooth rise and fall:
 
         F(t) = F (s((t - start_time) / rise) - s((t - end_time) / rise)),    s(x) = 3 x^2 - 2 x^3
 
@@ -30,9 +30,9 @@ class Push:
     Attributes:
         frame: Name of the frame.
         force: F in the world, N, shape (3,).
-        start_time: When it begins, s.
-        end_time: When it begins to fade, s; None for never.
-        rise: How long it grows, and fades, s.
+        start_time: The start, s.
+        end_time: The start of the fall, s; None for never.
+        rise: The duration of the rise and of the fall, s.
         point: The point in the frame, m, shape (3,).
 
     Raises:
@@ -47,11 +47,11 @@ class Push:
     point: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        positive("the rise of a push", self.rise)
-        start = number("the start_time of a push", self.start_time)
+        positive("the rise of a disturbance", self.rise)
+        start = number("the start_time of a disturbance", self.start_time)
         if self.end_time is not None and not self.end_time > start:
             raise ModelError(
-                f"a push must end after it begins, at {start:g} s; its end_time is "
+                f"a disturbance must end after it begins, at {start:g} s; its end_time is "
                 f"{brief(self.end_time)}"
             )
 
@@ -72,31 +72,36 @@ class Push:
         return x * x * (3.0 - 2.0 * x)
 
 
-class AppliedPushes(LeafSystem):
-    """Gives pushes to Drake's MultibodyPlant.
+class AppliedDisturbances(LeafSystem):
+    """Applies disturbance forces to Drake's MultibodyPlant.
 
     Output port:
-        spatial_forces: For its port `applied_spatial_force`.
+        spatial_forces: The input of its port `applied_spatial_force`.
 
     Args:
         plant: The plant, finalized.
-        pushes: The pushes.
+        disturbances: The disturbances.
         frames: The frame of each.
     """
 
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
-        self, plant: MultibodyPlant, pushes: Sequence[Push], frames: Sequence[Frame]
+        self,
+        plant: MultibodyPlant,
+        disturbances: Sequence[DisturbanceForce],
+        frames: Sequence[Frame],
     ) -> None:
         super().__init__()
-        self.set_name("pushes")
-        self._forces = [push.reference.derivatives([0, 0, 0]) for push in pushes]
+        self.set_name("disturbances")
+        self._forces = [
+            disturbance.reference.derivatives([0, 0, 0]) for disturbance in disturbances
+        ]
         self._applied = []
-        for push, frame in zip(pushes, frames, strict=True):
+        for disturbance, frame in zip(disturbances, frames, strict=True):
             applied = ExternallyAppliedSpatialForce()
             applied.body_index = frame.body().index()
-            applied.p_BoBq_B = frame.GetFixedPoseInBodyFrame() @ push.point
+            applied.p_BoBq_B = frame.GetFixedPoseInBodyFrame() @ disturbance.point
             self._applied.append(applied)
         self.DeclareAbstractOutputPort(
             "spatial_forces",

@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray
 
 
 class Regularity(Enum):
-    """Whether the motion is determined at a point; the value says what is wrong."""
+    """Whether the motion is determined at a point; the value describes the problem."""
 
     REGULAR = ""
     MATRIX_NOT_FINITE = "A(x) or B(x) is not finite"
@@ -20,7 +20,7 @@ class Regularity(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A state on Z(R), and what belongs to it, finite or not.
+    """A state on Z(R) with its rate, inputs and matrices, which may be infinite.
 
     Attributes:
         state: x, shape (n,).
@@ -29,7 +29,7 @@ class Point:
         constraint_input: v, shape (m,).
         A, B: The matrices of Assumptions (2) and (5).
         pivot: A number that is 0 exactly where one of them is singular, shape (1,).
-        unrest: |E x'| relative to the sizes of the terms that cancel in it at rest, shape (n,).
+        unrest: |E x'| relative to the sizes of its terms, shape (n,).
     """
 
     state: FloatArray

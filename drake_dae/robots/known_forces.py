@@ -1,4 +1,4 @@
-"""Known forces on a robot that are none of constraints.                       (37)"""
+"""Known applied forces on a robot.                                            (37)"""
 
 from dataclasses import dataclass, field
 
@@ -15,17 +15,17 @@ from drake_dae.robots.surfaces.surface import Vector
 @checked(ModelError)
 @dataclass(frozen=True)
 class KnownForce:
-    """A force F on a point of a frame, which the right side of (37) then holds as J_p^T F.
+    """A force F on a point of a frame, which adds J_p^T F to the right side of (37).
 
     The parameter "<name>.force" is F in N, in the world, zero by default. As an exogenous signal
-    (see `RobotModel`) it is a push, a weight that is picked up, or a force that a sensor measures:
-    the law, which knows it too, makes up for it. A force that the law does not know is set in the
-    plant's context alone.
+    (see `RobotModel`) it is a varying applied force, the weight of a payload, or a force that a
+    sensor measures; the law has it as well and compensates it. For a force that the law does not
+    know, set it in the plant's context alone.
 
     Attributes:
         frame: Name of the frame.
         point: The point in the frame, m, shape (3,).
-        name: Stands before the name of its parameter.
+        name: The prefix of its parameter's name.
     """
 
     frame: str
@@ -38,6 +38,6 @@ class KnownForce:
         object.__setattr__(self, "parameters", (force,))
 
     def reaction(self, kinematics: Kinematics) -> Reaction:
-        """What it does to the robot."""
+        """The reaction on the robot."""
         velocity = kinematics.velocity(self.frame, self.point)
         return kinematics.reaction(ca.dot(self.parameters[0].symbol, velocity))

@@ -1,4 +1,4 @@
-"""Painleve's paradox: where friction jams a contact, against closed forms.
+"""The Painleve paradox of frictional contacts, against closed forms.
 
 The rod: uniform, of length 2 l and mass m, one end on a rough floor, at an angle a to it. With the
 friction of an end that slides toward -x, J M^-1 J^T = (1 + 3 cos^2 a) / m and
@@ -32,9 +32,16 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae.references import stack_references
-from drake_dae.dae.system.contacts import MOST, Contact, Contacts, Jam, critical_factor, jam
+from drake_dae.dae.system.contacts import (
+    MOST,
+    Contact,
+    Contacts,
+    PainleveOutcome,
+    critical_factor,
+    painleve_outcome,
+)
 from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.errors import JammedContactError, ModelError
+from drake_dae.errors import ModelError, PainleveError
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
@@ -46,7 +53,7 @@ def margin_of(mu, angle):
 
 @pytest.fixture(scope="module")
 def steep():
-    """A rod that jams between 50 and 76 degrees."""
+    """A rod with the Painleve paradox between 50 and 76 degrees."""
     return RobotPlant(rod(1.5))
 
 
@@ -65,7 +72,7 @@ def test_analyze_finds_the_critical_coefficient_at_a_state(angle, friction):
     found = analyze(system, states=[sliding(angle)]).contact_margin
     assert found.critical_friction["floor.friction"] == pytest.approx(critical(angle), rel=1e-6)
     assert found.reserve == pytest.approx(margin_of(friction, angle), abs=1e-6)
-    assert not found.jams
+    assert not found.is_paradoxical
 
 
 def test_a_rod_that_slides_the_other_way_never_jams():
@@ -83,22 +90,24 @@ def test_analyze_finds_the_worst_angle_of_a_region(friction):
     assert margin.critical_friction["floor.friction"] == pytest.approx(4.0 / 3.0, rel=1e-3)
     assert np.tan(margin.state[2]) == pytest.approx(2.0, abs=0.05)
     assert margin.reserve == pytest.approx(1.0 - 0.75 * friction, abs=2e-3)
-    jams = friction > 4.0 / 3.0
-    assert margin.jams is jams
-    assert any("Painleve" in problem for problem in found.problems) is jams
+    paradoxical = friction > 4.0 / 3.0
+    assert margin.is_paradoxical is paradoxical
+    assert any("Painleve" in problem for problem in found.problems) is paradoxical
     assert found.to_dict()["contact_margin"]["critical_friction"]["floor.friction"] > 1.33
 
 
-@pytest.mark.parametrize(("turn", "outcome"), [(0.0, Jam.INCONSISTENT), (6.0, Jam.INDETERMINATE)])
+@pytest.mark.parametrize(
+    ("turn", "outcome"), [(0.0, PainleveOutcome.INCONSISTENT), (6.0, PainleveOutcome.INDETERMINATE)]
+)
 def test_a_rod_that_jams_has_no_motion_or_two(steep, turn, outcome):
     """b = l sin a a'^2 - g: a rod at rest would pierce the floor, one that turns fast lifts off."""
     state = sliding(1.1, turn)
     context = context_of(steep, state)
     free = HALF * np.sin(1.1) * turn**2 - GRAVITY
-    assert (free < 0.0) == (outcome is Jam.INCONSISTENT)
-    with pytest.raises(JammedContactError, match=f"{outcome.name.lower()}:") as caught:
+    assert (free < 0.0) == (outcome is PainleveOutcome.INCONSISTENT)
+    with pytest.raises(PainleveError, match=f"{outcome.name.lower()}:") as caught:
         steep.EvalTimeDerivatives(context)
-    assert caught.value.jam is outcome
+    assert caught.value.outcome is outcome
     assert "'floor.force'" in str(caught.value)
     assert_allclose(caught.value.state, state)
 
@@ -142,13 +151,13 @@ def test_a_run_that_reaches_the_edge_stops_there():
     tan a = (9 + 17^(1/2)) / 4 where 3 mu t = t^2 + 4 with mu = 1.5, and a(t) is as commanded.
     """
     start = sliding(np.deg2rad(80.0))
-    with pytest.raises(JammedContactError) as caught:
+    with pytest.raises(PainleveError) as caught:
         follow(rod(1.5, np.deg2rad(80.0)), tilting(), start, 3.5)
     angle = np.arctan((9.0 + np.sqrt(17.0)) / 4.0)
     when = np.arccos((np.rad2deg(angle) - 60.0) / 20.0) / (np.pi / 4.0)
     assert caught.value.time == pytest.approx(when, abs=1e-5)
     assert caught.value.state[2] == pytest.approx(angle, abs=1e-5)
-    assert caught.value.jam is Jam.INDETERMINATE
+    assert caught.value.outcome is PainleveOutcome.INDETERMINATE
 
 
 @pytest.mark.slow
@@ -164,10 +173,10 @@ def test_analyze_tells_that_a_reference_leads_into_it():
     assert any("A(x) becomes singular" in problem for problem in found.problems)
     gentle = analyze(law.system, reference=reference, times=times[:40], start=start)
     assert not gentle.problems
-    assert gentle.contact_margin.jams
-    assert not gentle.contact_margin_along.jams
+    assert gentle.contact_margin.is_paradoxical
+    assert not gentle.contact_margin_along.is_paradoxical
     assert "along the reference at least" in " ".join(str(gentle).split())
-    assert "would jam at floor.friction" in " ".join(str(gentle).split())
+    assert "paradox is at floor.friction" in " ".join(str(gentle).split())
 
 
 def test_a_law_that_does_not_know_the_friction_does_not_reach_it():
@@ -240,13 +249,23 @@ def test_sets_of_forces_are_those_of_complementarity():
     """Two contacts by hand: A = [[-1, 0], [0, 2]], b = -A v."""
     A, A_0 = np.diag([-1.0, 2.0]), np.diag([1.0, 2.0])
     rows, size = [0, 1], np.full(2, 10.0)
-    assert jam(A, A_0, np.array([3.0, 1.0]), size, rows) is Jam.INDETERMINATE
-    assert jam(A, A_0, np.array([-3.0, 1.0]), size, rows) is Jam.INCONSISTENT
-    assert jam(A_0, A_0, np.array([3.0, 1.0]), size, rows) is None
-    assert jam(A_0, A_0, np.array([-3.0, -1.0]), size, rows) is Jam.OPENING
+    assert (
+        painleve_outcome(A, A_0, np.array([3.0, 1.0]), size, rows) is PainleveOutcome.INDETERMINATE
+    )
+    assert (
+        painleve_outcome(A, A_0, np.array([-3.0, 1.0]), size, rows) is PainleveOutcome.INCONSISTENT
+    )
+    assert painleve_outcome(A_0, A_0, np.array([3.0, 1.0]), size, rows) is None
+    assert painleve_outcome(A_0, A_0, np.array([-3.0, -1.0]), size, rows) is PainleveOutcome.OPENING
     edge = np.diag([0.0, 2.0])
-    assert jam(edge, A_0, np.array([3.0, 0.0]), size, rows) is Jam.INDETERMINATE
-    assert jam(edge, A_0, np.array([np.inf, 1.0]), size, rows) is Jam.INCONSISTENT
+    assert (
+        painleve_outcome(edge, A_0, np.array([3.0, 0.0]), size, rows)
+        is PainleveOutcome.INDETERMINATE
+    )
+    assert (
+        painleve_outcome(edge, A_0, np.array([np.inf, 1.0]), size, rows)
+        is PainleveOutcome.INCONSISTENT
+    )
 
 
 def test_too_many_contacts_are_refused():

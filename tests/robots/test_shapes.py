@@ -1,0 +1,161 @@
+"""Shapes of links behind surfaces and in each other, against forward kinematics by hand."""
+
+import numpy as np
+import pytest
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_dae import Cylinder, JointPositions, Plane, PointOnSurface, RobotModel, Sphere
+from drake_dae.robots.clearances import links_behind
+from drake_dae.robots.shapes import LinkShapes, collisions
+
+BASE, LENGTH, RADIUS = 0.3, 0.5, 0.06
+JOINTS = 4
+
+
+def urdf(shape):
+    """Links of 0.5 m that turn about y and point along x at zero, each with a shape at its end."""
+    inertia = '<mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>'
+    parts = ['<robot name="chain"><link name="base"/>']
+    parts.append(
+        '<joint name="mount" type="fixed"><parent link="world"/><child link="base"/>'
+        f'<origin xyz="0 0 {BASE}"/></joint>'
+    )
+    for index in range(JOINTS):
+        above, shift = (f"link{index - 1}", LENGTH) if index else ("base", 0.0)
+        parts.append(
+            f'<link name="link{index}"><inertial><origin xyz="0.25 0 0"/>{inertia}</inertial>'
+            f'<collision><origin xyz="{LENGTH} 0 0"/><geometry>{shape}</geometry></collision>'
+            f'</link><joint name="joint{index}" type="revolute"><parent link="{above}"/>'
+            f'<child link="link{index}"/><origin xyz="{shift} 0 0"/><axis xyz="0 1 0"/>'
+            '<limit lower="-3" upper="3" effort="9" velocity="9"/></joint>'
+            f"<transmission><type>transmission_interface/SimpleTransmission</type><joint "
+            f'name="joint{index}"/><actuator name="motor{index}"/></transmission>'
+        )
+    parts.append('<frame name="tip" link="link3" xyz="0.5 0 0" rpy="0 0 0"/></robot>')
+    return "".join(parts)
+
+
+def chain(surface, shape=f'<sphere radius="{RADIUS}"/>'):
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    Parser(plant).AddModelsFromString(urdf(shape), "urdf")
+    plant.Finalize()
+    model = RobotModel.from_multibody(
+        plant,
+        [PointOnSurface("tip", surface, name="wall")],
+        [JointPositions(["joint1", "joint2", "joint3"])],
+    )
+    return model, LinkShapes(model, scene_graph)
+
+
+def ends(q):
+    """Where the links end, m, shape (4, 3)."""
+    angles = np.cumsum(q)
+    steps = LENGTH * np.column_stack([np.cos(angles), 0 * angles, -np.sin(angles)])
+    return np.array([0.0, 0.0, BASE]) + np.cumsum(steps, axis=0)
+
+
+def behind(model, shapes, *configurations):
+    states = np.column_stack([configurations, np.zeros((len(configurations), JOINTS))])
+    own = np.tile(model.dae.parameter_values, (len(states), 1))
+    return links_behind(model, np.arange(len(states)) / 10.0, states, own, shapes)
+
+
+# The second link ends so far above the table; the base stands on it.
+def bent(height):
+    turn = np.arcsin((BASE - height) / (2 * LENGTH))
+    return np.array([turn, 0.0, -turn - 0.4, 0.6])
+
+
+def test_an_elbow_above_a_table_is_no_problem_and_one_in_it_is_named():
+    """Its origin is in front of the table in both cases."""
+    model, shapes = chain(Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0]))
+    assert behind(model, shapes, bent(0.07), bent(0.07)) == ()
+    (one,) = behind(model, shapes, bent(0.07), bent(0.03), bent(0.02), bent(0.07))
+    assert (one.link, one.since, one.time) == ("link1", 0.1, 0.2)
+    assert one.depth == pytest.approx(RADIUS - 0.02, abs=1e-9)
+    assert "link1 is behind the surface of 'wall'" in str(one)
+    # By origins alone, as without shapes, nothing is seen of it.
+    assert behind(model, None, bent(0.02)) == ()
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        '<box size="0.2 0.1 0.12"/>',
+        '<cylinder radius="0.06" length="0.3"/>',
+        '<capsule radius="0.06" length="0.1"/>',
+    ],
+)
+def test_other_shapes_are_as_deep_as_their_lowest_point(shape):
+    plane = Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
+    model, shapes = chain(plane, shape)
+    q = bent(0.03)
+    (one,) = behind(model, shapes, q)
+    turn = q[0] + q[1]
+    lowest = {
+        "box": 0.1 * abs(np.sin(turn)) + 0.06 * np.cos(turn),
+        "cylinder": 0.06 * abs(np.sin(turn)) + 0.15 * np.cos(turn),
+        "capsule": 0.06 + 0.05 * np.cos(turn),
+    }[shape[1:].split()[0]]
+    assert (one.link, one.depth) == ("link1", pytest.approx(lowest - 0.03, rel=1e-9))
+
+
+@pytest.mark.parametrize(
+    ("surface", "distance"),
+    [
+        (Sphere(center=[0.9, 0.0, -0.4], radius=0.45), [0.9, 0.0, -0.4]),
+        (Cylinder(point=[0.9, 0.0, -0.4], axis=[0.0, 1.0, 0.0], radius=0.45), [0.9, 0.0, -0.4]),
+    ],
+)
+def test_surfaces_that_bend_are_as_deep_as_they_are_far(surface, distance):
+    model, shapes = chain(surface)
+    q = bent(0.05)
+    (one,) = behind(model, shapes, q)
+    off = np.linalg.norm(ends(q)[1] - distance)
+    assert (one.link, one.depth) == ("link1", pytest.approx(0.45 + RADIUS - off, rel=1e-9))
+
+
+def test_links_that_collide_are_named_with_pair_depth_and_time():
+    _, shapes = chain(Plane(point=[0.0, 0.0, -9.0], normal=[0.0, 0.0, 1.0]))
+    turns = np.linspace(0.3, 2.2, 20)
+    states = np.array([[0.0, turn, turn, turn, 0, 0, 0, 0] for turn in turns])
+    overlap = []
+    for state in states:
+        places = ends(state[:JOINTS])
+        overlap.append(2 * RADIUS - np.linalg.norm(places[3] - places[0]))
+    times = np.arange(20) / 100.0
+    (one, *others) = collisions(shapes, times, states)
+    assert {one.first, one.second} == {"link0", "link3"}
+    assert one.depth == pytest.approx(max(overlap), rel=1e-6)
+    assert one.time == times[np.argmax(overlap)]
+    assert one.since == times[np.argmax(np.array(overlap) > 1e-3)]
+    assert f"collide from {one.since:.4g} s on" in str(one)
+    assert collisions(shapes, times[:3], states[:3]) == ()
+    assert all({each.first, each.second} != {"link0", "link1"} for each in others)
+
+
+def test_shapes_with_one_link_between_them_may_overlap_a_little():
+    """Vendors' shapes do, as those of a base and an upper arm: the ends of two links apart."""
+    _, shapes = chain(Plane(point=[0.0, 0.0, -9.0], normal=[0.0, 0.0, 1.0]))
+    for overlap, count in ((0.015, 0), (0.03, 1)):
+        fold = 2 * np.arccos((2 * RADIUS - overlap) / (2 * LENGTH))
+        state = np.array([[0.0, 0.2, fold, 0.2, 0, 0, 0, 0]])
+        assert len(collisions(shapes, np.zeros(1), state)) == count
+
+
+def test_shapes_that_always_overlap_are_how_the_file_has_them():
+    _, shapes = chain(
+        Plane(point=[0.0, 0.0, -9.0], normal=[0.0, 0.0, 1.0]), '<sphere radius="0.6"/>'
+    )
+    straight = np.zeros((3, 2 * JOINTS))
+    assert collisions(shapes, np.arange(3.0), straight) == ()
+
+
+def test_a_robot_without_shapes_has_none():
+    model, _ = chain(Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0]))
+    bare = LinkShapes(model, None)
+    assert not bare
+    assert collisions(bare, np.zeros(1), np.zeros((1, 8))) == ()

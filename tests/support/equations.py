@@ -1,0 +1,108 @@
+"""Where each equation of the paper is computed, and which test proves it: `make equations`.
+
+The number of an equation stands as a comment at the line that computes it, `# (13), (14)`, and as
+the mark `@pytest.mark.equation(13, 14)` at the test that holds that line against another source.
+"""
+
+import ast
+import io
+import re
+import tokenize
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LAST = 83
+
+_NUMBERS = re.compile(r"# \(\d+\)(?:(?:, |-)\(\d+\))*$")
+
+_ROBOT = "for the robot (43)-(45) a special case of"
+
+WITHOUT_LINE = {
+    5: "the form of a feedback; (28) is the one that is used",
+    6: "the closed loop: Drake's Diagram of law and plant is that system",
+    7: "see (6)",
+    8: "see (6)",
+    17: "follows from (9) and (13); nothing computes it",
+    18: "follows from (9) and (13); nothing computes it",
+    19: "follows from (10) and (14); nothing computes it",
+    23: "the derivative of (20) along (1); (26) is what is left of it on N*",
+    33: "follows from (30) and (32)",
+    42: f"{_ROBOT} (4) with r = 2",
+    46: f"{_ROBOT} (9)",
+    47: f"{_ROBOT} (11)",
+    48: f"{_ROBOT} (10)",
+    49: f"{_ROBOT} (12)",
+    50: f"{_ROBOT} (21)",
+    51: f"{_ROBOT} (21)",
+    52: f"{_ROBOT} (21)",
+    53: f"{_ROBOT} (21)",
+    54: f"{_ROBOT} (26)",
+    55: f"{_ROBOT} (26)",
+    56: f"{_ROBOT} (26)",
+    57: f"{_ROBOT} (25)",
+    61: "what (59) leaves of the force error; nothing computes it",
+    62: "(29) of the positions",
+    63: "(29) of the forces",
+    66: "(38), whatever drives the joints",
+    67: "(39), whatever drives the joints",
+    68: "(40), whatever drives the joints",
+    69: "(28) of the chain of joints and springs",
+    70: "ubar of (28) of the chain of joints and springs",
+    76: "(38), whatever drives the joints",
+    77: "(39), whatever drives the joints",
+    78: "(40), whatever drives the joints",
+    79: "(28) of the chain of joints and motors",
+    80: "ubar of (28) of the chain of joints and motors",
+}
+"""Why no line computes an equation."""
+
+
+def lines() -> dict[int, list[str]]:
+    """Number of an equation -> the lines of the library that compute it, "file:line"."""
+    found = defaultdict(list)
+    for path in sorted((ROOT / "drake_dae").rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type == tokenize.COMMENT and _NUMBERS.match(token.string):
+                for number in _listed(token.string):
+                    found[number].append(f"{path.relative_to(ROOT)}:{token.start[0]}")
+    return found
+
+
+def proofs() -> dict[int, list[str]]:
+    """Number of an equation -> the tests that prove it, "file::test"."""
+    found = defaultdict(list)
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        text = path.read_text(encoding="utf-8")
+        if "mark.equation" not in text:
+            continue
+        for test in ast.parse(text).body:
+            for mark in getattr(test, "decorator_list", ()):
+                if ast.unparse(mark).startswith("pytest.mark.equation("):
+                    for number in mark.args:
+                        found[number.value].append(f"{path.relative_to(ROOT)}::{test.name}")
+    return found
+
+
+def _listed(comment: str) -> list[int]:
+    """The numbers of "# (9), (17)-(19)"."""
+    numbers = []
+    for part in comment.removeprefix("# ").split(", "):
+        ends = [int(number) for number in re.findall(r"\d+", part)]
+        numbers += range(ends[0], ends[-1] + 1)
+    return numbers
+
+
+def table() -> str:
+    """The table in Markdown: number, line or the reason why there is none, test."""
+    places, tests = lines(), proofs()
+    rows = ["| equation | line | test |", "|---|---|---|"]
+    for number in range(1, LAST + 1):
+        place = "<br>".join(places.get(number, [WITHOUT_LINE.get(number, "")]))
+        rows.append(f"| ({number}) | {place} | {'<br>'.join(tests.get(number, ['']))} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    print(table())
