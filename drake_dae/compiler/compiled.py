@@ -40,6 +40,7 @@ class Rate:
         function: (time, state, held, parameters, noise) -> new values of some held entries, and a
             number that is finite if they are of use.
         places: Which entries these are.
+        stepped: The block that Drake steps then; the function gives what its input port reads.
     """
 
     period: float
@@ -47,6 +48,7 @@ class Rate:
     is_unrestricted: bool
     function: ca.Function
     places: tuple[int, ...]
+    stepped: Block | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,9 +171,11 @@ class CompiledDiagram:
             own = system.GetMyContextFromRoot(context)
             state[part] = own.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
-            own = system.GetMyContextFromRoot(context)
-            groups = range(own.num_discrete_state_groups())
-            held[part] = np.concatenate([own.get_discrete_state(i).value() for i in groups])
+            own, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
+            values = [own.get_discrete_state(i).value() for i in range(_groups(own))]
+            if stepped is not None:
+                values = [system.GetOutputPort(name).Eval(own) for name in stepped.ports]
+            held[part] = np.concatenate(values)
         return state, held
 
     def put(
@@ -313,6 +317,18 @@ class CompiledDiagram:
         return found
 
     @property
+    def has_stepped(self) -> bool:
+        """Whether Drake steps one of the blocks, which is not traced."""
+        return bool(self.rates) and self.rates[-1].stepped is not None
+
+    @property
+    def stepped(self) -> tuple[Rate, Block]:
+        """The steps of the block that Drake runs, and this block; only where there is one."""
+        rate = self.rates[-1]
+        assert rate.stepped is not None
+        return rate, rate.stepped
+
+    @property
     def projects(self) -> bool:
         """Whether a block has a manifold that its state is brought to."""
         return any(block.projection is not None for block in self.blocks.values())
@@ -329,6 +345,10 @@ class CompiledDiagram:
     def _function(self, name: str, values: Sequence[ca.SX]) -> ca.Function:
         values = self._expressions.expanded(values)
         return dense_function(name, [self._columns[each] for each in ARGUMENTS], values)
+
+
+def _groups(context: Context) -> int:
+    return int(context.num_discrete_state_groups())
 
 
 def dense_function(name: str, given: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:

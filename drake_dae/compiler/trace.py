@@ -239,6 +239,9 @@ class Expressions:
             return self.time
         if name == PARAMETERS:
             return self.parameters(block)
+        if name == HELD and block.stepped is not None:
+            sizes = (system.GetOutputPort(port).size() for port in block.stepped.ports)
+            return self.symbol(system, HELD, sum(sizes))
         if name in (STATE, HELD, NOISE):
             return self.symbol(system, name, self._size(system, name))
         if system.HasInputPort(name):

@@ -96,6 +96,7 @@ class Fused:
         self._updates = [
             (rate.is_unrestricted, list(rate.places), Called(rate.function))
             for rate in compiled.rates
+            if rate.stepped is None
         ]
         self._steps: dict[bytes, tuple[Called, Called]] = {}
         self._called = Called(self._rate)

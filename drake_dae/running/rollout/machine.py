@@ -115,7 +115,7 @@ def _argument(value: Any) -> Any:
 def _source(program: Program) -> str:
     compiled, calls = program.compiled, program.functions
     sizes: dict[str, int] = {
-        "SIZE": program.size,
+        "SIZE": max(1, program.size),  # An array has one entry at least.
         "HELD": compiled.sizes["held"],
         "NOISE": compiled.sizes["noise"],
         "WIDTH": program.width,
@@ -151,7 +151,10 @@ def _source(program: Program) -> str:
             generate(*(renamed(each, f"dae_{name}") for name, each in calls.items()))
         ),
         "constants": "\n".join([*lines, ""]),
-        "updates": "\n".join(_updated(*item) for item in enumerate(compiled.rates)),
+        "updates": "\n".join(
+            _updated(*item) for item in enumerate(compiled.rates) if item[1].stepped is None
+        ),
+        "sample": _sampled(len(compiled.rates) - 1) if compiled.has_stepped else "",
         "watch": _WATCH if compiled.watched else "  (void)time, (void)x, (void)g;",
         "guards": _GUARDS if compiled.guards else "  (void)x, (void)g;",
     }
@@ -170,6 +173,28 @@ def _updated(number: int, rate: Rate) -> str:
     good &= isfinite(valid) != 0;
     for (i = 0; i < {count}; i++) fresh[places_{number}[i]] = values[i];
   }}"""
+
+
+def _sampled(number: int) -> str:
+    """What stepper.c has for a diagram with a block that Drake steps."""
+    return f"""
+/* What Drake's step reads and the unrestricted updates; or, after it, the discrete ones. */
+__attribute__((visibility("default"))) int sample(
+    double time, double *held, const double *parameters, const double *noise, long long due,
+    int unrestricted, double *input) {{
+  Given g;
+  double x[SIZE] = {{0.0}}, valid = 0.0;
+  const double *arg[UPDATE_{number}_ARG] = {{&time, x, held, parameters, g.given, noise}};
+  double *res[UPDATE_{number}_RES] = {{input, &valid}};
+  g.held = held;
+  g.parameters = parameters;
+  g.time = NAN;
+  set_time(time, &g);
+  if (unrestricted) dae_update_{number}(arg, res, 0, 0, 0);
+  if (!isfinite(valid)) return INVALID;
+  return apply(time, x, held, &g, noise, due, unrestricted) ? DONE : INVALID;
+}}
+"""
 
 
 _GUARDS = """\

@@ -16,6 +16,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout import interpreted, machine
+from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
@@ -162,14 +163,16 @@ def _runs(
     code: machine.Library | None,
 ) -> list[Run]:
     """What runs come to, by machine code if there is any."""
-    if code is None or program.compiled.changes:
+    if code is None or program.compiled.changes or program.compiled.has_stepped:
         fused = program.kept("fused", lambda: Fused(program))
         run = interpreted.runner(fused, settings)
     if code is not None:
         run = partial(machine.run, code, program, settings=settings)
     if program.compiled.changes:
         run = partial(run_with_changes, fused, run, settings.tableau)
-    if code is None or len(problems) == 1:
+    if program.compiled.has_stepped:
+        run = partial(run_beside, fused, code, settings=settings)
+    if code is None or len(problems) == 1 or program.compiled.has_stepped:
         return [run(problem) for problem in problems]
     # Machine code lets go of Python's lock: threads are enough for all cores.
     with ThreadPoolExecutor(num_cores()) as pool:

@@ -110,6 +110,26 @@ class Guard:
 
 
 @dataclass(frozen=True, eq=False)
+class Stepped:
+    """A block that Drake steps at t_k = k period, as with its own contact, and that is not traced.
+
+    Its HELD are the values of some of its output ports, below each other. They change at t_k alone,
+    as by an unrestricted update, and depend on the time only by what one input port reads at t_k.
+
+    Attributes:
+        period: In s.
+        ports: The names of these output ports.
+        reads: The name of the input port.
+        put: (context, HELD) -> None; puts into a context of the block what it steps from.
+    """
+
+    period: float
+    ports: tuple[str, ...]
+    reads: str
+    put: Callable[[Context, FloatArray], None]
+
+
+@dataclass(frozen=True, eq=False)
 class Block:
     """What one system of a diagram computes.
 
@@ -126,6 +146,7 @@ class Block:
         unwired: Name of an input port -> what stands there without a wire and without a value.
         moving: The entries of its parameters that come through an input port "exogenous".
         guard: When and how it changes at moments that a run has to find; None if at none.
+        stepped: How Drake steps it, in place of updates; None if it is traced.
         draws: Whether its update takes new random numbers.
         model: What its first parameters are those of, such as a DaeSystem; None for nothing that
             another block has.
@@ -146,6 +167,7 @@ class Block:
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
     guard: Guard | None = None
+    stepped: Stepped | None = None
     draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None

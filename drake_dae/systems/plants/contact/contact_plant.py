@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
@@ -31,10 +32,15 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
+from drake_dae.robots.constraint_wrenches import (
+    ConstraintWrenches,
+    contact_normals,
+    own_values,
+)
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.systems.blocks.traced import HELD, Block, Computation, Stepped
 from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
@@ -286,6 +292,44 @@ class ContactPlant(Diagram, Plant):
             body.SetMass(own, mass)
         if self._stages is not None:
             self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
+
+    def traced(self) -> Block:
+        shows = ["state", "contact_force"]
+        if self._stages is not None:
+            shows += ["joint_torque", *self._stages.stage_ports]
+        sizes = [self.GetOutputPort(name).size() for name in shows]
+        held = ca.SX.sym("held", sum(sizes))
+        parts = dict(zip(shows, ca.vertsplit(held, np.cumsum([0, *sizes]).tolist()), strict=True))
+        state, given = parts["state"], ca.DM(self._values)
+        normals = contact_normals(self.model).function(state, given)[0]
+        products = normals * parts["contact_force"]
+        force = ca.sum1(ca.reshape(products, 3, -1)).T
+        links = self.GetOutputPort("link_state").size()
+        shown = {**parts, "link_state": state[:links], "constraint_force": force}
+        acting = ca.SX.sym("force", force.numel())
+        found = [self.dae.outputs(acting), self.structure.manifold.residual_expression]
+        symbols = [self.dae.state, self.dae.parameter_symbol, acting]
+        names = "controlled_output", "constraint_residual"
+        values = ca.substitute(found, symbols, [state, given, force])
+        shown |= dict(zip(names, values, strict=True))
+        computations = tuple(
+            Computation(ca.Function(name, [held], [value]), (HELD,), (name,))
+            for name, value in shown.items()
+        )
+
+        def put(context: Context, values: FloatArray) -> None:
+            self.set_state(context, values[: self.dae.num_states])
+
+        stepped = Stepped(self.time_step, tuple(shows), "control", put)
+        known = {
+            "state": self.dae.state_signals,
+            "constraint_force": self.dae.force_signals,
+            "contact_force": self.contact_force_signals,
+            "constraint_residual": self.structure.manifold.residual_signals,
+            "controlled_output": self.dae.output_signals,
+        }
+        ports = {name: tuple(signals) for name, signals in known.items()}
+        return Block(self, computations, stepped=stepped, ports=ports)
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.

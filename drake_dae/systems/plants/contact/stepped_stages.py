@@ -9,7 +9,6 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, not_traced
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -128,9 +127,6 @@ class SteppedStages(LeafSystem):
         if function.is_valid:
             return values[0]
         raise simulation_error(function.failure(), context.get_time(), state, self._signals)
-
-    def traced(self) -> Block:
-        raise not_traced("Drake's own contact behind springs, motors or valves")
 
 
 def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:
