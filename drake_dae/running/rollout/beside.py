@@ -36,6 +36,11 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
     rows = count = 0
     ending, error, moment = Ending.DONE, None, float(times[0])
     take = _sampler(fused, code, problem, held)
+
+    def written() -> FloatArray:
+        states = np.zeros((rows, 0))
+        return fused.rows(times[:rows], states, kept[:rows], problem.parameters)[0]
+
     while rows < times.size:
         at = problem.events[count] if count < problem.events.size else np.inf
         # A row has what was before the updates of its time.
@@ -43,7 +48,7 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
         kept[rows:stop], rows = held, stop
         if rows == times.size:
             break
-        if count % LOOKED == 0 and settings.stop():
+        if count % LOOKED == 0 and settings.look(written, problem.context):
             ending = Ending.PAUSED
             break
         moment, due = float(at), int(problem.due[count])
@@ -59,10 +64,8 @@ def run_beside(fused: Fused, code: Library | None, problem: Problem, settings: S
             ending = Ending.INVALID
             break
         count += 1
-    states = np.zeros((rows, 0))
-    values, _ = fused.rows(times[:rows], states, kept[:rows], problem.parameters)
     given = moment, none, held, count, count, moment, np.inf, 0.0, none
-    return Run(values, ending, *given, error=error)
+    return Run(written(), ending, *given, error=error)
 
 
 class _Steps:
@@ -99,9 +102,9 @@ def _sampler(
 ) -> Callable[[float, int, int, bool, FloatArray], bool]:
     """What changes `held` by updates, and says whether all has values.
 
-    It takes the time, the number of the event, which rates are due, whether to make the unrestricted
-    updates or the discrete ones, and an array for what Drake's block reads, which comes with the
-    unrestricted ones.
+    It takes the time, the number of the event, which rates are due, whether the updates are the
+    unrestricted ones or the discrete ones, and an array for what Drake's block reads, which comes
+    with the unrestricted ones.
     """
     compiled, parameters = fused.program.compiled, problem.parameters
     kinds = sum(

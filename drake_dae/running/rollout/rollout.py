@@ -79,7 +79,9 @@ def rollout(
     states before their projection; under error control steps are those of DOP853 (Hairer, Norsett
     and Wanner, 1993), a thousandth of the accuracy each, and rows between them are on N*. Where a C
     compiler is found the whole diagram is machine code; otherwise a step is one call of CasADi.
-    Where plant and law have the same numbers, the motion follows from what the law wants.
+    Where plant and law have the same numbers, the motion follows from what the law wants. A
+    `ContactPlant` is stepped by Drake, and all else of a sample is one call; the record is that of
+    `simulate`.
 
     Args:
         loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it, or any diagram

@@ -28,7 +28,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.errors import InconsistentStateError, PainleveError, ModelError, SimulationError
+from drake_dae.errors import InconsistentStateError, ModelError, PainleveError, SimulationError
 from drake_dae.running.rollout.program import program_of
 
 with_compiler = pytest.param(
