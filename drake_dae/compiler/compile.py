@@ -8,7 +8,8 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram, Place, Rate, dense_function
+from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
+from drake_dae.compiler.rates import Place, Rate, dense_function
 from drake_dae.compiler.trace import Expressions
 from drake_dae.compiler.wires import Port, Wires
 from drake_dae.errors import ModelError

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.compiler.rates import Place, Rate, dense_function
 from drake_dae.compiler.trace import Call, Expressions
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
@@ -21,34 +21,6 @@ from drake_dae.systems.blocks.traced import (
 
 ARGUMENTS = ("time", "state", "held", "parameters")
 """What the functions of a diagram take; an update takes new random numbers, "noise", as well."""
-
-
-class Place(NamedTuple):
-    """Where a column of a block stands among those of the diagram."""
-
-    system: System
-    part: slice
-
-
-@dataclass(frozen=True, eq=False)
-class Rate:
-    """Updates of discrete states at t_k = offset + k period.
-
-    Attributes:
-        period, offset: In s.
-        is_unrestricted: As of an `Update`.
-        function: (time, state, held, parameters, noise) -> new values of some held entries, and a
-            number that is finite if they are of use.
-        places: Which entries these are.
-        stepped: The block that Drake steps then; the function gives what its input port reads.
-    """
-
-    period: float
-    offset: float
-    is_unrestricted: bool
-    function: ca.Function
-    places: tuple[int, ...]
-    stepped: Block | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,9 +321,3 @@ class CompiledDiagram:
 
 def _groups(context: Context) -> int:
     return int(context.num_discrete_state_groups())
-
-
-def dense_function(name: str, given: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
-    """Expressions as a function with dense outputs and without what is common twice."""
-    dense = [ca.densify(value) for value in values]
-    return ca.Function(name, list(given), ca.cse(dense), {"cse": False})

@@ -15,7 +15,7 @@ from runs import run_scenario, scenario
 from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands.run_folder import FILES, PART
-from drake_dae.running.rollout.course import Course
+from drake_dae.running.rollout.stepping.course import Course
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.simulation.records.interruption import ENDING_SIGNALS

@@ -9,9 +9,9 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
-from drake_dae.running.rollout.fused import Called, Fused
-from drake_dae.running.rollout.machine import Library
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
+from drake_dae.running.rollout.stepping.fused import Called, Fused
+from drake_dae.running.rollout.stepping.machine import Library
 
 LOOKED = 64
 """After so many samples Python looks for Ctrl-C."""

@@ -15,15 +15,15 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running.rollout import interpreted, machine
 from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
-from drake_dae.running.rollout.fused import Fused
 from drake_dae.running.rollout.problems import checked_times, problems_of
 from drake_dae.running.rollout.program import Program, program_of
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings, num_cores
+from drake_dae.running.rollout.stepping import interpreted, machine
+from drake_dae.running.rollout.stepping.fused import Fused
 from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
 from drake_dae.simulation.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice

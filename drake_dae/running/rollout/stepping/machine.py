@@ -9,7 +9,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
-from drake_dae.compiler.compiled import Rate
+from drake_dae.compiler.rates import Rate
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import Program
 from drake_dae.running.rollout.run import Ending, Problem, Run, Settings
