@@ -1,4 +1,4 @@
-"""The key of the scenario before whatever goes wrong, and remedies that a scenario has."""
+"""The scenario's key in errors, and remedies for users of scenarios."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ S = TypeVar("S")
 
 @contextmanager
 def at(key: str) -> Iterator[None]:
-    """Puts the key of the scenario before whatever goes wrong."""
+    """Adds the key of the scenario to errors in the block."""
     try:
         yield
     except ScenarioError:
@@ -23,7 +23,7 @@ def at(key: str) -> Iterator[None]:
 
 
 def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
-    """What is made of each item; an error bears the key and the item's index."""
+    """The results for each item; errors get the key and the item's index."""
     results = []
     for index, item in enumerate(items):
         with at(f"{key}.{index}"):
@@ -57,7 +57,7 @@ _REMEDIES = {
         "which it starts in another one"
     ),
 }
-"""What to do about a violation where that is not the same as in Python."""
+"""The remedies of violations that differ from those in Python."""
 
 
 def violated(error: AssumptionError) -> ScenarioError:

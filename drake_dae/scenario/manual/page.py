@@ -32,7 +32,7 @@ def keys_page() -> str:
 def _section(entry: Entry) -> str:
     where = f"At `{entry.where}`. " if entry.where else ""
     paragraphs = entry.text.split("\n\n")
-    # What is told by a formula is for readers of the code.
+    # Formulas are for readers of the code.
     end = next((i for i, one in enumerate(paragraphs) if one.endswith((":", ","))), None)
     text = _one_line(" ".join(paragraphs if end is None else paragraphs[: max(end, 1)]))
     text = text.rstrip(":,.") + "."
