@@ -19,7 +19,7 @@ def run_command(options: argparse.Namespace) -> int:
     scenario = load_scenario(path, options.settings)
     loop, context = build_scenario(scenario)
     if loop.generator is None:
-        text = "exports know `references` alone; `drake-dae simulate` runs a task"
+        text = "exports support only `references`; `drake-dae simulate` runs a task"
         raise ScenarioError(("task", text))
     folder = options.out or Path(f"{path.stem}_c99")
     files = export_code(loop, context, path.stem, folder)
@@ -34,10 +34,10 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
-    """What the scenario runs beside law, plant and projection."""
+    """The parts of the scenario that are not in the exported code."""
     closed = "the code has the plant with all contacts closed"
     parts = {
-        "the observer, which finds the disturbance and the friction among law_parameters": (
+        "the observer, which estimates the disturbance and the friction among law_parameters": (
             loop.observer is not None
         ),
         "the limits of the drives": scenario.saturation,

@@ -78,9 +78,8 @@ class ClosedLoop:
         """
         if self.generator is None:
             raise ModelError(
-                f"{self.controller.get_name()} plans its references itself, so that no generator "
-                "tells them: rollouts, exports and laws of `references` alone know one; run the "
-                "loop by simulate"
+                f"{self.controller.get_name()} plans its references itself and has no generator, "
+                "which rollouts and exports need; run the loop by simulate"
             )
         return self.generator
 

@@ -36,7 +36,7 @@ def add_block(builder: DiagramBuilder, block: Block) -> Block:
         return builder.AddSystem(block)
     except RuntimeError:
         raise WiringError(
-            f"'{block.get_name()}' stands in another diagram already; make a new one for this loop"
+            f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
         ) from None
 
 
@@ -73,7 +73,7 @@ def add_exogenous(
 
 
 _NEEDS = dict.fromkeys(
-    ("observer", "tolerances"), "it takes the references of a generator, and here is none"
+    ("observer", "tolerances"), "it needs the references of a generator, and there is none"
 )
 
 

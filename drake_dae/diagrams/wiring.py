@@ -246,15 +246,15 @@ def _logged(
         control: What arrives at the plant.
         named: The signals.
     """
-    told: set[str] = set()
+    available: set[str] = set()
     if plant.functions:
-        told = {*plant.functions, "reference", "exogenous"}
+        available = {*plant.functions, "reference", "exogenous"}
         if controller.follows and control.get_system() is controller:
-            told.add("control")
+            available.add("control")
     loggers = {}
     for name, (port, signals) in named.items():
         builder.ExportOutput(port, name)
-        if name not in told:
+        if name not in available:
             loggers[name] = (log_steps(builder, port, plant), signals)
     for name in controller.shown:
         builder.ExportOutput(controller.GetOutputPort(name), name)

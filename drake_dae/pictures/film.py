@@ -204,10 +204,10 @@ class _Scene:
                 place = _label_place(head, tail, taken)
                 taken.append(place)
                 x, y = place
-                told = axis.text(
+                caption = axis.text(
                     x, y, f"{size:.1f} N", color=FORCE, fontsize=11, ha="center", va="center"
                 )
-                told.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+                caption.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
             if bright := course.flashes[number, row]:
                 x, y = self._camera.project(wrench.points[row])[0]
                 axis.scatter(x, y, s=900.0 * bright, marker="*", color=IMPACT, zorder=3)

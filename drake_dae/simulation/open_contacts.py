@@ -30,7 +30,7 @@ def contact_notes(record: Record) -> list[tuple[str, str]]:
         is_open[0] = False
         name, away = signal.name.removesuffix(".gap"), gaps[is_open, column]
         if not away.size:
-            notes.append((name, "closed all the time"))
+            notes.append((name, "always closed"))
             continue
         first = record.time[int(np.argmax(is_open)) - 1]
         notes.append(

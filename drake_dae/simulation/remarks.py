@@ -45,7 +45,8 @@ def _left(constraint: Constraint, model: RobotModel, record: Record) -> str:
     first = record.time[int(np.argmax(beyond > 0.0))]
     return (
         f"{constraint.name}: the robot is beyond the edge of the data by up to "
-        f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there a plane goes on"
+        f"{1e3 * float(np.max(beyond)):.2g} mm, first at {first:.3g} s; there the surface "
+        "continues as a plane"
     )
 
 

@@ -94,7 +94,7 @@ def summary(
     sections = [_errors(record, predicted), _forces(record, limits), _controls(record, limits)]
     residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
     # Drake's own contact is compliant, and the state is not projected.
-    kind = "in contact that gives way" if "contact_force" in record.signals else _PROJECTED
+    kind = "in compliant contact" if "contact_force" in record.signals else _PROJECTED
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
     notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
     notes += _identified(record)
@@ -140,8 +140,8 @@ def _errors(record: Record, predicted: FloatArray) -> list[str]:
             ],
             left=2,
         ).lines(),
-        "off prediction by: the largest distance from the error that theory predicts, which decays",
-        "from its start by the gains alone",
+        "off prediction by: the largest deviation from the predicted error, which decays",
+        "from its initial value by the gains alone",
     ]
 
 
@@ -238,9 +238,9 @@ def shortfalls(record: Record, limits: Limits) -> list[str]:
     beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
     found = []
     if pulling:
-        found.append(f"{', '.join(pulling)} would have to pull, and a contact cannot")
+        found.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
     if beyond:
-        found.append(f"{', '.join(beyond)} would have to give more than the limit")
+        found.append(f"{', '.join(beyond)} would exceed the limits")
     if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:
         found.append(f"{', '.join(joints)} would leave the joint limits")
     return found

@@ -144,10 +144,10 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
         raise ModelError(f"'{path}' is no file of a study; choose another name") from None
     if known != FORMAT:
         raise ModelError(f"'{path}' has format {brief(known)}, this version writes {FORMAT}")
-    told = differences(found, json.loads(_line(head)))
-    if told:
+    differing = differences(found, json.loads(_line(head)))
+    if differing:
         raise ModelError(
-            f"'{path}' belongs to another study: {'; '.join(told)}. Choose another folder, or "
+            f"'{path}' belongs to another study: {'; '.join(differing)}. Choose another folder, or "
             "remove it"
         )
     rest = lines.pop() if lines else b""
@@ -175,19 +175,21 @@ def _continued(path: Path, file: int, head: Mapping[str, Any]) -> dict[int, RunR
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     """Some differences of the heads of two studies, in words."""
-    told = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
-    told += list(_different("rollout", there.get("rollout", False), here.get("rollout", False)))
-    told += list(_different("", there.get("scenario"), here.get("scenario")))
+    differing = list(_different("drake_dae", there.get("drake_dae"), here.get("drake_dae")))
+    differing += list(
+        _different("rollout", there.get("rollout", False), here.get("rollout", False))
+    )
+    differing += list(_different("", there.get("scenario"), here.get("scenario")))
     old, new = there.get("variations", []), here["variations"]
     if len(old) != len(new):
-        told.append(f"{len(old)} runs there, {len(new)} here")
+        differing.append(f"{len(old)} runs there, {len(new)} here")
     pairs = enumerate(zip(old, new, strict=False))
     other = next(((i, a, b) for i, (a, b) in pairs if a != b), None)
     if other is not None:
         number, a, b = other
         first = next(iter(_different("", a, b)))
-        told.append(f"run {number} has {first}")
-    return told if len(told) <= 6 else [*told[:6], f"and {len(told) - 6} more"]
+        differing.append(f"run {number} has {first}")
+    return differing if len(differing) <= 6 else [*differing[:6], f"and {len(differing) - 6} more"]
 
 
 def _different(key: str, there: Any, here: Any) -> Iterator[str]:

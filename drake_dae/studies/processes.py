@@ -65,7 +65,7 @@ def run_in_processes(
     waiting, workers = deque(batches), min(workers, len(batches))
     running: list[_Worker] = []
     found: list[RunResult] = []
-    told = -PERIOD
+    last_report = -PERIOD
     with selectors.DefaultSelector() as selector:
         try:
             while waiting or running:
@@ -75,7 +75,7 @@ def run_in_processes(
                     selector.register(worker.output, selectors.EVENT_READ, worker)
                 now = time.monotonic()
                 due = min(worker.due(time_limit) for worker in running) - now
-                due = min(due, told + PERIOD - now) if found else due
+                due = min(due, last_report + PERIOD - now) if found else due
                 for key, _ in selector.select(max(0.0, due) if isfinite(due) else None):
                     worker = key.data
                     is_open = worker.read()
@@ -94,8 +94,8 @@ def run_in_processes(
                 for worker in running:
                     if time.monotonic() >= worker.due(time_limit):
                         worker.stop(time_limit)  # Its run is reported when its output ends.
-                if found and (time.monotonic() >= told + PERIOD or not (waiting or running)):
-                    told = time.monotonic()
+                if found and (time.monotonic() >= last_report + PERIOD or not (waiting or running)):
+                    last_report = time.monotonic()
                     yield found
                     found = []
         finally:
@@ -156,12 +156,12 @@ class _Worker:
         data = os.read(self.output.fileno(), 1 << 16)
         *lines, self._text = (self._text + data).split(b"\n")
         for line in lines:
-            told = json.loads(line)
-            if "builds" in told:
+            line_data = json.loads(line)
+            if "builds" in line_data:
                 self._is_ready = self.is_idle = True
-                self.began, self.builds = float("inf"), told["builds"]
+                self.began, self.builds = float("inf"), line_data["builds"]
             else:
-                self._results.append(RunResult.from_dict(told))
+                self._results.append(RunResult.from_dict(line_data))
                 self.left, self.began = self.left[1:], time.monotonic()
         return bool(data)
 

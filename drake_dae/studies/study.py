@@ -128,8 +128,8 @@ class Study:
             parts.append([*shown, f"and {more} more, see runs.csv"] if more else shown)
         beyond = Counter(name for result in self.results for name in result.exceeded)
         if beyond:
-            told = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
-            parts.append([f"beyond their limits: {', '.join(told)}"])
+            counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
+            parts.append([f"beyond their limits: {', '.join(counted)}"])
         if self.figures:
             head = ["figure", "least", "at run", "median", "largest", "at run"]
             parts.append(Table(head, [self._row(name) for name in self.figures]))

@@ -109,8 +109,8 @@ class _Explained:
         self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
     ) -> dict[str, Any]:
         schema = dict(handler(source))
-        told = "\n\n".join(filter(None, (self.text, schema.get("description"))))
-        schema.update({"description": told} if told else {})
+        combined = "\n\n".join(filter(None, (self.text, schema.get("description"))))
+        schema.update({"description": combined} if combined else {})
         schema.update({"default": self.default} if _is_plain(self.default) else {})
         return schema
 

@@ -42,19 +42,19 @@ _REMEDIES = {
         "robot.actuators, or add a stage under actuation"
     ),
     Cause.REDUNDANT: (
-        "The constraints are redundant at every state: how the forces split among them is not "
-        "determined. Take a redundant one out, or write compliances: {}, which has the forces "
-        "shared by least squares"
+        "The constraints are redundant at every state: the distribution of the forces among them "
+        "is not determined. Take a redundant one out, or write compliances: {}, which has the "
+        "forces shared by least squares"
     ),
     Cause.NUMBERS: (
-        "The structure must be the same for all numbers that the robot may have. Give such a "
+        "The structure must be the same for all parameter values of the robot. Give such a "
         "number another value where it is written, away from the one at which it changes, or "
-        "say under bounds between which values it stays; or choose another output or constraint"
+        "give its range under bounds; or choose another output or constraint"
     ),
     Cause.CONTROL_RANK: (
-        "An output may repeat a constraint or another output; choose others. Or the robot is in a "
-        "singular configuration there, as an arm is that is stretched: give start.positions from "
-        "which it starts in another one"
+        "An output may repeat a constraint or another output; choose others. Or the robot is in "
+        "a singular configuration, such as a stretched arm: give start.positions of another "
+        "configuration"
     ),
 }
 """The remedies of violations that differ from those in Python."""

@@ -10,7 +10,7 @@ from drake_dae.scenario.manual.schema import custom_tags
 _HEAD = """# The keys of a scenario
 
 A scenario is a YAML file. `drake-dae show NAME` prints one to begin with, and all wrong keys and
-values of a file are told at once. Where several forms fit, a tag chooses one, as in
+values of a file are reported together. Where several forms fit, a tag chooses one, as in
 `surface: !Sphere`; the first in a list of tags is meant without a tag.
 
 An editor with a YAML language server completes the keys: write `drake-dae schema > scenario.json`,

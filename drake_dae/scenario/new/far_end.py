@@ -33,7 +33,7 @@ def far_end(robot: Robot, body: RigidBody, last: Joint, size: float) -> Vector |
         The point; None if there is none off the axis of the joint.
     """
     scene_graph = SceneGraph()
-    with warnings.catch_warnings():  # The run tells them.
+    with warnings.catch_warnings():  # They are repeated by the run.
         warnings.simplefilter("ignore", GeometryWarning)
         warnings.simplefilter("ignore", RobotFileWarning)
         plant, _ = read_robot(robot, scene_graph)

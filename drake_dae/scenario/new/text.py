@@ -51,7 +51,7 @@ def scenario_text(scenario: Scenario, robot: NewRobot, task: NewTask, folder: Pa
 
 def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[str]:
     yield "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m."
-    yield "# `drake-dae analyze FILE` tells how far limits and singularities are,"
+    yield "# `drake-dae analyze FILE` reports the margins to limits and singularities,"
     yield "# `drake-dae simulate FILE` runs it, and with --meshcat it is seen in a browser."
     yield f"description: {_flow(data['description'])}"
     yield "robot:"

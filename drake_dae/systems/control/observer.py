@@ -236,8 +236,8 @@ class DisturbanceObserver(ParameterizedSystem):
             chain -= frictional @ change
         lags[:], r[:] = chain[:-1].ravel(), chain[-1]
         moves = chain @ free.T
-        told = self._lags.derivatives(moves) + self._force_lags.derivatives(chain - moves)
-        rates[:] = told.ravel()
+        lagged = self._lags.derivatives(moves) + self._force_lags.derivatives(chain - moves)
+        rates[:] = lagged.ravel()
         discrete = state.get_mutable_discrete_state()
         discrete.set_value(self._estimate, estimate)
         discrete.set_value(self._before, np.concatenate([p, rate, u]))

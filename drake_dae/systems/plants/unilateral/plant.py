@@ -206,7 +206,7 @@ class UnilateralRobotPlant(ModalPorts):
             worst = int(np.argmax(np.abs(residual)))
             signal = kept.residual_signals[worst]
             raise InconsistentStateError(
-                f"{self.dae.name}: the start state is not on the constraints that stay: "
+                f"{self.dae.name}: the start state violates the remaining constraints: "
                 f"{signal.name} = {residual[worst]:.3g} {signal.unit}",
                 residual,
             )
