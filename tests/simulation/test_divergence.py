@@ -64,7 +64,7 @@ def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings,
     assert grew in text
     assert "may_diverge" in text
     assert "gains" in text
-    # Far before numbers end: what is told can be read.
+    # Far before numbers end: the reported numbers can be read.
     assert np.isfinite(caught.value.state).all()
     assert caught.value.time < 1.0
 
@@ -169,6 +169,6 @@ def test_a_start_far_away_is_no_divergence():
     assert state == pytest.approx(1.0, abs=1e-5)
 
 
-def test_a_state_that_left_all_measure_is_told_by_its_size():
+def test_a_diverged_state_is_reported_by_its_size():
     assert show_state([1.0, -0.25]) == "[ 1.  , -0.25]"
     assert show_state([1.0, -3e192, np.inf]) == "grown to 3e+192"
