@@ -1,5 +1,6 @@
 """The command `drake-dae`."""
 
+import argparse
 import gc
 import json
 import logging
@@ -7,7 +8,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
 
@@ -19,7 +20,7 @@ from drake_dae.errors import (
     describe_os_error,
 )
 from drake_dae.scenario.shipped import description, shipped_scenarios
-from drake_dae.simulation.records.interruption import end_at_once, ending_signals
+from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 
 YOUNG = 50_000
 """The number of new objects before a garbage collection.
@@ -58,30 +59,9 @@ def _main(arguments: Sequence[str] | None) -> int:
     try:
         if options.command == "list":
             return _list(as_json)
-        # Commands are imported when they are called: Drake alone takes a second.
-        ignored: list[type[Warning]] = []
-        if options.command == "show":
-            from drake_dae.commands.show import run_command
-        elif options.command in ("keys", "schema"):
-            from drake_dae.commands.keys import run_command
-        elif options.command == "view":
-            from drake_dae.commands.view import run_command
-        elif options.command == "cache":
-            from drake_dae.commands.cache import run_command
-        elif options.command == "analyze":
-            from drake_dae.commands.analyze import run_command
-
-            ignored.append(NonMinimumPhaseWarning)  # It is in the report.
-        elif options.command == "export":
-            from drake_dae.commands.export import run_command
-        elif options.command == "film":
-            from drake_dae.commands.film import run_command
-        elif options.command == "new":
-            from drake_dae.commands.new import run_command
-        elif options.command == "sweep":
-            from drake_dae.commands.sweep import run_command
-        else:
-            from drake_dae.commands.simulate import run_command
+        run_command = _loaded(options.command)
+        # The report tells it.
+        ignored = [NonMinimumPhaseWarning] if options.command == "analyze" else []
         if getattr(options, "compiled", None) is not None:
             options.settings.append(f"compiled={options.compiled}")
         # Drake logs the port of each Meshcat, also of one that only records.
@@ -109,6 +89,37 @@ def _main(arguments: Sequence[str] | None) -> int:
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
+
+
+def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
+    """What runs a command, with what that needs: Drake alone takes a second.
+
+    A signal waits meanwhile: Drake's modules would make an ImportError of it.
+    """
+    with ending_signals(interruption := Interruption()):
+        if command == "show":
+            from drake_dae.commands.show import run_command
+        elif command in ("keys", "schema"):
+            from drake_dae.commands.keys import run_command
+        elif command == "view":
+            from drake_dae.commands.view import run_command
+        elif command == "cache":
+            from drake_dae.commands.cache import run_command
+        elif command == "analyze":
+            from drake_dae.commands.analyze import run_command
+        elif command == "export":
+            from drake_dae.commands.export import run_command
+        elif command == "film":
+            from drake_dae.commands.film import run_command
+        elif command == "new":
+            from drake_dae.commands.new import run_command
+        elif command == "sweep":
+            from drake_dae.commands.sweep import run_command
+        else:
+            from drake_dae.commands.simulate import run_command
+    if interruption.signal is not None:
+        end_at_once(interruption.signal)
+    return run_command
 
 
 def _list(as_json: bool) -> int:

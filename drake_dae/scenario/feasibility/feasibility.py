@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Analysis
@@ -15,6 +16,7 @@ from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError
 from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.shapes import Collision, LinkShapes, collisions
 from drake_dae.scenario.build import build_loop, exogenous_references
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -50,7 +52,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         ScenarioError: Something does not fit; the message names its key. A violated assumption is
             not an error: the analysis reports it.
     """
-    completed, model = completed_model(scenario)
+    scene_graph = SceneGraph()
+    completed, model = completed_model(scenario, scene_graph)
     scenario = completed.scenario
     try:
         structure = scenario_structure(model)
@@ -85,9 +88,11 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         model.dae, reference=reference, times=times, start=start, exogenous=exogenous
     )
     motion = analysis.motion
-    behind: tuple[LinkBehind, ...] = ()
+    behind: tuple[LinkBehind | Collision, ...] = ()
     if motion is not None:
-        behind = links_behind(model, motion.times, motion.states, motion.parameters)
+        shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
+        behind = links_behind(model, *along, motion.parameters, shapes)
+        behind += collisions(shapes, *along)
     return Feasibility(
         analysis,
         scenario.duration,

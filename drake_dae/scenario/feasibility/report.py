@@ -10,11 +10,15 @@ from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.clearances import LinkBehind
+from drake_dae.robots.shapes import Collision
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
 )
 """The remedy for a link behind a surface."""
+
+IN_EACH_OTHER = ": begin in another configuration, by start.positions, or choose another path"
+"""What to do about links that collide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +78,8 @@ class Feasibility:
         joints: Positions and velocities of the joints that have limits.
         is_resolved: Whether the times resolve the reference; otherwise values between them are not
             known.
-        behind: Links that move behind a contact surface; see `links_behind`.
+        behind: Links that move behind a contact surface, and links that collide; see `links_behind`
+            and `collisions`.
     """
 
     analysis: Analysis
@@ -84,12 +89,15 @@ class Feasibility:
     constraint_forces: tuple[SignalRange, ...] = ()
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
-    behind: tuple[LinkBehind, ...] = ()
+    behind: tuple[LinkBehind | Collision, ...] = ()
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
-        """The problems with links behind a surface."""
-        return tuple(f"{one}{WRONG_SIDE}" for one in self.behind)
+        """The problems with links behind a surface, or in each other."""
+        return tuple(
+            f"{one}{IN_EACH_OTHER if isinstance(one, Collision) else WRONG_SIDE}"
+            for one in self.behind
+        )
 
     @property
     def problems(self) -> tuple[str, ...]:

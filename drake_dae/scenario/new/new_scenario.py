@@ -84,7 +84,8 @@ def new_scenario(
                 whole = complete_scenario(_scenario(robot, task, links)).scenario
                 found = find_feasibility(whole)
             problems = found.problems
-            if usable is None and not set(problems) - {*_beside(found), *found.wrong_sides}:
+            deeper = usable is not None and _depth(found) >= _depth(usable[2])
+            if not deeper and not set(problems) - {*_beside(found), *found.wrong_sides}:
                 usable = whole, task, found
         except DrakeDaeError as error:
             problems = (str(error),)
@@ -108,6 +109,11 @@ def new_scenario(
             + ". Give another tip, or copy a shipped scenario",
         )
     )
+
+
+def _depth(found: Feasibility) -> float:
+    """How far links are behind surfaces or in each other, all together, in m."""
+    return sum(one.depth for one in found.behind)
 
 
 def _beside(found: Feasibility) -> tuple[str, ...]:

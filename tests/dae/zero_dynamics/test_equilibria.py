@@ -141,7 +141,7 @@ def test_singular_states_are_named():
 def test_no_equilibrium_is_reported():
     """s' = 1 + s^2 has none, nor has a blade pinned to a speed; with speed 0 it has many."""
     dynamics = zero_dynamics(internal(lambda s, z: 1 + s**2))
-    with pytest.raises(InconsistentStateError, match="z = 0 .* s' = ") as e:
+    with pytest.raises(InconsistentStateError, match=r"z = 0 .* s' = ") as e:
         dynamics.equilibrium([0.0])
     assert e.value.residual[1] >= 1.0
     # The motion from there, s = tan t, tells it.

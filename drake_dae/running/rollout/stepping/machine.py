@@ -1,6 +1,7 @@
 """A diagram as one library of machine code, which steps it without Python in between."""
 
 import ctypes
+import time
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -23,8 +24,8 @@ Library = ctypes.CDLL
 _PROJECTION, _ALL = 2, 7
 """What is pending before a step, as stepper.c has it."""
 
-BUDGET = 20_000
-"""So many steps are taken before Python looks at the run: at most some tenths of a second."""
+FIRST, PAUSE = 500, 0.1
+"""So many steps are taken before Python looks at the run, then as many as take this time, in s."""
 
 
 class _Run(ctypes.Structure):
@@ -79,11 +80,14 @@ def run(code: Library, program: Program, problem: Problem, settings: Settings) -
     given = [state, held, problem.parameters, trial, problem.times.size, problem.times, rows]
     given += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
     arguments = [_argument(value) for value in given]
-    ending = Ending.PAUSED
+    ending, budget = Ending.PAUSED, FIRST
     while ending is Ending.PAUSED and not settings.look(
         lambda: problem.whole(rows[: own.row]), problem.context
     ):
-        ending = Ending(step(ctypes.byref(own), *arguments, _argument(BUDGET)))
+        began = time.perf_counter()
+        ending = Ending(step(ctypes.byref(own), *arguments, _argument(budget)))
+        passed = time.perf_counter() - began
+        budget = max(1, int(budget * min(4.0, PAUSE / max(passed, 1e-9))))
         if ending is Ending.OFF_MANIFOLD:
             try:
                 state[:] = problem.project(own.time, state, held)
