@@ -161,7 +161,7 @@ def _needed_systems(expressions: Expressions, outputs: Sequence[Port]) -> list[S
                 expressions.call(block, block.guard.computation)
             if block.stepped is not None:
                 expressions.source(block, HELD)
-                expressions.input(block, block.stepped.reads)
+                expressions.source(block, block.stepped.reads)
             if block.initial is not None:
                 expressions.call(block, block.initial)
     return done
@@ -250,13 +250,14 @@ def _rates(
         if (stepped := block.stepped) is not None:
             values = expressions.checked(partial(_read, expressions, block, stepped.reads))
             function = dense_function("update", given, expressions.expanded(values))
-            own = tuple(_entries(parts[block.system]))
+            count = sum(stepped.system.GetOutputPort(name).size() for name in stepped.ports)
+            own = tuple(_entries(parts[block.system])[:count])
             found.append((Rate(stepped.period, 0.0, True, function, own, block), values))
     return found
 
 
 def _read(expressions: Expressions, block: Block, port: str) -> list[ca.SX]:
-    return [expressions.input(block, port)]
+    return [expressions.source(block, port)]
 
 
 def _guards(expressions: Expressions, blocks: Sequence[Block]) -> tuple[list[ca.SX], list[Place]]:

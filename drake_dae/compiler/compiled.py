@@ -146,7 +146,7 @@ class CompiledDiagram:
             own, stepped = system.GetMyContextFromRoot(context), self.blocks[system].stepped
             values = [own.get_discrete_state(i).value() for i in range(_groups(own))]
             if stepped is not None:
-                values = [system.GetOutputPort(name).Eval(own) for name in stepped.ports]
+                values = [stepped.held(own)]
             held[part] = np.concatenate(values)
         return state, held
 

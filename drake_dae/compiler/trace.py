@@ -240,8 +240,7 @@ class Expressions:
         if name == PARAMETERS:
             return self.parameters(block)
         if name == HELD and block.stepped is not None:
-            sizes = (system.GetOutputPort(port).size() for port in block.stepped.ports)
-            return self.symbol(system, HELD, sum(sizes))
+            return self.symbol(system, HELD, block.stepped.size)
         if name in (STATE, HELD, NOISE):
             return self.symbol(system, name, self._size(system, name))
         if system.HasInputPort(name):

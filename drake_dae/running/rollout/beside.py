@@ -74,15 +74,15 @@ class _Steps:
     def __init__(self, fused: Fused, problem: Problem) -> None:
         compiled = fused.program.compiled
         rate, block = compiled.stepped
-        stepped, system = block.stepped, block.system
-        assert stepped is not None
+        assert block.stepped is not None
+        stepped, system = block.stepped, block.stepped.system
         self.bit, self.places = 1 << compiled.rates.index(rate), list(rate.places)
         self._period = rate.period
         context: Context = system.CreateDefaultContext()
         context.SetTime(float(problem.times[0]))
-        stepped.put(context, problem.held[self.places])
+        stepped.put(context, problem.held[dict(compiled.held)[block.system]])
         self._ports = [system.GetOutputPort(name) for name in stepped.ports]
-        port = system.GetInputPort(stepped.reads)
+        port = system.GetInputPort(stepped.into)
         self.input = np.zeros(port.size())
         self._port, self._context = port, context
         port.FixValue(context, self.input)

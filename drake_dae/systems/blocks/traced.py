@@ -111,22 +111,32 @@ class Guard:
 
 @dataclass(frozen=True, eq=False)
 class Stepped:
-    """A block that Drake steps at t_k = k period, as with its own contact, and that is not traced.
+    """What Drake steps in a block at t_k = k period, as its own contact, since it is not traced.
 
-    Its HELD are the values of some of its output ports, below each other. They change at t_k alone,
-    as by an unrestricted update, and depend on the time only by what one input port reads at t_k.
+    The first entries of the block's HELD are the values of some output ports of that system, below
+    each other. They change at t_k alone, as by an unrestricted update; its step depends on them, on
+    what one of its input ports reads at t_k, and on t_k. Other entries have updates as usual.
 
     Attributes:
+        system: What Drake steps: the block, or a diagram in it.
         period: In s.
         ports: The names of these output ports.
-        reads: The name of the input port.
-        put: (context, HELD) -> None; puts into a context of the block what it steps from.
+        into: The name of that input port.
+        reads: What it reads: the name of an input port of the block, or of an output that one of
+            its computations has.
+        held: The context of the block -> HELD, shape (size,).
+        put: (context of the system, HELD) -> None; puts in what it steps from.
+        size: The number of entries of HELD.
     """
 
+    system: System
     period: float
     ports: tuple[str, ...]
+    into: str
     reads: str
+    held: Callable[[Context], FloatArray]
     put: Callable[[Context, FloatArray], None]
+    size: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +156,7 @@ class Block:
         unwired: Name of an input port -> what stands there without a wire and without a value.
         moving: The entries of its parameters that come through an input port "exogenous".
         guard: When and how it changes at moments that a run has to find; None if at none.
-        stepped: How Drake steps it, in place of updates; None if it is traced.
+        stepped: What Drake steps in it; None if all of it is traced.
         draws: Whether its update takes new random numbers.
         model: What its first parameters are those of, such as a DaeSystem; None for nothing that
             another block has.
