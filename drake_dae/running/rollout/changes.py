@@ -8,10 +8,10 @@ import numpy as np
 from pydrake.systems.framework import Context, EventStatus, System
 from scipy.integrate import DOP853
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import Ending, Problem, Run, Tableau
-from drake_dae.running.rollout.stepping.fused import Fused
+from drake_dae.running.rollout.stepping.fused import Fused, Seen
 from drake_dae.systems.blocks.trials import SLOWEST
 
 WINDOW = 1e-13
@@ -19,6 +19,9 @@ WINDOW = 1e-13
 
 MOST = 1000
 """So many changes that hardly lead on end a run."""
+
+MOST_REPEATED = 10
+"""So many reactions may follow each other at one moment."""
 
 _LOCK = Lock()
 """Runs find and make changes one at a time: functions have one place for what they compute."""
@@ -34,6 +37,7 @@ class _Changes:
     problem: Problem
     tableau: Tableau
     is_controlled: bool
+    repeated: int = 0
     context: Context = field(init=False)
 
     def begin(self) -> tuple[Run, Problem | None]:
@@ -98,8 +102,18 @@ class _Changes:
             events=piece.events[count:],
             due=piece.due[count:],
             noise=piece.noise[count:],
-            has_reacted=run.next == run.time and not is_sample,
+            has_reacted=not is_sample and self.has_settled(run, moment, state, held),
         )
+
+    def has_settled(self, run: Run, time: float, state: FloatArray, held: FloatArray) -> bool:
+        """Whether a step is to be made now, since a reaction changed nothing but round-off.
+
+        Others may follow it at the same moment, but no more than some: of contacts that touch
+        without a force any mode fits.
+        """
+        self.repeated = self.repeated + 1 if time == run.time else 0
+        is_same = np.allclose(state, run.state, 1e-12, 1e-12) and np.array_equal(held, run.held)
+        return self.repeated >= MOST_REPEATED or (time == run.time and is_same)
 
     def sample(self, run: Run, piece: Problem) -> tuple[FloatArray, FloatArray, bool]:
         """What `react` returns, where blocks react that look at their guards in samples.
@@ -173,21 +187,38 @@ class _Changes:
         return self.fused.rows(times, states, held, self.problem.parameters)[0]
 
     def located(self, run: Run) -> tuple[float, FloatArray]:
-        """When the change is that lies within a step, and the state just after it."""
+        """When the change is that lies within a step, and the state just after it.
+
+        By the secant through the least margins at both ends, where that halves what is left within
+        three trials; else by bisection.
+        """
         given = run.held, self.problem.parameters
         before = self.fused.seen(run.time, run.state, *given)
-        first, last = run.time, run.next
-        state = self.reached(run, last)
-        while last - first > WINDOW:
-            middle = 0.5 * (first + last)
-            if middle in (first, last):
-                break
+        first, last, state = run.time, run.next, self.reached(run, run.next)
+        found = self.fused.seen(last, state, *given)
+        due = (found.margins <= 0.0) & (before.margins > 0.0)
+        above, below = _least(before, due), _least(found, due)
+        trials, goal = 0, 0.5 * (last - first)
+        while last - first > WINDOW and first < 0.5 * (first + last) < last:
+            share = above / (above - below) if above - below > 0.0 else 0.5
+            if trials == 3:
+                trials, goal, share = 0, 0.5 * (last - first), 0.5
+            margin = min(0.25 * WINDOW / (last - first), 0.5)
+            middle = first + (last - first) * min(max(share, margin), 1.0 - margin)
             tried = self.reached(run, middle)
-            if self.fused.seen(middle, tried, *given).follows_change(before):
-                last, state = middle, tried
+            found = self.fused.seen(middle, tried, *given)
+            if found.follows_change(before):
+                last, state, below = middle, tried, min(_least(found, due), 0.0)
             else:
-                first = middle
+                first, above = middle, max(_least(found, due), 0.0)
+            trials = 0 if last - first <= goal else trials + 1
+            goal = min(goal, 0.5 * (last - first)) if not trials else goal
         return last, state
+
+
+def _least(seen: Seen, due: Booleans) -> float:
+    """The least of the margins that fall through zero; 0 where none does at both ends."""
+    return float(np.min(seen.margins[due], initial=np.inf)) if due.any() else 0.0
 
 
 def run_with_changes(

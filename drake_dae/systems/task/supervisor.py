@@ -26,7 +26,7 @@ from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.planner import CONTACT, FREE, Now, Planner
 from drake_dae.systems.task.progress import Progress, Segment
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import TracedTask
+from drake_dae.systems.task.traced import EARLY, TracedTask
 
 
 class TaskSupervisor(LeafSystem):
@@ -169,7 +169,9 @@ class TaskSupervisor(LeafSystem):
         if not progress.segments or self._is_over(progress.segments[-1]):
             return 1.0
         _, margins = self._margins(context, progress, progress.segments[-1])
-        least = float(np.min(margins))
+        # A little early: Drake's Simulator ends the process where it finds a zero at the very end
+        # of a step at which a sample is due.
+        least = float(np.min(margins)) - EARLY
         # What jumped with an event, as the force of an impact, is seen only if it was not so at the
         # start of a step.
         return 1.0 if least <= 0.0 and context.get_time() == progress.step else least
@@ -203,11 +205,11 @@ class TaskSupervisor(LeafSystem):
             return EventStatus.DidNothing()
         moment, margins = self._margins(context, progress, segment)
         status, found = EventStatus.Succeeded(), progress.segments
-        if np.any(margins[:-1] <= 0.0):
+        if np.any(margins[:-1] <= 2.0 * EARLY):
             following, status = self._changed(context, segment, moment, margins)
             found = (*found, following)
         known: dict[str, Any] = {"felt": time} if progress.is_felt else {}
-        is_felt = moment.force > self.task.contact_force
+        is_felt = progress.is_felt != bool(margins[-1] <= 2.0 * EARLY)
         self._put(state, replace(progress, segments=found, step=time, is_felt=is_felt, **known))
         return status
 
@@ -222,10 +224,10 @@ class TaskSupervisor(LeafSystem):
         task, place, now = self.task, segment.change.place, self._now(context)
         phase, status = task.phases[place], EventStatus.Succeeded()
         awaited = phase.awaited(task.contact_force)
-        if margins[0] <= 0.0:
+        if margins[0] <= 2.0 * EARLY:
             following = self._plan.following(now, segment, moment, place + 1, f"after {awaited}")
             return following, status
-        if margins[1] <= 0.0:
+        if margins[1] <= 2.0 * EARLY:
             reaction, reason = phase.if_lost, f"the contact of {phase.name} is lost"
         else:
             reaction = phase.if_late

@@ -28,6 +28,9 @@ from drake_dae.trace.functions import TracedFunction
 NAMES = ("place", "contact", "start", "over", "touched", "felt", "is_felt")
 """Which numbers a context holds of a task, before base, rate and fade of its present segment."""
 
+EARLY = 1e-12
+"""A margin that is less is over: so zeros are alike whose round-off is not."""
+
 
 class TracedTask:
     """The functions of a `TaskSupervisor`, by the numbers of its present segment.
@@ -182,6 +185,6 @@ class TracedTask:
         found = self._in_phase(margins, ca.SX.ones(4))
         inputs = [self._time, self._held, x, self._forces, parameters]
         none = ca.SX(0, 1)
-        function = ca.Function("guard", inputs, [ca.densify(found), none, none])
+        function = ca.Function("guard", inputs, [ca.densify(found - EARLY), none, none])
         sources = (TIME, HELD, "estimated_state", "measured_force", PARAMETERS)
         return Computation(function, sources, (MARGINS, GAPS, RATES))
