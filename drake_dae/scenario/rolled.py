@@ -123,16 +123,16 @@ class _Watched:
             self._next = time.perf_counter() + PERIOD
         return self._failure is not None or self._look(record)
 
-    def _see(self, rows: Record) -> None:
+    def _see(self, rows: Record, *, is_last: bool = False) -> None:
         if self._may_diverge or self._failure is not None or not rows.time.size:
             return
         self._time = float(rows.time[-1])
         try:
-            self._watch.look(rows)
+            self._watch.look(rows, is_last=is_last)
         except SimulationError as error:
             self._failure = error
 
     def judged(self, found: Rollout) -> Rollout:
         """A rollout up to where it diverges."""
-        self._see(found.record.after(self._time))
+        self._see(found.record.after(self._time), is_last=found.failure is None)
         return found if self._failure is None else found.ended(self._failure)

@@ -38,8 +38,9 @@ EVERY = 32
 class DivergenceWatch:
     """Ends a run whose states or errors leave all measure.
 
-    A state is compared with its value at the start and with `DaeSystem.scale`, a control with what
-    had its unit at the start. The error z - r of
+    A state is compared with its value at the start and with `DaeSystem.scale`, a control at the end
+    with what had its unit at the start: before, as near a singular configuration, the run ends by
+    itself, and tells why. The error z - r of
     an output is compared with the largest number in its unit that the reference has had up to now,
     or that outputs, states, forces and controls had at the start. So nothing depends on units, and
     the force of an impact, the sag under a load or a start far away are no divergence.
@@ -83,7 +84,7 @@ class DivergenceWatch:
 
         Args:
             context: The context of the diagram.
-            always: Whether to look at this one, as at the last.
+            always: Whether to look at this one, the last.
 
         Raises:
             SimulationError: The run diverges.
@@ -97,7 +98,8 @@ class DivergenceWatch:
         times, shown = np.array([context.get_time()]), self._shown(context)
         state, control = shown("state")[None], shown("control")[None]
         if self._controls is not None and control.size:
-            _raise_first([self._controls.look(times, control, state)])
+            found = self._controls.look(times, control, state)
+            _raise_first([found] if always else [])
         for controller, errors in self._errors:
             if (now := self._compared(controller, context)) is not None:
                 _raise_first([errors.look(times, now[0][None], now[1][None], state)])
@@ -152,8 +154,12 @@ class RecordWatch:
         self._plant, self._duration = plant, duration
         self._watched: tuple[_Amounts, _Amounts, _Errors] | None = None
 
-    def look(self, record: Record) -> None:
+    def look(self, record: Record, *, is_last: bool = False) -> None:
         """Looks at rows that follow those that were looked at.
+
+        Args:
+            record: The rows.
+            is_last: Whether the run has come to its end with them.
 
         Raises:
             SimulationError: The run diverges; the time is that of the first row that says so.
@@ -171,12 +177,12 @@ class RecordWatch:
                 _Errors(signals, time, window, start, _least(self._plant)),
             )
         of_states, of_controls, of_errors = self._watched
+        controls = of_controls.look(record.time, record["control"], states)
         found = [
             of_errors.look(record.time, outputs, record["desired_output"], states),
             of_states.look(record.time, states, states),
-            of_controls.look(record.time, record["control"], states),
         ]
-        _raise_first(found)
+        _raise_first([*found, controls] if is_last else found)
 
 
 Sizes = dict[str, float]

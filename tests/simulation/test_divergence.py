@@ -101,9 +101,15 @@ def test_rollouts_diverge_as_simulations_do(fixed, compiled):
 
 @pytest.mark.slow
 def test_tasks_diverge_by_their_own_outputs():
+    """By simulate; rollouts, which are looked at before they have a row, end at least."""
+    settings = ("wall_polish", "gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004))
     with pytest.raises(SimulationError, match=r"the error of wall.force .* has grown") as caught:
-        run("wall_polish", "gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004))
+        run(*settings)
     assert 3.0 < caught.value.time < 4.0
+    case = scenario(*settings, "compiled=false")
+    found = roll_scenario(case, *build_scenario(case)).failure
+    assert found is not None  # Between two of its rows, by impacts without end.
+    assert found.time == pytest.approx(caught.value.time, abs=0.05)
 
 
 @pytest.mark.slow
@@ -199,6 +205,8 @@ def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
     record = loop.record(context)
     assert np.max(np.abs(record["tracking_error"])) < 10.0
     with pytest.raises(SimulationError, match="u0 is") as caught:
-        RecordWatch(loop.plant, duration).look(record)
+        RecordWatch(loop.plant, duration).look(record, is_last=True)
     first = np.argmax(np.abs(record["control"]) > 1e9)
     assert caught.value.time == record.time[first]
+    # Before, a run ends by itself, and tells why.
+    RecordWatch(loop.plant, duration).look(record)

@@ -125,7 +125,7 @@ def program_of(loop: ClosedLoop | Diagram) -> Program:
 def _completed(loop: ClosedLoop, record: Record, context: Context | None) -> Record:
     """A record of a loop with errors, and with what happened to contacts."""
     found = loop.with_errors(record, context)
-    if context is None:
+    if context is None or not found.time.size:
         return found
     events = loop.plant.events(loop.plant.GetMyContextFromRoot(context))
     return replace(found, events=tuple(one for one in events if one.time <= found.time[-1]))
