@@ -209,7 +209,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     RobotToSimulate: lambda: RobotToSimulate(
         arm("two_link").model, arm("two_link").structure, False, "", add_arm, {}, ()
     ),
-    PositionOutput: lambda: arm("two_link").model.positions[0],
+    PositionOutput: lambda: arm("two_link").model.outputs[0],
     Reaction: lambda: Reaction(ca.SX(2, 1)),
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
     RigidTransform: RigidTransform,

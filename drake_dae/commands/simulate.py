@@ -17,6 +17,7 @@ from typing import Any, TextIO
 from pydrake.systems.framework import Context
 
 import drake_dae
+from drake_dae.commands.play import show
 from drake_dae.commands.run_folder import (
     ANIMATION,
     FILES,
@@ -26,7 +27,6 @@ from drake_dae.commands.run_folder import (
     run_folder,
     stage,
 )
-from drake_dae.commands.view import show
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
@@ -282,7 +282,7 @@ def _write(run: _Run) -> bool:
         with _collected(problems):
             _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
             if ANIMATION in files:
-                _print(f"watch it: drake-dae view {shlex.quote(str(folder))}", sys.stdout)
+                _print(f"watch it: drake-dae play {shlex.quote(str(folder))}", sys.stdout)
         with suppress(OSError):
             _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
     return not problems

@@ -123,9 +123,9 @@ def _in_words(schema: Mapping[str, Any]) -> str:
 
 
 def without_tags(schema: Any) -> Any:
-    """A schema of the same data without the entries "_tag", as a plain reader of YAML gives them.
+    """The schema of the same data as a plain YAML reader gives them: without the entries "_tag".
 
-    Where a tag chooses, any form fits.
+    Without the tag any of the forms may match, so "oneOf" becomes "anyOf".
     """
     if isinstance(schema, list):
         return [without_tags(one) for one in schema]
