@@ -36,7 +36,7 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import ForceArrows, GrowingPaths
-from drake_dae.pictures.course import contact_paths, follow, frame_times
+from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
 from drake_dae.pictures.surroundings import scene_extent
 from drake_dae.pictures.view import FRAME_RATE, draw_scene
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
