@@ -110,9 +110,9 @@ equations:
 
 pictures: $(VENV)/installed
 	$(BIN)/drake-dae simulate wall_polish --out runs/polish
-	$(BIN)/drake-dae film runs/polish --out $(PICTURES)/wall_polish.gif
+	$(BIN)/drake-dae render runs/polish --out $(PICTURES)/wall_polish.gif
 	$(BIN)/drake-dae simulate seven_joint_wall --set duration=8 --out runs/pictures
-	$(BIN)/drake-dae film runs/pictures --out $(PICTURES)/seven_joint_wall.gif
+	$(BIN)/drake-dae render runs/pictures --out $(PICTURES)/seven_joint_wall.gif
 	cp runs/pictures/path.png $(PICTURES)/seven_joint_wall_path.png
 	cp runs/pictures/errors.png $(PICTURES)/seven_joint_wall_errors.png
 

@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from io import TextIOWrapper
 
 from drake_dae.commands.options import parse_options
@@ -60,7 +61,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         if options.command == "list":
             return _list(as_json)
         run_command = _loaded(options.command)
-        # The report tells it.
+        # In the report already.
         ignored = [NonMinimumPhaseWarning] if options.command == "analyze" else []
         if getattr(options, "compiled", None) is not None:
             options.settings.append(f"compiled={options.compiled}")
@@ -92,31 +93,15 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _loaded(command: str) -> Callable[[argparse.Namespace], int]:
-    """What runs a command, with what that needs: Drake alone takes a second.
+    """The function of a command, imported when it is called: Drake alone takes a second.
 
-    A signal waits meanwhile: Drake's modules would make an ImportError of it.
+    A signal waits meanwhile: Drake's modules would convert it to an ImportError.
     """
     with ending_signals(interruption := Interruption()):
-        if command == "show":
-            from drake_dae.commands.show import run_command
-        elif command in ("keys", "schema"):
-            from drake_dae.commands.keys import run_command
-        elif command == "view":
-            from drake_dae.commands.view import run_command
-        elif command == "cache":
-            from drake_dae.commands.cache import run_command
-        elif command == "analyze":
-            from drake_dae.commands.analyze import run_command
-        elif command == "export":
-            from drake_dae.commands.export import run_command
-        elif command == "film":
-            from drake_dae.commands.film import run_command
-        elif command == "new":
-            from drake_dae.commands.new import run_command
-        elif command == "sweep":
-            from drake_dae.commands.sweep import run_command
-        else:
-            from drake_dae.commands.simulate import run_command
+        module = "keys" if command == "schema" else command
+        run_command: Callable[[argparse.Namespace], int] = import_module(
+            f"drake_dae.commands.{module}"
+        ).run_command
     if interruption.signal is not None:
         end_at_once(interruption.signal)
     return run_command

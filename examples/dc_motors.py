@@ -33,7 +33,7 @@ def run(mass_factor: float, measured_force: bool) -> tuple[dd.Record, np.ndarray
     model = dd.RobotModel.from_multibody(
         multibody,
         constraints=[dd.PointOnSurface("tool", dd.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[dd.PointCoordinates("tool", "z")],
+        outputs=[dd.PointCoordinates("tool", "z")],
         nominal_positions=[1.2, -1.6],
         actuation=[MOTORS],
     )

@@ -30,7 +30,7 @@ def main(folder: Path) -> float:
     model = dd.RobotModel.from_multibody(
         multibody,
         constraints=[dd.PointOnSurface("tool", dd.Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[
+        outputs=[
             dd.PointCoordinates("tool", "yz"),
             dd.AxisCoordinates("tool", "z", "yz"),
             dd.JointPositions(["joint3", "joint7"]),

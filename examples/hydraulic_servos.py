@@ -34,7 +34,7 @@ def main(folder: Path) -> float:
     model = dd.RobotModel.from_multibody(
         multibody,
         constraints=[dd.PointOnSurface("tool", dd.Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[dd.PointCoordinates("tool", "z")],
+        outputs=[dd.PointCoordinates("tool", "z")],
         nominal_positions=[1.2, -1.6],
         actuation=[SERVOS],
     )

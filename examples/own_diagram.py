@@ -45,7 +45,7 @@ def main(folder: Path) -> float:
     model = RobotModel.from_multibody(
         multibody,
         constraints=[PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[PointCoordinates("tool", axes="z")],
+        outputs=[PointCoordinates("tool", axes="z")],
         nominal_positions=[1.2, -1.6],
     )
     law = TrackingLaw(model.dae, poles(-4.0))

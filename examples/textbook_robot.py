@@ -43,7 +43,7 @@ def main(folder: Path) -> float:
     model = dd.RobotModel(
         links,
         constraints=[dd.PointOnSurface("tip", bench, name="bench")],
-        positions=[dd.PointCoordinates("tip", "x")],
+        outputs=[dd.PointCoordinates("tip", "x")],
         nominal_positions=[-0.6, 1.0],
     )
     law = dd.TrackingLaw(model.dae, dd.gain_coefficients([36.0, 9.0]))

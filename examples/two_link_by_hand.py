@@ -42,7 +42,7 @@ def main(folder: Path) -> tuple[float, float]:
     model = RobotModel.from_multibody(
         multibody,
         constraints=[PointOnSurface("tool", Plane((1.2, 0, 0), (-1, 0, 0)), name="wall")],
-        positions=[PointCoordinates("tool", axes="z")],
+        outputs=[PointCoordinates("tool", axes="z")],
         nominal_positions=[1.2, -1.6],
     )
 

@@ -29,7 +29,7 @@ def main(folder: Path) -> tuple[float, float]:
     model = dd.RobotModel.from_multibody(
         multibody,
         constraints=[wall],
-        positions=[
+        outputs=[
             dd.PointCoordinates("tool", "yz"),
             dd.AxisCoordinates("tool", "z", "yz"),
             dd.JointPositions(["joint3", "joint7"]),

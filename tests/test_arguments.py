@@ -41,7 +41,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import Margin
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.course import ShownLoop
+from drake_dae.pictures.run_motion import ShownLoop
 from drake_dae.robots.actuation.stage import Stage
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
@@ -209,7 +209,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     RobotToSimulate: lambda: RobotToSimulate(
         arm("two_link").model, arm("two_link").structure, False, "", add_arm, {}, ()
     ),
-    PositionOutput: lambda: arm("two_link").model.positions[0],
+    PositionOutput: lambda: arm("two_link").model.outputs[0],
     Reaction: lambda: Reaction(ca.SX(2, 1)),
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
     RigidTransform: RigidTransform,

@@ -32,7 +32,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     listed = commands.add_parser("list", help="list the shipped scenarios")
     _add_json(listed, "print names and descriptions as JSON")
     shown = commands.add_parser(
-        "show", help=("print a shipped scenario, as the beginning of your own")
+        "print", help=("print a shipped scenario, as the beginning of your own")
     )
     shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
     shown.add_argument("--path", action="store_true", help="print where its file is instead")
@@ -91,7 +91,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--check", action="store_true", help="exit code 2 for a run that missed its task"
     )
     _add_json(run, "print the verdict and where the files are as JSON, and all else on stderr")
-    shown = commands.add_parser("view", help="open the animation of a run in the browser")
+    shown = commands.add_parser("play", help="play the animation of a run in the browser")
     shown.add_argument("folder", type=_path, help="the folder of the run")
     examine = commands.add_parser(
         "analyze",
@@ -118,8 +118,8 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     written.add_argument("--out", type=_path, help="folder for the files (default: <scenario>_c99)")
     _add_json(written, "print the names of the files as JSON")
     film = commands.add_parser(
-        "film",
-        help="film a run, into a GIF or a strip of pictures",
+        "render",
+        help="render a run into a GIF or a strip of pictures",
         description=(
             "Renders the run in a folder, with the paths and the forces of its contacts. "
             "It needs no screen and no browser."

@@ -25,7 +25,7 @@ FILES = (SCENARIO, "summary.txt", "record.npz", *PLOTS, ANIMATION)
 """The files of a run in its folder."""
 
 FILM = "film.gif"
-"""The files of `drake-dae film`."""
+"""The files of `drake-dae render`."""
 
 MARK = "# Scenario as run by drake-dae"
 """The first line of the scenario in a run's folder: only such a folder is reused."""

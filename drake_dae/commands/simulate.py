@@ -17,6 +17,7 @@ from typing import Any, TextIO
 from pydrake.systems.framework import Context
 
 import drake_dae
+from drake_dae.commands.play import show
 from drake_dae.commands.run_folder import (
     ANIMATION,
     FILES,
@@ -26,13 +27,12 @@ from drake_dae.commands.run_folder import (
     run_folder,
     stage,
 )
-from drake_dae.commands.view import show
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
 from drake_dae.pictures.animation import animate
-from drake_dae.pictures.course import Course, contact_paths, follow
 from drake_dae.pictures.phases import phase_spans
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
+from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
 from drake_dae.pictures.view import start_meshcat
 from drake_dae.robots.clearances import LinkBehind, links_behind
 from drake_dae.robots.shapes import Collision, LinkShapes, collisions
@@ -117,7 +117,7 @@ def _unused(name: str) -> Path:
 
 
 @dataclass
-class _Run:
+class _CommandRun:
     """A run: its scenario, its folder, and its outcome."""
 
     loop: ClosedLoop
@@ -135,7 +135,7 @@ class _Run:
     results: dict[str, Any] = field(default_factory=dict)
 
 
-def _step(run: _Run) -> RunStatistics:
+def _step(run: _CommandRun) -> RunStatistics:
     """Runs by Drake's Simulator."""
     _tell_rate(run)
     return simulate(
@@ -149,7 +149,7 @@ def _step(run: _Run) -> RunStatistics:
     )
 
 
-def _tell_rate(run: _Run) -> None:
+def _tell_rate(run: _CommandRun) -> None:
     """Warns before a run in real time that is too slow for it."""
     scenario, config = run.scenario, run.scenario.integrator
     wanted = config.target_realtime_rate
@@ -164,7 +164,7 @@ def _tell_rate(run: _Run) -> None:
         )
 
 
-def _roll(run: _Run) -> RunStatistics:
+def _roll(run: _CommandRun) -> RunStatistics:
     """Runs by `rollout`.
 
     Raises:
@@ -196,7 +196,7 @@ def _run(
     context: Context,
     completed: Completed,
     folder: Path,
-    simulate_by: Callable[[_Run], RunStatistics],
+    simulate_by: Callable[[_CommandRun], RunStatistics],
     title: str,
 ) -> tuple[int, dict[str, Any]]:
     """Runs and writes; the record is kept also when the run fails or is interrupted."""
@@ -206,7 +206,7 @@ def _run(
         return loop.record(context, after) if run.recorded is None else run.recorded(after)
 
     with RecordWriter(folder / PART, recorded, about) as writer:
-        run = _Run(loop, context, completed.scenario, folder, writer, title, completed.notes)
+        run = _CommandRun(loop, context, completed.scenario, folder, writer, title, completed.notes)
         try:
             run.statistics = simulate_by(run)
         except DrakeDaeError as error:
@@ -222,7 +222,7 @@ def _run(
     return 0 if complete else 1, run.results
 
 
-def _write(run: _Run) -> bool:
+def _write(run: _CommandRun) -> bool:
     """Writes the files, prints the summary, and says whether all files are complete."""
     loop, folder, write = run.loop, run.folder, run.scenario.write
     problems: list[str] = []
@@ -264,7 +264,7 @@ def _write(run: _Run) -> bool:
     try:
         if ending.signal is not None:
             end_at_once(ending.signal)
-        course: Course | None = None
+        course: RunMotion | None = None
         if run.pictures and (write.plots or write.animation) and model is not None:
             course = follow(loop, record, run.context)
         if write.plots and run.pictures:
@@ -282,7 +282,7 @@ def _write(run: _Run) -> bool:
         with _collected(problems):
             _print(f"{text}\nwritten to {folder}/: {', '.join(files)}", sys.stdout)
             if ANIMATION in files:
-                _print(f"watch it: drake-dae view {shlex.quote(str(folder))}", sys.stdout)
+                _print(f"watch it: drake-dae play {shlex.quote(str(folder))}", sys.stdout)
         with suppress(OSError):
             _print("".join(f"error: {line}\n" for line in problems), sys.stderr)
     return not problems
@@ -301,7 +301,7 @@ def _ways(loop: ClosedLoop, record: Record, context: Context) -> tuple[LinkBehin
     return *behind, *collisions(shapes, record.time, states)
 
 
-def _as_data(run: _Run, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
+def _as_data(run: _CommandRun, verdict: RunVerdict, reasons: Sequence[str]) -> dict[str, Any]:
     """The results of a run for JSON."""
     found = run.statistics
     return {
@@ -335,7 +335,7 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
     return [reason for reason, holds in reasons.items() if holds]
 
 
-def _write_record(record: Record, run: _Run) -> None:
+def _write_record(record: Record, run: _CommandRun) -> None:
     writer = run.writer
     try:
         with stage(run.folder, "record.npz") as place:

@@ -17,8 +17,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import LEAST_SCALE, PATH_COLOR, path_of
-from drake_dae.pictures.course import Course, ShownLoop, follow, run_extent
 from drake_dae.pictures.phases import PhaseSpan, phase_spans
+from drake_dae.pictures.run_motion import RunMotion, ShownLoop, follow, run_extent
 from drake_dae.pictures.surroundings import scene_extent, surroundings
 from drake_dae.pictures.view import (
     FRAME_RATE,
@@ -78,7 +78,7 @@ def make_animation(
 
 
 def animate(
-    course: Course,
+    course: RunMotion,
     scene_graph: SceneGraph | None,
     title: str = "",
     phases: Sequence[PhaseSpan] = (),
@@ -135,7 +135,7 @@ def animate(
     return AnimationPage(_with_overlay(meshcat.StaticHtml(), course, name, phases))
 
 
-def _add_flashes(meshcat: Meshcat, course: Course, radius: float) -> dict[int, str]:
+def _add_flashes(meshcat: Meshcat, course: RunMotion, radius: float) -> dict[int, str]:
     """Adds a ball for each constraint with impacts, which shows them; row -> path."""
     paths = {
         row: path_of(constraint, "impact")
@@ -209,7 +209,7 @@ def _tube(points: FloatArray, radius: float) -> tuple[FloatArray, np.ndarray]:
     return rings.reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def _with_overlay(page: str, course: Course, title: str, phases: Sequence[PhaseSpan]) -> str:
+def _with_overlay(page: str, course: RunMotion, title: str, phases: Sequence[PhaseSpan]) -> str:
     """Meshcat's page with a title, the clock, the sizes of the forces, and paths that grow."""
     constraints = course.acting.constraints
     sizes = np.linalg.norm([wrench.forces for wrench in course.wrenches], axis=2)

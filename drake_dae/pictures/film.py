@@ -35,8 +35,8 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.course import Course, ShownLoop, follow, run_extent
 from drake_dae.pictures.phases import phases_at
+from drake_dae.pictures.run_motion import RunMotion, ShownLoop, follow, run_extent
 from drake_dae.pictures.surroundings import surroundings
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.simulation.records.record import Record
@@ -140,7 +140,7 @@ class _Camera:
 class _Scene:
     """The links and surfaces in front of a camera."""
 
-    def __init__(self, course: Course, scene_graph: SceneGraph | None) -> None:
+    def __init__(self, course: RunMotion, scene_graph: SceneGraph | None) -> None:
         model, links = course.model, course.model.links.plant
         if scene_graph is None or links is None or links.get_source_id() is None:
             raise ModelError("a film shows links with geometry; this robot has none")

@@ -28,7 +28,7 @@ from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.figure import Figure
 
-    from drake_dae.pictures.course import ContactPath
+    from drake_dae.pictures.run_motion import ContactPath
 
 PATHS = "path.png"
 """The plot of points that move on surfaces, if there are any."""

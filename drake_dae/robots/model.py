@@ -58,7 +58,7 @@ class RobotModel:
         links: The links, which provide M, H and the frames.
         constraints: The constraints phi in their order; none for a robot in free motion. Those of
             the links' MultibodyPlant are appended: see `plant_constraints`.
-        positions: The position outputs h_1 in their order.
+        outputs: The position outputs h_1 in their order.
         nominal_positions: A configuration of the robot at work, shape (nq,), near which the
             structure is examined; `links.default_positions` if None.
         name: The robot's name in messages.
@@ -79,7 +79,7 @@ class RobotModel:
 
     Attributes:
         dae: The `DaeSystem` (43)-(45).
-        links, positions, nominal_positions, name, known_forces: The arguments.
+        links, outputs, nominal_positions, name, known_forces: The arguments.
         constraints: The constraints, with those of the plant.
         forces: The force outputs; a name is a `NamedForce`.
         stages: The attached stages.
@@ -97,7 +97,7 @@ class RobotModel:
         self,
         links: Links,
         constraints: Sequence[Constraint],
-        positions: Sequence[PositionOutput],
+        outputs: Sequence[PositionOutput],
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
@@ -111,7 +111,7 @@ class RobotModel:
         self.links = links
         every = (*constraints, *plant_constraints(links))
         self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
-        self.positions = tuple(positions)
+        self.outputs = tuple(outputs)
         self.name = name
         self.known_forces = tuple(known_forces)
         bound = ConstraintSet(self.constraints)
@@ -120,8 +120,10 @@ class RobotModel:
         self.forces = force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
-        h_1 = ca.vertcat(ca.SX(0, 1), *[p.expression(links) for p in self.positions])  # (39)
-        signals = [signal for output in self.positions for signal in output.signals(links)]
+        h_1 = ca.vertcat(
+            ca.SX(0, 1), *[output.expression(links) for output in self.outputs]
+        )  # (39)
+        signals = [signal for output in self.outputs for signal in output.signals(links)]
         weighted = control_weights is not None
         check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)
         driven = chain(actuation, links)
@@ -173,7 +175,7 @@ class RobotModel:
         cls,
         plant: MultibodyPlant,
         constraints: Sequence[Constraint],
-        positions: Sequence[PositionOutput],
+        outputs: Sequence[PositionOutput],
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
@@ -193,7 +195,7 @@ class RobotModel:
         return cls(
             links,
             constraints,
-            positions,
+            outputs,
             nominal_positions,
             name,
             actuation,

@@ -122,7 +122,7 @@ def _moved(model: RobotModel) -> list[str]:
     """The names of outputs that are coordinates of points."""
     return [
         signal.name
-        for output in model.positions
+        for output in model.outputs
         for signal in output.signals(model.links)
         if signal.unit == "m"
     ]

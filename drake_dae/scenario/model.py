@@ -106,7 +106,7 @@ def completed_model(
 
 
 @dataclass(frozen=True, eq=False)
-class _Robot:
+class _BuiltRobot:
     """A scenario's checked robot, and the completed scenario."""
 
     name: str
@@ -117,7 +117,9 @@ class _Robot:
     completed: Completed
 
 
-def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()) -> _Robot:
+def _read(
+    scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payload] = ()
+) -> _BuiltRobot:
     # The robot.
     name = scenario.robot.title
     links, loops = robot_links(scenario.robot, scene_graph, payloads)
@@ -146,7 +148,7 @@ def _read(scenario: Scenario, scene_graph: SceneGraph, payloads: Sequence[Payloa
 
     # The completion.
     completed = complete(scenario, links, constraints, plant_constraints(links), guess)
-    return _Robot(name, links, constraints, stages, known_forces, completed)
+    return _BuiltRobot(name, links, constraints, stages, known_forces, completed)
 
 
 def scenario_structure(model: RobotModel) -> Structure:

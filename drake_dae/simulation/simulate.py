@@ -121,7 +121,7 @@ def simulate(
         if began is not None:
             simulator.set_monitor(monitor)
 
-    with ending_signals(stop), _Progress(duration, progress) as shown:
+    with ending_signals(stop), _StepMonitor(duration, progress) as shown:
 
         def monitor(current: Context) -> EventStatus:
             if progress:
@@ -273,7 +273,7 @@ def check_config(config: SimulatorConfig) -> None:
         )
 
 
-class _Progress:
+class _StepMonitor:
     """Simulated time and speed on stderr: a bar on a terminal, otherwise periodic lines."""
 
     def __init__(self, duration: float, enabled: bool) -> None:

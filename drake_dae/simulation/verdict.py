@@ -163,7 +163,7 @@ def in_words(
     Args:
         verdict: The verdict.
         accuracy: The accuracy that the integrator was asked for; None with fixed steps.
-        reasons: Why a run is not as predicted, such as "the drives were cut off".
+        reasons: Why a run is not as predicted, such as "the drives were saturated".
         ended: The end of the run, such as "The run failed at 2.1 s"; empty if it is complete.
     """
     head = f"{ended}; up to there: " if ended else ""

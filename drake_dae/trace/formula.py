@@ -57,7 +57,7 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
     """
     if len(text) > MOST_LETTERS:
         raise ModelError(f"a formula has at most {MOST_LETTERS} letters, this one {len(text)}")
-    formula = _Formula(" ".join(text.split()), symbols)
+    formula = _FormulaReader(" ".join(text.split()), symbols)
     if not formula.text:
         raise ModelError("the formula is empty; write one such as z - 0.1*sin(x)")
     try:
@@ -87,7 +87,7 @@ def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
             raise ModelError(f"parameter '{name}': in a formula this means something else")
 
 
-class _Formula:
+class _FormulaReader:
     """A text on one line, with the expressions of its names."""
 
     def __init__(self, text: str, symbols: Mapping[str, ca.SX]) -> None:

@@ -403,7 +403,7 @@ def _goals(
     random: Random, model: RobotModel, links: MultibodyExpressions, tree: Tree
 ) -> np.ndarray:
     """Where the outputs are now, and random forces."""
-    rows = [output.expression(links) for output in model.positions]
+    rows = [output.expression(links) for output in model.outputs]
     known = {parameter.name: parameter for parameter in model.dae.parameters}
     symbols = ca.vertcat(*[parameter.symbol for parameter in known.values()])
     values = ca.DM(model.dae.parameter_values)

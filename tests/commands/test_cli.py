@@ -47,7 +47,7 @@ def test_it_prints_the_summary(demo):
     assert out.splitlines()[0].startswith(f"{DEFAULT_SCENARIO}: built in ")
     written, watch = out.splitlines()[-2:]
     assert written == f"written to {folder}/: {', '.join(FILES)}"
-    assert watch == f"watch it: drake-dae view {folder}"
+    assert watch == f"watch it: drake-dae play {folder}"
     assert "Tracked as predicted: errors stay within" in text
     assert re.search(r"simulated +2 s in \d+ steps, [\d.]+ s, [\d.]+ times real time", text)
     for name in ("tool.y", "tool.z", "joint7", "wall.force", "joint1_motor"):
@@ -140,11 +140,11 @@ def test_view_opens_the_animation(demo, monkeypatch, capsys):
     folder, _, _ = demo
     opened = []
     monkeypatch.setattr(webbrowser, "open", lambda address: not opened.append(address))
-    assert main(["view", str(folder)]) == 0
+    assert main(["play", str(folder)]) == 0
     assert opened == [(folder / "animation.html").resolve().as_uri()]
     assert capsys.readouterr().out == f"opened {opened[0]}\n"
     monkeypatch.setattr(webbrowser, "open", lambda _: False)
-    assert main(["view", str(folder)]) == 1
+    assert main(["play", str(folder)]) == 1
     assert error_line(capsys) == f"error: found no browser here; open {opened[0]} in one"
 
 
@@ -158,11 +158,11 @@ def test_view_says_what_is_missing(demo, tmp_path, capsys):
         (folder / "summary.txt", "is a file; name the folder of a run"),
         (run, "'.*run' is no folder of a run: `drake-dae simulate --out FOLDER` makes one"),
     ):
-        assert main(["view", str(path)]) == 1
+        assert main(["play", str(path)]) == 1
         assert re.search(text, error_line(capsys))
     for name in ("scenario.yaml", "outputs.png"):
         (run / name).touch()
-    assert main(["view", str(run)]) == 1
+    assert main(["play", str(run)]) == 1
     assert "has no animation.html; it has the pictures outputs.png. A run" in error_line(capsys)
 
 

@@ -120,8 +120,8 @@ def test_a_study_is_json(tmp_path, capsys):
         (["sweep", "--vary", "a=1", "--out="], "argument --out: a name is needed"),
         (["export", "--out="], "argument --out: a name is needed"),
         (["new", "a.urdf", "--out="], "argument --out: a name is needed"),
-        (["film", ""], "argument folder: a name is needed"),
-        (["view", ""], "argument folder: a name is needed"),
+        (["render", ""], "argument folder: a name is needed"),
+        (["play", ""], "argument folder: a name is needed"),
         (["sweep", "--vary", "a=1", "--random=1_0"], "expected a whole number, got '1_0'"),
         (["sweep", "--vary", "a=1", "--time-limit=nan"], "expected a positive number of seconds"),
     ],
@@ -184,7 +184,7 @@ def test_a_film_that_is_ended_leaves_nothing_behind(sent, tmp_path):
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from drake_dae.cli import main\nsys.exit(main(sys.argv[1:]))"
     )
-    command = [sys.executable, "-c", code, "film", str(folder)]
+    command = [sys.executable, "-c", code, "render", str(folder)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     limit = time.monotonic() + 60
     while not list(folder.glob(".unfinished-*")):

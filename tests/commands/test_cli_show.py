@@ -1,4 +1,4 @@
-"""`drake-dae show`, `keys` and `schema`: what one reads before a scenario runs."""
+"""`drake-dae print`, `keys` and `schema`: what one reads before a scenario runs."""
 
 import json
 
@@ -13,7 +13,7 @@ from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 
 def test_a_shipped_scenario_is_shown_as_it_is(tmp_path, capsys):
     """With its comments, and so that what is printed is a scenario anywhere."""
-    assert main(["show", "seven_joint_dome"]) == 0
+    assert main(["print", "seven_joint_dome"]) == 0
     text = capsys.readouterr().out
     assert text == find_scenario("seven_joint_dome").read_text()
     (tmp_path / "mine.yaml").write_text(text)
@@ -21,7 +21,7 @@ def test_a_shipped_scenario_is_shown_as_it_is(tmp_path, capsys):
 
 
 def test_where_it_is_and_which_without_a_name(capsys):
-    assert main(["show", "--path"]) == 0
+    assert main(["print", "--path"]) == 0
     assert capsys.readouterr().out.strip() == str(find_scenario(DEFAULT_SCENARIO))
 
 
@@ -32,7 +32,7 @@ def test_where_it_is_and_which_without_a_name(capsys):
 def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
-    assert main(["show", name]) == 1
+    assert main(["print", name]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     assert words in line

@@ -210,7 +210,7 @@ class Interrupting:
 sys.meta_path.insert(0, Interrupting())
 from drake_dae.cli import main
 assert "pydrake" not in sys.modules
-sys.exit(main(["film", "nowhere"]))
+sys.exit(main(["render", "nowhere"]))
 """
 
 

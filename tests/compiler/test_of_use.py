@@ -58,7 +58,7 @@ def test_parameters_that_move_by_a_value_that_is_fixed_are_those_of_drake():
     """A wall at x = 1.1 that moves, where the default of the parameter is 1.2."""
     model = touching("two_link")
     moving = RobotModel(
-        model.links, model.constraints, model.positions, [1.2, -1.6], exogenous=["wall.position"]
+        model.links, model.constraints, model.outputs, [1.2, -1.6], exogenous=["wall.position"]
     )
     builder = DiagramBuilder()
     plant = builder.AddSystem(RobotPlant(moving))

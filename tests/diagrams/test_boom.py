@@ -142,7 +142,7 @@ def test_a_revolute_joint_in_a_plane_does_as_a_pin():
         model = RobotModel(
             given.links,
             [constraint],
-            given.positions,
+            given.outputs,
             given.dae.nominal_state[:4],
             forces=[],
             control_weights=[1.0, 2.0, 3.0, 4.0],

@@ -36,7 +36,7 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError
 from drake_dae.pictures.arrows import ForceArrows, GrowingPaths
-from drake_dae.pictures.course import contact_paths, follow, frame_times
+from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
 from drake_dae.pictures.surroundings import scene_extent
 from drake_dae.pictures.view import FRAME_RATE, draw_scene
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
@@ -161,7 +161,7 @@ def test_paths_of_the_contact_point(shown):
     contact = loop.plant.model.constraints[0]
     lines = objects(page)
     times = np.arange(33) / 32
-    axes = ["xyz".index(axis) for axis in loop.plant.model.positions[0].axes]
+    axes = ["xyz".index(axis) for axis in loop.plant.model.outputs[0].axes]
     for name, signal in (("actual", "controlled_output"), ("desired", "desired_output")):
         path = middles(lines[f"/paths/{contact.name}/{name}"])
         assert path.shape == (33, 3)

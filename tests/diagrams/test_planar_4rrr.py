@@ -146,7 +146,7 @@ def test_springs_before_its_legs_leave_one_of_them_to_swing():
     model = RobotModel(
         rigid.links,
         rigid.constraints,
-        rigid.positions,
+        rigid.outputs,
         rigid.dae.nominal_state[:11],
         actuation=springs,
         forces=[],
@@ -165,7 +165,7 @@ def test_springs_before_its_legs_leave_one_of_them_to_swing():
 
 def test_what_does_not_fit_is_reported():
     rigid = scenario_model(scenario(NAME))
-    parts = (rigid.links, rigid.constraints, rigid.positions, rigid.dae.nominal_state[:11])
+    parts = (rigid.links, rigid.constraints, rigid.outputs, rigid.dae.nominal_state[:11])
     with pytest.raises(ModelError, match="For fewer, control_weights choose"):
         RobotModel(*parts, forces=[])
     with pytest.raises(ModelError, match="4 actuators and 4 outputs"):

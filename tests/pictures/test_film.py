@@ -70,7 +70,7 @@ def test_projection_is_that_of_drakes_camera():
 def test_runs_that_cannot_be_filmed_are_refused(tmp_path, capsys):
     with pytest.raises(ModelError, match=r"a \.gif, a strip of pictures a \.png, got 'x\.mp4'"):
         save_film(*recorded("two_link_wall", "duration=0.01"), "x.mp4")
-    assert main(["film", str(tmp_path)]) == 1
+    assert main(["render", str(tmp_path)]) == 1
     assert "is no folder of a run" in capsys.readouterr().err
 
 
@@ -78,7 +78,7 @@ def test_runs_that_cannot_be_filmed_are_refused(tmp_path, capsys):
 def test_command_films_a_run(tmp_path, capsys):
     folder = tmp_path / "run"
     assert main(["simulate", "two_link_wall", "--set", "duration=0.3", "--out", str(folder)]) == 0
-    assert main(["film", str(folder)]) == 0
+    assert main(["render", str(folder)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"written to {folder}/film.gif"
     assert len(list(frames(folder / "film.gif"))) == 4
     # The next run into this folder takes it away: it shows another run.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drake_dae.pictures.animation import animate
-from drake_dae.pictures.course import contact_paths, follow, run_extent
 from drake_dae.pictures.plots import plot_paths
+from drake_dae.pictures.run_motion import contact_paths, follow, run_extent
 from drake_dae.pictures.surroundings import surroundings
 from drake_dae.scenario.build import build_scenario
 from drake_dae.simulation.simulate import simulate

@@ -183,7 +183,7 @@ def test_the_mathematics_loads_no_drake() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
-    [["list"], ["show"], ["show", "--path"], ["--version"], ["--help"], ["simulate", "--help"]],
+    [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"], ["simulate", "--help"]],
 )
 def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
     code = (

@@ -33,7 +33,7 @@ def pushed(exogenous=(), frame="tool", actuation=()):
     return RobotModel.from_multibody(
         parse("two_link_arm"),
         known.constraints,
-        known.positions,
+        known.outputs,
         [1.2, -1.6],
         actuation=actuation,
         exogenous=exogenous,
@@ -47,7 +47,7 @@ def test_a_force_acts_as_drake_applies_it():
     model = RobotModel.from_multibody(
         parse("two_link_arm"),
         [],
-        known.positions[:0],
+        known.outputs[:0],
         [1.2, -1.6],
         known_forces=pushed().known_forces,
     )

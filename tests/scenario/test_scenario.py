@@ -406,7 +406,7 @@ def test_stages(form, stage):
     """
     loop, context = build_scenario(two_link(f"actuation=[{form}]"))
     model = loop.plant.model
-    rebuilt = type(model)(model.links, model.constraints, model.positions, actuation=[stage])
+    rebuilt = type(model)(model.links, model.constraints, model.outputs, actuation=[stage])
     assert [p.name for p in rebuilt.dae.parameters] == [p.name for p in model.dae.parameters]
     np.testing.assert_array_equal(rebuilt.dae.parameter_values, model.dae.parameter_values)
     state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))

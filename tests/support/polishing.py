@@ -54,7 +54,7 @@ def polisher() -> RobotModel:
     return RobotModel.from_multibody(
         parse("two_link_arm"),
         known.constraints,
-        known.positions,
+        known.outputs,
         [1.2, -1.6],
         "two_link",
         known_forces=[KnownForce("tool", name="push")],

@@ -64,7 +64,7 @@ def two_arms(actuation: Sequence[Stage] = ()) -> RobotModel:
     return RobotModel.from_multibody(
         two_arms_plant(),
         constraints=[GRASP],
-        positions=[
+        outputs=[
             PointCoordinates("object", "xyz"),
             AxisCoordinates("object", "x", "yz"),
             AxisCoordinates("object", "y", "z"),

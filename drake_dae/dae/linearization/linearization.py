@@ -51,7 +51,7 @@ def linearize(
     structure = constraint_structure_of("linearize", system, structure)
     p = system.num_controls
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
-    plant = _Plant(structure, state, system.parameter_vector(parameters))
+    plant = _PlantModel(structure, state, system.parameter_vector(parameters))
     point = plant.at(u)
     still = np.zeros((p, system.num_states + system.num_constraints))
     return plant.linearization(point, still, np.eye(p), system.control_signals)
@@ -89,7 +89,7 @@ def linearize_loop(
         )
     system, own = law.system, law.all_parameters()
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
-    plant = _Plant(law.structure, state, system.parameter_vector(parameters))
+    plant = _PlantModel(law.structure, state, system.parameter_vector(parameters))
     n, m, p = system.num_states, system.num_constraints, system.num_controls
     measured = [np.zeros(m)] if law.measured_force else []
     moving = tuple(range(2 + len(measured)))
@@ -114,7 +114,7 @@ def linearize_loop(
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
+class _OperatingPoint:
     """The motion at a state and a control: x', v and u."""
 
     rate: FloatArray
@@ -122,7 +122,7 @@ class _Point:
     control: FloatArray
 
 
-class _Plant:
+class _PlantModel:
     """The equations of motion at a state, in numbers.
 
     With c the last derivatives of the constraints the motion solves
@@ -200,15 +200,19 @@ class _Plant:
         m, p = self.system.num_constraints, self.system.num_controls
         return self._solve(np.vstack([self._h, np.zeros((m, p))]))
 
-    def at(self, control: FloatArray) -> _Point:
+    def at(self, control: FloatArray) -> _OperatingPoint:
         """The motion at the state with a control."""
         n = self.system.num_states
         push = np.concatenate([self._f[:, 0] + self._h @ control, -self._c_t[:, 0]])
         moved = self._solve(push[:, None])[:, 0]
-        return _Point(moved[:n], moved[n:], control)
+        return _OperatingPoint(moved[:n], moved[n:], control)
 
     def linearization(
-        self, point: _Point, feedback: FloatArray, forward: FloatArray, inputs: Sequence[Signal]
+        self,
+        point: _OperatingPoint,
+        feedback: FloatArray,
+        forward: FloatArray,
+        inputs: Sequence[Signal],
     ) -> Linearization:
         """The linear models with du = feedback (dx, dv) + forward dw.
 

@@ -65,7 +65,7 @@ def constraint_chains(
         force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
         control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
         reached = _reached(explicit.g, f, last, x)
-        numbers, still, stuck = _Rows(samples), [], []
+        numbers, still, stuck = _ChainRows(samples), [], []
         for row, i in enumerate(undecided):
             order = len(chains[i])
             if force_acts[row].all():
@@ -141,7 +141,7 @@ def output_chains(
     round_off, need_force = np.zeros((count, controls), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
-    elsewhere, numbers = Elsewhere(), _Rows(samples, elimination)
+    elsewhere, numbers = Elsewhere(), _ChainRows(samples, elimination)
     following, rows = elimination.l_star, elimination.n_star
     undecided = list(range(count))
     while True:
@@ -216,7 +216,7 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
     return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
 
 
-class _Rows:
+class _ChainRows:
     """The action of inputs at a state, for values of all parameters.
 
     Args:

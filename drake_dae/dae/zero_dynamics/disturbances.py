@@ -46,7 +46,7 @@ class Lost(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Transition:
+class StateTransition:
     """The flow of a state on Z(R) and of its disturbances over an interval of time.
 
     Attributes:
@@ -130,7 +130,7 @@ class Flow:
 
     def carry(
         self, state: FloatArray, begin: float, end: float, *, disturbed: bool = True
-    ) -> Transition:
+    ) -> StateTransition:
         """The state and its disturbances at the end of an interval.
 
         Raises:
@@ -150,7 +150,7 @@ class Flow:
                 size = max(float(np.linalg.norm(transition, 2)), 1e-300)
                 transition, growth = transition / size, growth + float(np.log(size))
                 volume += max(float(np.linalg.slogdet(scaled)[1]), -700.0)
-        return Transition(state, basis, transition, growth, volume)
+        return StateTransition(state, basis, transition, growth, volume)
 
     def way(
         self, state: FloatArray, begin: float, end: float

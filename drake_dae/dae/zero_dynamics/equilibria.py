@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.isolation import Isolation, isolation
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import PinnedPoint, Regularity
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     balanced_norm,
@@ -193,7 +193,9 @@ class Equilibria:
         found = linearized_eigenvalues(self.pinned, self.sizes, rest, reference, parameters)
         return found[0], known.errors(*found), known
 
-    def unrest(self, point: Point, reference: FloatArray, parameters: FloatArray) -> Unrest | None:
+    def unrest(
+        self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray
+    ) -> Unrest | None:
         """What changes at a point, or that it is singular; None at a regular equilibrium.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.

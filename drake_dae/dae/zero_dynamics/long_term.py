@@ -6,7 +6,7 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, Transition
+from drake_dae.dae.zero_dynamics.disturbances import Flow, Lost, StateTransition
 from drake_dae.dae.zero_dynamics.equilibria import Equilibria
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.returns import Return, find_multiple, find_return
@@ -71,7 +71,7 @@ class LongTerm:
         )
 
 
-def behavior_of(passage: Transition, *halves: Transition) -> Behavior:
+def behavior_of(passage: StateTransition, *halves: StateTransition) -> Behavior:
     """The behavior of a motion, from its disturbances over a late interval.
 
     If a motion attracts its neighbours, disturbances decay in all directions. On a limit cycle,
@@ -127,7 +127,7 @@ def watch(
 
 def carry_in_halves(
     flow: Flow, state: FloatArray, begin: float, end: float
-) -> tuple[Transition, tuple[Transition, Transition]]:
+) -> tuple[StateTransition, tuple[StateTransition, StateTransition]]:
     """The flow over an interval and over its halves.
 
     Raises:
@@ -138,7 +138,7 @@ def carry_in_halves(
     second = flow.carry(first.state, middle, end)
     transition = second.transition @ first.transition
     size = max(float(np.linalg.norm(transition, 2)), 1e-300)
-    whole = Transition(
+    whole = StateTransition(
         second.state,
         second.basis,
         transition / size,

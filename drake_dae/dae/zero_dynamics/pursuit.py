@@ -8,7 +8,7 @@ import scipy  # SciPy loads its large parts when they are used.
 from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause, MotionEnd, PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import PinnedPoint, Regularity
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.given import result_of
 
@@ -56,14 +56,14 @@ def follow(
         guess: A state near the first one, shape (n,).
         parameters: The function t -> values of all parameters.
     """
-    points: list[Point] = []
+    points: list[PinnedPoint] = []
     ending = None
     try:
         with np.errstate(all="ignore"):  # States outside the domain are tried and rejected.
             pursuit = _Pursuit(pinned, reference, parameters, times.tolist(), guess)
             for point in pursuit.points():
                 points.append(point)
-    except _Ended as end:
+    except _MotionEnded as end:
         ending = end.ending
     system, count = pinned.system, len(points)
 
@@ -86,7 +86,7 @@ def follow(
     )
 
 
-class _Ended(Exception):
+class _MotionEnded(Exception):
     """The end of a motion with pinned outputs."""
 
     def __init__(self, ending: MotionEnd) -> None:
@@ -95,7 +95,7 @@ class _Ended(Exception):
 
 
 class _Pursuit:
-    """Follows a reference from point to point; raises _Ended at the end of the motion."""
+    """Follows a reference from point to point; raises _MotionEnded at the end of the motion."""
 
     def __init__(
         self,
@@ -117,23 +117,23 @@ class _Pursuit:
             start = pinned.state(goal, guess, parameters(self._time))
         except InconsistentStateError as error:
             ending = MotionEnd(EndCause.NO_START, self._time, f"{error} ({when})")
-            raise _Ended(ending) from error
+            raise _MotionEnded(ending) from error
         self._last = pinned.point(start, goal, parameters(self._time))
         if pinned.regularity(self._last) is not Regularity.REGULAR:
             text = (
                 f"{self._name}: at the start, {when}, x = {show(start)}, A(x) or B(x) is singular, "
                 "or the domain of the system ends"
             )
-            raise _Ended(MotionEnd(EndCause.SINGULAR_START, self._time, text, start))
+            raise _MotionEnded(MotionEnd(EndCause.SINGULAR_START, self._time, text, start))
         self._largest = self._last.margins
 
-    def points(self) -> Iterator[Point]:
+    def points(self) -> Iterator[PinnedPoint]:
         """The points of the motion, one for each time."""
         yield self._last
         has_dynamics = self._pinned.structure.zero_dynamics_dimension > 0
         yield from self._integrate() if has_dynamics else self._continue()
 
-    def _continue(self) -> Iterator[Point]:
+    def _continue(self) -> Iterator[PinnedPoint]:
         """Continues without zero dynamics, by a predictor and Newton's method."""
         step, change = np.inf, np.zeros(self._last.state.size)
         for end in self._times[1:]:
@@ -152,7 +152,7 @@ class _Pursuit:
                     self._check_step(step, interval)
             yield self._last
 
-    def _integrate(self) -> Iterator[Point]:
+    def _integrate(self) -> Iterator[PinnedPoint]:
         """Continues with zero dynamics, by an implicit integrator, since they may be stiff."""
         scale = self._pinned.system.scale
         bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
@@ -213,7 +213,7 @@ class _Pursuit:
             goal = numbers(f"reference({time:g})", given).reshape(-1)
         except NonFiniteError as error:
             ending = MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error))
-            raise _Ended(ending) from error
+            raise _MotionEnded(ending) from error
         if goal.size != layout.reference_size:
             raise ModelError(
                 f"{self._name}: the reference must have size {layout.reference_size} (each output "
@@ -221,7 +221,7 @@ class _Pursuit:
             )
         if not np.all(np.isfinite(goal)):
             text = f"{self._name}: the reference is not finite at t = {time:.6g} s"
-            raise _Ended(MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, text))
+            raise _MotionEnded(MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, text))
         return goal
 
     def _reach(self, time: float, state: FloatArray) -> bool:
@@ -253,7 +253,7 @@ class _Pursuit:
         if step < SHORTEST * interval:
             raise self._end(0.1 * interval)
 
-    def _end(self, ahead: float) -> _Ended:
+    def _end(self, ahead: float) -> _MotionEnded:
         """The reason why the motion ends at the last point, also from the reference ahead."""
         last, when = self._last, f"t = {self._time:.6g} s"
         shares = [
@@ -284,7 +284,7 @@ class _Pursuit:
         text = f"{self._name}: {EndCause.OUT_OF_REACH.value} at {when}: {singular}"
         return self._stop(EndCause.OUT_OF_REACH, text, matrix)
 
-    def _escape(self) -> _Ended | None:
+    def _escape(self) -> _MotionEnded | None:
         """The end where a state grows without bound within a finite time; None where none does.
 
         At such an end a rate is so large that the state would have grown by `GROWN` in the elapsed
@@ -304,6 +304,6 @@ class _Pursuit:
             f"{self._time:.6g} s",
         )
 
-    def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _Ended:
+    def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _MotionEnded:
         """The end of the motion at the last point."""
-        return _Ended(MotionEnd(cause, self._time, text, self._last.state, matrix))
+        return _MotionEnded(MotionEnd(cause, self._time, text, self._last.state, matrix))

@@ -183,7 +183,7 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
 
 
 def without_dynamics(structure: Structure) -> Stability:
-    """What is said where no internal states are left."""
+    """The verdict on a system without zero dynamics: whether R determines the motion."""
     nothing = np.zeros(0, dtype=complex)
     margins = {
         "A(x) of Assumption (2)": structure.constraint_margin,

@@ -155,9 +155,9 @@ class ZeroDynamics:
         Args:
             state: x, shape (n,).
             parameters: Values of all parameters.
-            outputs: z, shape (p,). If None those of the state, where outputs with mu_i = 0, which
-                depend on the control, are as brings it nearest to rest: give them where several
-                values do, such as the force on a surface that nothing else moves.
+            outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
+                state does not determine, are chosen such that x' is smallest. Give them if this
+                choice is not unique, as for a force that does not affect the motion.
 
         Returns:
             The eigenvalues in 1/s, largest real part first, shape (dimension,).

@@ -180,18 +180,18 @@ class ConstraintSet:
 
     @property
     def motors(self) -> tuple[Signal, ...]:
-        """Names and units of the controls in these joints."""
+        """Names and units of the motors' efforts in the loop-closing joints."""
         return tuple(joint.motor for _, joint in self.joints if joint.motor is not None)
 
     def joint_state(self, links: Links) -> tuple[ca.SX, ca.SX]:
-        """The coordinates of these joints and their rates, shape (l, 1) each, in q and v."""
+        """The coordinates of the l loop-closing joints and their rates, shape (l, 1) each."""
         kinematics, parts = links.kinematics(), [c for c, _ in self.joints]
         positions = ca.vertcat(ca.SX(0, 1), *[c.coordinates(kinematics) for c in parts])
         rates = ca.vertcat(ca.SX(0, 1), *[c.coordinate_rate(kinematics) for c in parts])
         return kinematics.value(positions), kinematics.value(rates)
 
     def joint_columns(self, links: Links) -> ca.SX:
-        """The generalized force of a unit along each of these coordinates, shape (nv, l)."""
+        """The generalized forces of unit efforts in the loop-closing joints, shape (nv, l)."""
         kinematics, count = links.kinematics(), len(self.joints)
         unit, total = ca.SX.sym("unit", count), Reaction(ca.SX(links.v.numel(), 1))
         for i, (constraint, _) in enumerate(self.joints):

@@ -143,7 +143,7 @@ class Kinematics(ABC):
 
     @abstractmethod
     def reaction(self, power: ca.SX) -> Reaction:
-        """The forces with a given power in W, an expression linear in velocities."""
+        """The forces on the links with a power in W that is linear in velocities."""
 
     @abstractmethod
     def value(self, expression: ca.SX) -> ca.SX:

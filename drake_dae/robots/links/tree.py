@@ -119,7 +119,7 @@ class Link:
         return self.rotation @ moment + ca.cross(self.offset, force), force
 
     def generalized_force(self, moment: ca.SX, force: ca.SX) -> list[tuple[int, ca.SX]]:
-        """The generalized force of a moment about L's origin and a force: index in v, scalar."""
+        """The generalized force of a wrench at L's origin: (index in v, component) pairs."""
         turning = [(j, ca.dot(d, moment)) for j, d in self.turning.items()]
         return turning + [(j, ca.dot(self.rotation.T @ d, force)) for j, d in self.shifting.items()]
 

@@ -24,7 +24,7 @@ from drake_dae.scenario.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
+class _ToolContact:
     """A contact of a robot: the constraint's name, the point, and the tool's axis there."""
 
     constraint: str
@@ -63,7 +63,9 @@ class Candidates:
         self._given = len(self.signals)
         rows = [output.expression(links) for output in given]
         touching = [(c.name, c.touch(links)) for c in bound.constraints]
-        places = [_Place(name, t, tool_axis(links, t)) for name, t in touching if t is not None]
+        places = [
+            _ToolContact(name, t, tool_axis(links, t)) for name, t in touching if t is not None
+        ]
 
         def add(forms: Iterable[Output]) -> list[int]:
             first = len(self.signals)
@@ -101,7 +103,7 @@ class Candidates:
         return self._forms[row - self._given]
 
 
-def _points(place: _Place, taken: set[str]) -> list[Output]:
+def _points(place: _ToolContact, taken: set[str]) -> list[Output]:
     frame, point = place.touch.frame, place.touch.point
     # Names are unique: the constraint's name is used if the frame's is taken.
     named = ((axis, f"{frame}.{axis}" in taken) for axis in "xyz")
@@ -111,13 +113,13 @@ def _points(place: _Place, taken: set[str]) -> list[Output]:
     ]
 
 
-def _tilts(place: _Place) -> list[Output]:
+def _tilts(place: _ToolContact) -> list[Output]:
     axis = place.axis.axis
     others = "xyz".replace(axis, "")
     return [TiltFromNormal(place.constraint, axis, one) for one in others]
 
 
-def _directions(place: _Place) -> list[Output]:
+def _directions(place: _ToolContact) -> list[Output]:
     return [AxisCoordinates(place.touch.frame, place.axis.axis, one) for one in "xyz"]
 
 

@@ -31,7 +31,7 @@ def problem(schema: Mapping[str, Any], details: ErrorDetails, data: Any) -> tupl
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
+class _DataPlace:
     """A place in data: its dotted key, its schema, and the tag that chose it, with all tags."""
 
     key: str
@@ -45,7 +45,7 @@ _PARTS = {"oneOf", "items", "properties", "additionalProperties"}
 """The schema entries of data with parts."""
 
 
-def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _Place:
+def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _DataPlace:
     """The place of pydantic's location, in which a chosen tag is a part."""
     keys: list[str] = []
     tag = tags = ""
@@ -61,7 +61,7 @@ def _place(loc: Sequence[int | str], schema: Mapping[str, Any], data: Any) -> _P
             inner = schema.get("items", schema.get("additionalProperties"))
             schema = schema.get("properties", {}).get(part, inner)
             data, tag = data[part], ""
-    return _Place(".".join(keys) or "scenario", schema, data, tag, tags)
+    return _DataPlace(".".join(keys) or "scenario", schema, data, tag, tags)
 
 
 def with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -70,7 +70,7 @@ def with_parts(schema: Mapping[str, Any]) -> Mapping[str, Any]:
     return inside[0] if len(inside) == 1 and not _PARTS.isdisjoint(inside[0]) else schema
 
 
-def _wrong_key(place: _Place, name: str, value: Any, is_missing: bool) -> str:
+def _wrong_key(place: _DataPlace, name: str, value: Any, is_missing: bool) -> str:
     """The text for a key that is missing or unknown."""
     names = [name for name in place.schema["properties"] if name != TAG]
     title, known = f"{place.tag} " if place.tag else "", f"keys: {', '.join(names) or 'none'}"
@@ -123,9 +123,9 @@ def _in_words(schema: Mapping[str, Any]) -> str:
 
 
 def without_tags(schema: Any) -> Any:
-    """A schema of the same data without the entries "_tag", as a plain reader of YAML gives them.
+    """The schema of the same data as a plain YAML reader gives them: without the entries "_tag".
 
-    Where a tag chooses, any form fits.
+    Without the tag any of the forms may match, so "oneOf" becomes "anyOf".
     """
     if isinstance(schema, list):
         return [without_tags(one) for one in schema]

@@ -9,7 +9,7 @@ from drake_dae.scenario.manual.schema import custom_tags
 
 _HEAD = """# The keys of a scenario
 
-A scenario is a YAML file. `drake-dae show NAME` prints one to begin with, and all wrong keys and
+A scenario is a YAML file. `drake-dae print NAME` prints one to begin with, and all wrong keys and
 values of a file are reported together. Where several forms fit, a tag chooses one, as in
 `surface: !Sphere`; the first in a list of tags is meant without a tag.
 

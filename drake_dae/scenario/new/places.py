@@ -88,14 +88,14 @@ def find_places(links: Links, tip: str, point: Vector) -> list[TipPlace]:
         tip: The frame in contact.
         point: The point in it, m.
     """
-    search = _Search(links, tip, point)
+    search = _PlaceSearch(links, tip, point)
     found = [search.best(axis, sign) for axis, sign, _ in _NORMALS]
     ranked = [(place, liked) for place, (_, _, liked) in zip(found, _NORMALS, strict=True) if place]
     ranked.sort(key=lambda pair: -pair[0].quality * pair[0].directions * pair[1])
     return [place for place, _ in ranked]
 
 
-class _Search:
+class _PlaceSearch:
     """Postures of a robot for surfaces that are not yet placed."""
 
     def __init__(self, links: Links, tip: str, point: Vector) -> None:

@@ -19,7 +19,7 @@ class ModelForce:
     gain: ClassVar = 0.0
 
     def sensor(self, size: int) -> ForceSensor | None:
-        """No sensor, since none is needed."""
+        """None: the force is not measured, so there is no sensor."""
         return None
 
 

@@ -25,7 +25,7 @@ class Estimate(Protocol):
 
 
 class RecordedLoop(Protocol):
-    """A diagram with named parts, as a `ClosedLoop`; see there."""
+    """The parts of a closed loop from which a record is computed; see `ClosedLoop`."""
 
     @property
     def plant(self) -> Plant:

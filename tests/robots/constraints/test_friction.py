@@ -39,7 +39,7 @@ def frictional(friction=0.3, stiction_tolerance=0.05, viscous=None, actuation=()
         viscous_friction=viscous,
     )
     nominal = model.dae.nominal_state[: model.links.q.numel()]
-    return RobotModel(model.links, [contact], model.positions, nominal, name, actuation)
+    return RobotModel(model.links, [contact], model.outputs, nominal, name, actuation)
 
 
 @pytest.mark.parametrize("name", ["two_link", pytest.param("seven_joint", marks=pytest.mark.slow)])

@@ -134,7 +134,7 @@ def test_a_turning_surface_drags_a_frictional_contact_along(friction, viscous):
     frictional = RobotModel(
         model.links,
         [wall],
-        model.positions,
+        model.outputs,
         [1.2, -1.6],
         exogenous=("wall.position", "wall.rpy"),
     )

@@ -175,7 +175,7 @@ def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_k
 
     model = scenario_model(scenario("two_link_wall"))
     links, bound = model.links, ConstraintSet(model.constraints)
-    height = model.positions[0].expression(links)
+    height = model.outputs[0].expression(links)
     S = force_rows(model.forces, bound, links)
     q = np.array([1.2, -1.6])
     plant = links.plant

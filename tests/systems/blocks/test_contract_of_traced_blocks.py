@@ -67,7 +67,7 @@ def observer(**more):
     found = arm("two_link")
     smooth = found.model.constraints[0]
     wall = replace(smooth, friction=0.2, stiction_tolerance=0.1)
-    model = RobotModel(found.model.links, [wall], found.model.positions, [1.2, -1.6])
+    model = RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
     names = [signal.name for signal in model.links.velocity_signals]
     dae = with_disturbance(model.dae, names, ["wall.friction"])
     rates = Observing(20.0, force_rate=30.0, **more)

@@ -106,7 +106,7 @@ def test_a_push_that_the_law_does_not_know_is_integrated_away():
     push = KnownForce("tool", name="push")
     smooth = touching("two_link")
     model = RobotModel(
-        smooth.links, smooth.constraints, smooth.positions, [1.2, -1.6], known_forces=[push]
+        smooth.links, smooth.constraints, smooth.outputs, [1.2, -1.6], known_forces=[push]
     )
     structure = find_structure(model.dae)
     wanted, ends = [ConstantReference(0.3), ConstantReference(20.0)], {}
@@ -130,7 +130,7 @@ def test_a_force_that_friction_falsifies_is_integrated_away():
     """lambda A / A_0 = r_2 - K_i sigma at each step, with A by MultibodyPlant; 50 times better."""
     smooth = touching("two_link")
     wall = replace(smooth.constraints[0], friction=0.0, stiction_tolerance=0.05)
-    model = RobotModel(smooth.links, [wall], smooth.positions, [1.2, -1.6])
+    model = RobotModel(smooth.links, [wall], smooth.outputs, [1.2, -1.6])
     structure, errors = find_structure(model.dae), {}
     wanted = [SinusoidReference(0.3, 0.2, 0.5), ConstantReference(20.0)]
     for names in ([], ["wall.force"]):

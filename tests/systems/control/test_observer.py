@@ -145,7 +145,7 @@ def frictional(friction: float) -> tuple[RobotModel, DaeSystem]:
     """The two-link arm on its wall, and what its law takes it for: with friction to be found."""
     smooth = touching("two_link")
     wall = replace(smooth.constraints[0], friction=friction, stiction_tolerance=1e-3)
-    model = RobotModel(smooth.links, [wall], smooth.positions, [1.2, -1.6])
+    model = RobotModel(smooth.links, [wall], smooth.outputs, [1.2, -1.6])
     velocities = [signal.name for signal in model.links.velocity_signals]
     return model, with_disturbance(model.dae, velocities, ["wall.friction"])
 

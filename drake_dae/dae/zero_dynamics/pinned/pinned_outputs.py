@@ -18,7 +18,7 @@ from drake_dae.dae.manifold.search import CONSISTENT
 from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.zero_dynamics.pinned.pinned_point import Point, Regularity
+from drake_dae.dae.zero_dynamics.pinned.pinned_point import PinnedPoint, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
@@ -246,12 +246,14 @@ class PinnedOutputs:
             often=False,
         )
 
-    def point(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> Point:
+    def point(
+        self, state: FloatArray, reference: FloatArray, parameters: FloatArray
+    ) -> PinnedPoint:
         """A state on Z(R) with its rate, inputs and matrices."""
         values = self._motion.evaluate(state, reference, parameters)
-        return Point(state, *(value.copy() for value in values))
+        return PinnedPoint(state, *(value.copy() for value in values))
 
-    def regularity(self, point: Point) -> Regularity:
+    def regularity(self, point: PinnedPoint) -> Regularity:
         """Whether the motion is determined at a point."""
         if not (np.all(np.isfinite(point.A)) and np.all(np.isfinite(point.B))):
             return Regularity.MATRIX_NOT_FINITE

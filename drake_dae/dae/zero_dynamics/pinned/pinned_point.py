@@ -19,7 +19,7 @@ class Regularity(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class PinnedPoint:
     """A state on Z(R) with its rate, inputs and matrices, which may be infinite.
 
     Attributes:

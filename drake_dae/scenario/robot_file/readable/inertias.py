@@ -149,7 +149,7 @@ _Read = tuple[float, FloatArray] | None
 
 
 @dataclass(frozen=True)
-class _Form:
+class _InertiaForm:
     """The way in which a kind of file writes an inertia."""
 
     read: Callable[[ElementTree.Element], _Read]
@@ -213,7 +213,7 @@ def _replaced(block: str, pattern: str, text: str) -> str:
 
 
 _FORMS = {
-    ".urdf": _Form(_read_urdf, _write_urdf),
-    ".sdf": _Form(_read_sdf, _write_sdf),
-    ".xml": _Form(_read_mjcf, _write_mjcf),
+    ".urdf": _InertiaForm(_read_urdf, _write_urdf),
+    ".sdf": _InertiaForm(_read_sdf, _write_sdf),
+    ".xml": _InertiaForm(_read_mjcf, _write_mjcf),
 }

@@ -1,4 +1,4 @@
-"""`drake-dae film`: renders the run in a folder."""
+"""`drake-dae render`: renders the run in a folder."""
 
 import argparse
 

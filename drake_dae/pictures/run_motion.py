@@ -39,7 +39,7 @@ class ShownLoop(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class RunMotion:
     """A run of a robot at k equidistant times.
 
     Attributes:
@@ -100,7 +100,9 @@ class ContactPath:
     points_left: bool = False
 
 
-def follow(loop: ShownLoop, record: Record, context: Context, rate: float = FRAME_RATE) -> Course:
+def follow(
+    loop: ShownLoop, record: Record, context: Context, rate: float = FRAME_RATE
+) -> RunMotion:
     """The course of a run of a robot.
 
     Args:
@@ -127,7 +129,7 @@ def follow(loop: ShownLoop, record: Record, context: Context, rate: float = FRAM
     wanted = _desired_states(model, states, desired, values)
     begin, names = float(record.time[0]), [constraint.name for constraint in acting.constraints]
     bright = flashes(record.events, names, begin + times)
-    return Course(plant, model, times, begin, states, values, wrenches, wanted, acting, bright)
+    return RunMotion(plant, model, times, begin, states, values, wrenches, wanted, acting, bright)
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
@@ -135,7 +137,7 @@ def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
     return np.arange(int(np.ceil(duration * rate - 1e-9)) + 1) / rate
 
 
-def contact_paths(course: Course) -> list[ContactPath]:
+def contact_paths(course: RunMotion) -> list[ContactPath]:
     """The paths of moving contact points, each on its surface.
 
     They are projected along the surface's mean normal: for a plane its own coordinates, for a
@@ -170,7 +172,7 @@ def contact_paths(course: Course) -> list[ContactPath]:
     return found
 
 
-def run_extent(course: Course, scene_graph: SceneGraph | None) -> tuple[FloatArray, float]:
+def run_extent(course: RunMotion, scene_graph: SceneGraph | None) -> tuple[FloatArray, float]:
     """The center and the size, in m, of the box around the robot over the run.
 
     Args:
@@ -185,7 +187,7 @@ def run_extent(course: Course, scene_graph: SceneGraph | None) -> tuple[FloatArr
     return (low + high) / 2, float(np.linalg.norm(high - low))
 
 
-def _pushes(course: Course) -> FloatArray:
+def _pushes(course: RunMotion) -> FloatArray:
     """The normals of the surfaces, in the world, shape (k, constraints, 3).
 
     At rest there is no friction, so that the force is along the normal.

@@ -1,4 +1,4 @@
-"""`drake-dae show`: prints a scenario file."""
+"""`drake-dae print`: prints a scenario file."""
 
 import argparse
 

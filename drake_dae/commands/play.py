@@ -1,4 +1,4 @@
-"""`drake-dae view`: opens the animation of a run in the browser."""
+"""`drake-dae play`: opens the animation of a run in the browser."""
 
 import argparse
 import webbrowser
