@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
@@ -32,15 +31,11 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import (
-    ConstraintWrenches,
-    contact_normals,
-    own_values,
-)
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
 from drake_dae.robots.links.frames import frame_named
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.blocks.traced import HELD, Block, Computation, Stepped, Update
+from drake_dae.systems.blocks.traced import Block, Stepped
 from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,
@@ -57,6 +52,7 @@ from drake_dae.systems.plants.contact.disturbance_forces import (
     DisturbanceForce,
 )
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
+from drake_dae.systems.plants.contact.traced_contact import traced_contact
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -304,55 +300,18 @@ class ContactPlant(Diagram, Plant):
             body.SetMass(own, mass)
 
     def traced(self) -> Block:
-        count, of_links = self.dae.num_states, self.multibody.num_multibody_states()
-        forces = 3 * self.dae.num_constraints
-        held = ca.SX.sym("held", count + forces)
-        links, contact, of_stages = ca.vertsplit(
-            held, [0, of_links, of_links + forces, held.numel()]
-        )
-        state, given = ca.vertcat(links, of_stages), ca.DM(self._values)
-        normals = contact_normals(self.model).function(state, given)[0]
-        force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
-        acting = ca.SX.sym("force", force.numel())
-        found = [self.dae.outputs(acting), self.structure.manifold.residual_expression]
-        symbols = [self.dae.state, self.dae.parameter_symbol, acting]
-        output, residual = ca.substitute(found, symbols, [state, given, force])
-        shown = {
-            "state": (state, self.dae.state_signals),
-            "link_state": (links, ()),
-            "contact_force": (contact, self.contact_force_signals),
-            "constraint_force": (force, self.dae.force_signals),
-            "constraint_residual": (residual, self.structure.manifold.residual_signals),
-            "controlled_output": (output, self.dae.output_signals),
-        }
-        reads, updates = "control", []
-        if self._stages is not None:
-            reads, step = "joint_torque", self._stages.step
-            values = {"joint_torque": self._stages.torque(state, given)}
-            for name, part in self._stages.stage_ports.items():
-                values[name] = of_stages[part]
-            shown |= {name: (value, ()) for name, value in values.items()}
-            control = ca.SX.sym("control", self.dae.num_controls)
-            after = ca.vertcat(links, contact, step(state, control, given))
-            function = ca.Function("step", [held, control], [after])
-            computation = Computation(function, (HELD, "control"), (HELD,))
-            updates.append(Update(computation, self.time_step, 0.0, True))
-        computations = tuple(
-            Computation(ca.Function(name, [held], [value]), (HELD,), (name,))
-            for name, (value, _) in shown.items()
-        )
-        ports = {name: tuple(signals) for name, (_, signals) in shown.items() if signals}
+        count = self.multibody.num_multibody_states()
         stepped = Stepped(
             self._scene,
             self.time_step,
             ("link_state", "contact_force"),
             "joint_torque",
-            reads,
+            "control" if self._stages is None else "joint_torque",
             self._held,
-            lambda context, values: self._set_links(context, values[:of_links]),
-            held.numel(),
+            lambda context, values: self._set_links(context, values[:count]),
+            self.dae.num_states + len(self.contact_force_signals),
         )
-        return Block(self, computations, tuple(updates), stepped=stepped, ports=ports)
+        return traced_contact(self, stepped, self._stages, self._values)
 
     def _held(self, context: Context) -> FloatArray:
         """(q, v), the contact forces, and the states of the stages."""

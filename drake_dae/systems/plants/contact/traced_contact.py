@@ -1,0 +1,69 @@
+"""What a `ContactPlant` computes of what Drake steps in it."""
+
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.constraint_wrenches import contact_normals
+from drake_dae.systems.blocks.traced import HELD, Block, Computation, Stepped, Update
+from drake_dae.systems.plants.contact.stepped_stages import SteppedStages
+
+if TYPE_CHECKING:
+    from drake_dae.systems.plants.contact.contact_plant import ContactPlant
+
+
+def traced_contact(
+    plant: "ContactPlant", stepped: Stepped, stages: SteppedStages | None, values: FloatArray
+) -> Block:
+    """The computations of a `ContactPlant`, whose HELD are (q, v), contact forces, and the stages.
+
+    Args:
+        plant: The plant.
+        stepped: What Drake steps, which shows (q, v) and the contact forces.
+        stages: The stages of its actuation, which are traced; None with rigid joints.
+        values: Values of all its parameters.
+    """
+    dae, manifold = plant.dae, plant.structure.manifold
+    links, forces = plant.multibody.num_multibody_states(), len(plant.contact_force_signals)
+    held, given = ca.SX.sym("held", stepped.size), ca.DM(values)
+    ends = np.cumsum([0, links, forces, stepped.size - links - forces]).tolist()
+    of_links, contact, of_stages = ca.vertsplit(held, ends)
+    state = ca.vertcat(of_links, of_stages)
+    normals = contact_normals(plant.model).function(state, given)[0]
+    force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
+    acting = ca.SX.sym("force", force.numel())
+    found = [dae.outputs(acting), manifold.residual_expression]
+    symbols = [dae.state, dae.parameter_symbol, acting]
+    output, residual = ca.substitute(found, symbols, [state, given, force])
+    shown = {
+        "state": state,
+        "link_state": of_links,
+        "contact_force": contact,
+        "constraint_force": force,
+        "constraint_residual": residual,
+        "controlled_output": output,
+    }
+    updates = []
+    if stages is not None:
+        shown["joint_torque"] = stages.torque(state, given)
+        shown |= {name: of_stages[part] for name, part in stages.stage_ports.items()}
+        control = ca.SX.sym("control", dae.num_controls)
+        after = ca.vertcat(of_links, contact, stages.step(state, control, given))
+        function = ca.Function("step", [held, control], [after])
+        updates = [
+            Update(Computation(function, (HELD, "control"), (HELD,)), stepped.period, 0.0, True)
+        ]
+    computations = tuple(
+        Computation(ca.Function(name, [held], [value]), (HELD,), (name,))
+        for name, value in shown.items()
+    )
+    ports = {
+        "state": tuple(dae.state_signals),
+        "contact_force": tuple(plant.contact_force_signals),
+        "constraint_force": tuple(dae.force_signals),
+        "constraint_residual": tuple(manifold.residual_signals),
+        "controlled_output": tuple(dae.output_signals),
+    }
+    return Block(plant, computations, tuple(updates), stepped=stepped, ports=ports)
